@@ -1,13 +1,18 @@
-//! How long the model of the error takes: a batch of touches more, a whole measurement with its map and samples, a scan.
+//! How long the model of the form takes: a batch of touches more, a whole measurement, a scan.
 //!
 //! ```text
 //! cargo bench --bench model
 //! ```
 
 use divan::Bencher;
-use divan::counter::ItemsCount;
 use nalgebra::DMatrix;
-use regrind::model::{Dense, Field, Growing, Hyper, Lattice, Observed, Priors, Sparse};
+use regrind::geometry::{Point, Pose};
+use regrind::model::{Dense, Field, Form, Given, Growing, Hyper, Observed};
+use regrind::registration::{Options, Registration, Start, register};
+use regrind::surface::{Nominal, Projection};
+use regrind_sim::form::FormError;
+use regrind_sim::probe::{add_noise, centre};
+use regrind_sim::shape::{FreeForm, Shape};
 
 fn main() {
     divan::main();
@@ -76,39 +81,41 @@ fn a_batch_after_400_points_in_place(bencher: Bencher) {
     });
 }
 
-#[divan::bench]
-fn a_batch_after_400_points_by_the_grid(bencher: Bencher) {
-    let (all, map) = (measured(420), nodes(40, 25));
-    let lattice = Lattice::over(&all.places, &HYPER.field).unwrap();
-    bencher.bench(|| Sparse::fit(&lattice, &all, HYPER).unwrap().predict(&map));
-}
-
-/// 1,800 points: motions, field, a map of 6,000 nodes with its sigma, 1,000 samples of it.
+/// Everything that is said of a measurement: fields laid over the pattern, 1,000 forms drawn from them, figures, slopes and budget.
 #[divan::bench(sample_count = 10)]
 fn a_measurement_of_1800_points(bencher: Bencher) {
-    let (all, map) = (measured(1800), nodes(100, 60));
-    bencher.counter(ItemsCount::new(1000_u32)).bench(|| {
-        let lattice = Lattice::over(&map, &HYPER.field).unwrap();
-        let model = Sparse::fit(&lattice, &all, HYPER).unwrap();
-        (model.predict(&map), model.samples(&map, 1000, 1).unwrap())
-    });
+    let found = registered(52, 35);
+    bencher.bench(|| Form::of(&found, &Given::default()).unwrap());
 }
 
 #[divan::bench(sample_count = 5)]
 fn a_scan_of_28476_points(bencher: Bencher) {
-    let (all, map) = (measured(28_476), nodes(100, 60));
-    bencher.bench(|| {
-        let lattice = Lattice::over(&map, &HYPER.field).unwrap();
-        let model = Sparse::fit(&lattice, &all, HYPER).unwrap();
-        (model.predict(&map), model.samples(&map, 1000, 1).unwrap())
-    });
+    let found = registered(226, 126);
+    bencher.bench(|| Form::of(&found, &Given::default()).unwrap());
 }
 
-/// What speaks for which parameters: 400 of the points.
+/// A free form with an error of 1 um, touched in rows.
+fn registered(columns: usize, rows: usize) -> Registration {
+    const RADIUS_MM: f64 = 1.5;
+    let shape = FreeForm::default();
+    let points = |of: Vec<[f64; 3]>| of.into_iter().map(Point::from).collect::<Vec<_>>();
+    let nominal = Nominal::from_points(points(shape.grid(66.0, 46.0, 265, 185)), Projection::Auto).unwrap();
+    let mut rng = regrind_sim::rng(1);
+    let form = FormError::with_rms(&mut rng, 20.0, 1e-3);
+    let at = |k: usize, n: usize, size_mm: f64| size_mm * (k as f64 / (n - 1) as f64 - 0.5);
+    let place = |k: usize| [at(k % columns, columns, 60.0), at(k / columns, rows, 40.0)];
+    let touch = |k: usize| centre(&shape, &form, RADIUS_MM, place(k)[0], place(k)[1]);
+    let mut centres: Vec<[f64; 3]> = (0..columns * rows).map(touch).collect();
+    add_noise(&mut rng, &mut centres, 3e-4);
+    let options = Options { start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) };
+    register(&nominal, &points(centres), &options).unwrap()
+}
+
+/// What speaks for which parameters: all fields laid over the points, and the middle of those that may be.
 #[divan::bench(sample_count = 5)]
 fn the_parameters_of_1800_points(bencher: Bencher) {
     let all = measured(1800);
-    bencher.bench(|| Hyper::of(&all, &Priors::of_size(102.0)).unwrap());
+    bencher.bench(|| Hyper::of(&all, None).unwrap());
 }
 
 /// The same of points that were measured along a path, whose drift is searched too.
@@ -116,5 +123,5 @@ fn the_parameters_of_1800_points(bencher: Bencher) {
 fn the_parameters_of_1800_points_along_a_path(bencher: Bencher) {
     let all = measured(1800);
     let all = Observed { path: (0..1800).map(f64::from).collect(), ..all };
-    bencher.bench(|| Hyper::of(&all, &Priors::of_size(102.0)).unwrap());
+    bencher.bench(|| Hyper::of(&all, None).unwrap());
 }

@@ -364,7 +364,7 @@ pub struct TouchOn {
 pub struct FormFigures {
     /// Peak to valley.
     pub pv: Interval,
-    /// Peak to valley of all but the outermost 0.2 %.
+    /// Peak to valley of the aperture: the touched points and the places between them, without the outermost 0.1 % of these at either end.
     pub pv_robust: Interval,
     /// Root mean square.
     pub rms: Interval,

@@ -84,10 +84,10 @@ impl Tolerance {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum PvOf {
-    /// All that were used.
+    /// The points that were touched.
     #[serde(rename = "all")]
     All,
-    /// All but the outermost 0.2 %, so that no two points decide.
+    /// The aperture: the touched points and the places between them, without the outermost 0.1 % of these at either end.
     #[default]
     #[serde(rename = "99.8 %")]
     MostPoints,

@@ -65,14 +65,6 @@ impl Pattern {
         }
     }
 
-    /// Returns which of the values stands at a row and a column, the row not above; `None` where there is none.
-    pub fn place(&self, row: usize, column: usize) -> Option<usize> {
-        let matrix = self.matrix.as_ref();
-        let begin = matrix.col_ptr()[column];
-        let rows = &matrix.row_idx()[begin..matrix.col_ptr()[column + 1]];
-        rows.binary_search(&row).ok().map(|k| begin + k)
-    }
-
     /// Factors a matrix of this pattern; `None` where it is not positive definite.
     pub fn factor(&self, values: &[f64]) -> Option<Factor<'_>> {
         let matrix = SparseColMatRef::new(self.matrix.as_ref(), values);
@@ -101,46 +93,6 @@ impl<'a> Factor<'a> {
             MemStack::new(&mut memory),
         );
         Some(solution)
-    }
-
-    /// Solves for many right sides at once, a column each.
-    pub fn solve_all(&self, right: &Mat<f64>) -> Option<Mat<f64>> {
-        let symbolic = &self.pattern.symbolic;
-        let mut solution = right.clone();
-        let scratch = symbolic.solve_in_place_scratch::<f64>(right.ncols(), Par::Seq);
-        let mut memory = MemBuffer::try_new(scratch).ok()?;
-        let factor = LltRef::new(symbolic, &self.values);
-        factor.solve_in_place_with_conj(Conj::No, solution.as_mut(), Par::Seq, MemStack::new(&mut memory));
-        Some(solution)
-    }
-
-    /// Returns the logarithm of the determinant of the matrix.
-    pub fn log_determinant(&self) -> f64 {
-        let Some(symbolic) = self.pattern.blocks() else { return f64::NAN };
-        let factor = SupernodalLltRef::new(symbolic, &self.values);
-        let of_block = |s: usize| {
-            let block = factor.supernode(s).val();
-            (0..block.ncols()).map(|k| block[(k, k)].ln()).sum::<f64>()
-        };
-        2.0 * (0..symbolic.n_supernodes()).map(of_block).sum::<f64>()
-    }
-
-    /// Turns independent normal numbers into ones whose covariance is the inverse of the matrix, a column each: P^T L^-T z.
-    pub fn colour(&self, mut white: Mat<f64>) -> Option<Mat<f64>> {
-        let symbolic = self.pattern.blocks()?;
-        let factor = SupernodalLltRef::new(symbolic, &self.values);
-        for s in (0..symbolic.n_supernodes()).rev() {
-            let node = factor.supernode(s);
-            let (begin, width) = (node.start(), node.val().ncols());
-            let (l11, l21) = node.val().split_at_row(width);
-            let below = gathered(&white, node.pattern());
-            let mut own = white.as_mut().subrows_mut(begin, width);
-            matmul(own.as_mut(), Accum::Add, l21.transpose(), &below, -1.0, Par::Seq);
-            solve_upper_triangular_in_place(l11.transpose(), own, Par::Seq);
-        }
-        // From the order of the factor back to that of the matrix.
-        let Some(order) = self.pattern.symbolic.perm() else { return Some(white) };
-        Some(gathered(&white, order.arrays().1))
     }
 
     /// Works out the entries of the inverse within the factor's pattern.
@@ -215,16 +167,6 @@ impl SelectedInverse<'_> {
     }
 }
 
-/// Some rows of a matrix, in the order in which they are named.
-fn gathered(of: &Mat<f64>, rows: &[usize]) -> Mat<f64> {
-    let mut chosen = Mat::zeros(rows.len(), of.ncols());
-    for c in 0..of.ncols() {
-        let from = of.col_as_slice(c);
-        chosen.col_as_slice_mut(c).iter_mut().zip(rows).for_each(|(to, &row)| *to = from[row]);
-    }
-    chosen
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -261,13 +203,6 @@ mod tests {
         let right: Vec<f64> = (0..N).map(|k| (k as f64).sin()).collect();
         let exact = &inverse * nalgebra::DVector::from_column_slice(&right);
         assert!(factor.solve(&right).unwrap().iter().zip(exact.iter()).all(|(a, b)| (a - b).abs() < 1e-13));
-        let all = factor.solve_all(&Mat::from_fn(N, 2, |r, c| right[r] * (1.0 + c as f64))).unwrap();
-        assert!((0..N).all(|k| (all[(k, 0)] - exact[k]).abs() < 1e-13 && (all[(k, 1)] - 2.0 * exact[k]).abs() < 1e-13));
-        assert!((factor.log_determinant() - full.determinant().ln()).abs() < 1e-12);
-        // Of the unit vectors come the columns of a root of the inverse.
-        let root = factor.colour(Mat::identity(N, N)).unwrap();
-        let product = &root * root.transpose();
-        assert!((0..N * N).all(|k| (product[(k / N, k % N)] - inverse[(k / N, k % N)]).abs() < 1e-14));
     }
 
     #[test]

@@ -22,7 +22,7 @@ use crate::formats::{
 };
 use crate::geometry::{Point, Vector};
 use crate::measuring::fit_sphere;
-use crate::model::{self, Form, Given, Hyper, Lesson, Priors, Taught};
+use crate::model::{self, Form, Given, Lesson, Priors, Taught};
 use crate::registration::{Options, PointStatus as Fate, Registration, Verdict, weak_for_compensation};
 
 use super::maps;
@@ -384,7 +384,7 @@ fn registered(
         let why = "a touch stands alone: it is made again, and a few around it".to_owned();
         figures.touch_on = Some(Box::new(TouchOn { targets, why }));
     }
-    let field = next.is_none().then(|| field_alone(&found, &given, form.as_ref().ok(), !looked_at)).flatten();
+    let field = next.is_none().then(|| form.as_ref().ok()?.alone).flatten();
     Ok(Registered { registration: found, form: form.ok(), field, error, known, parameters, set, figures, next, again })
 }
 
@@ -401,14 +401,6 @@ fn priors(task: &Task, cycle: &Cycle, before: Option<&Cycle>) -> Option<Priors> 
     let alike = before.filter(|before| before.correction.is_none() != is_corrected);
     let of_this_part = || Some(Lesson::after(None, &alike?.field?));
     taught.or_else(of_this_part).map(|lesson| lesson.priors())
-}
-
-/// What the points alone tell of the field; where nothing was expected of it that is what was found.
-fn field_alone(found: &Registration, given: &Given, form: Option<&Form>, in_order: bool) -> Option<Hyper> {
-    match (form?, given.priors) {
-        (form, None) => form.is_seen.then_some(form.hyper),
-        (_, Some(_)) => Form::alone(found, given, in_order).ok().flatten(),
-    }
 }
 
 /// Takes a measured pass into what is known of the grinder.

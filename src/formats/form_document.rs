@@ -22,7 +22,7 @@ struct FormDocument<'a> {
     /// Standard deviation and range of the form, and scatter of a single point.
     form_sigma_mm: f64,
     form_range_mm: f64,
-    /// How often it can be differentiated: once, thrice, endless.
+    /// How often it can be differentiated: once, endless.
     form_smoothness: &'static str,
     /// Where it is wider along a direction: how many times as wide as across, and the angle of that direction from x.
     form_lay_stretch: f64,

@@ -52,7 +52,7 @@ pub(super) fn told(form: &Form, raw: Option<&Figures>, slope: Option<&Slope>, ta
         row(name, values(of).map(|mm| 1e3 * mm), raw_mm.map(|mm| 1e3 * mm), "um", made)
     };
     let figures = form.figures;
-    let most = "of the form at all points but the outermost 0.1 % at either end";
+    let most = "of the form over the aperture, without the outermost 0.1 % between the points at either end";
     let mut rows = vec![
         um("PV", figures.pv, raw.map(|raw| raw.pv_mm), POINTS),
         um("PV 99.8 %", figures.pv_most_points, raw.map(|raw| raw.pv998_mm), most),

@@ -256,7 +256,8 @@ const RMS: &str = "root mean square of the deviations from the nominal surface a
 const FORM_PV: &str = "largest less least deviation of the form from the nominal surface along its normal, after its best fit, the scatter of \
                        the probe taken off";
 const FORM_MOST: &str = "largest less least deviation of the form from the nominal surface along its normal, after its best fit, the scatter of \
-                         the probe taken off, without the outermost 0.1 % at either end";
+                         the probe taken off, over the aperture: the touched points and the places between them, without the outermost 0.1 % of \
+                         these at either end";
 const FORM_RMS: &str = "root mean square of the deviations of the form from the nominal surface along its normal, after its best fit, the scatter \
                         of the probe taken off";
 const MOST: &str =

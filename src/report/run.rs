@@ -183,8 +183,9 @@ fn decision_rule(tolerance: &Tolerance) -> String {
          pose are in their uncertainty. Where no form shows they are known from above alone. U is half of the interval that holds the \
          figure with 95 %. PV is the largest less the least deviation along the normal{}.",
         match tolerance.pv_of {
-            regrind_cell::PvOf::All => ", of all points",
-            regrind_cell::PvOf::MostPoints => ", PV 99.8 % that of all points but the outermost 0.1 % at either end",
+            regrind_cell::PvOf::All => ", of the touched points",
+            regrind_cell::PvOf::MostPoints =>
+                ", PV 99.8 % that of the aperture: the touched points and the places between them, without the outermost 0.1 % of these at either end",
         }
     )
 }

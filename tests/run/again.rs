@@ -75,6 +75,8 @@ fn a_run_that_is_killed_while_it_touches_again_goes_on_with_what_it_had() {
         ("accuracy_nm = 0.5", "spacing_mm = 0.5"),
         ("cutoff_mm = 5.0", "cutoff_mm = 11.0"),
         ("outlier_share = 0.002", "outlier_share = 0.02"),
+        // So few touches say little of what lies between them.
+        ("pv_um = 7.0", "pv_um = 10.0"),
     ];
     let text = fs::read_to_string(recipe(home.path(), 1, 2_000.0)).unwrap();
     let text = few.iter().fold(text, |text, (from, to)| replaced(&text, from, to));

@@ -19,7 +19,7 @@ const TAKEN: &str = "[compensation.parameters]\nwheel_radius_um = 600.0\n\n";
 
 fn recipe(parameters: &str, accepted_um: f64) -> String {
     let (grinding, accepted) = (format!("{parameters}[grinding]\n"), format!("rms_um = {accepted_um:.2}"));
-    let simulation = format!("[simulation]\nseed = 4\nspeed = 1e6\n\n{GRINDER}");
+    let simulation = format!("[simulation]\nseed = 9\nspeed = 1e6\n\n{GRINDER}");
     let changes = [
         ("columns = 60", "columns = 14"),
         ("rows = 30", "rows = 9"),

@@ -1,12 +1,16 @@
 //! What the uncertainty of the figures comes from, source by source.
 //!
-//! Near the forms that may have been a figure is a sum over places, each with its mean slope. The variance of that sum is parted exactly
-//! ([`Sparse::parted`]); the uncertainty of the figure itself, as the drawn forms have it, is shared out in that proportion.
+//! Near the forms that may have been a figure is a sum over places, each with its mean slope. The variance of that sum is parted exactly, by the
+//! most probable field; the uncertainty of the figure itself, as the drawn forms have it, is shared out in that proportion.
 
+use faer::linalg::solvers::{Llt, Solve};
+use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector};
 
+use super::Observed;
+use super::fields::Fields;
 use super::machine::Source;
-use super::{Hyper, Lattice, Observed, Sparse};
+use super::posterior::Posterior;
 
 /// What one source makes of the standard uncertainty of the figures: the squares of all add up.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
@@ -30,19 +34,28 @@ pub(super) struct Drawn<'a> {
     pub(super) ground_in: Option<DMatrix<f64>>,
 }
 
+/// What a variance comes from.
+struct Parts {
+    /// The points by themselves.
+    scatter: f64,
+    /// The field between them.
+    form: f64,
+    /// The motions that nobody knows.
+    pose: f64,
+    /// Each effect that is stated.
+    stated: Vec<f64>,
+}
+
 /// Parts the standard uncertainties of root mean square and peak to valley; nothing where they cannot be.
 pub(super) fn parted(
     (observed, sources): (&Observed, &[Source]),
-    hyper: &Hyper,
+    (fields, posterior): (&Fields, &Posterior),
     drawn: &Drawn,
     uncertainties_mm: [f64; 2],
 ) -> Vec<Share> {
-    let everywhere: Vec<[f64; 2]> = observed.places.iter().chain(drawn.places).copied().collect();
-    let Ok(lattice) = Lattice::over(&everywhere, &hyper.field) else { return Vec::new() };
-    let Ok(model) = Sparse::fit(&lattice, observed, *hyper) else { return Vec::new() };
     let (slopes, ground_in) = slopes(drawn);
     let of = |figure: usize| {
-        let mut parts = model.parted(observed, hyper, (drawn.places, slopes[figure].as_slice()))?;
+        let mut parts = parts(observed, fields, posterior, (drawn.places, &slopes[figure]))?;
         if drawn.ground_in.is_some() {
             parts.stated.clone_from(&ground_in[figure]);
         }
@@ -63,6 +76,65 @@ pub(super) fn parted(
         Share { source, is_stated, rms_mm: rms[k], pv_99_8_mm: pv[k] }
     };
     Source::ALL.iter().enumerate().map(one).collect()
+}
+
+/// Tells what the uncertainty of a sum a'f over places comes from: the variance of the field is that of sigma^2 D z with z of variance 1, and the
+/// coordinates of the points have it as B z.
+///
+/// With the motions known the sum is told by w'd, of whose error the scatter makes s^2 w'w, an effect that is stated (w'e)^2, and the field what
+/// is left; that the motions are not known adds the rest.
+fn parts(
+    observed: &Observed,
+    fields: &Fields,
+    posterior: &Posterior,
+    (places, slopes): (&[[f64; 2]], &DVector<f64>),
+) -> Option<Parts> {
+    let (node, tau, scatter_mm) = posterior.best()?;
+    let field2 = tau * node.scale * scatter_mm.powi(2);
+    let scatter2 = scatter_mm.powi(2) + field2 * node.narrow;
+    let slopes = Mat::from_fn(1, slopes.len(), |_, c| slopes[c]);
+    let sums = slopes * fields.waves.at(places);
+    let own = Mat::from_fn(node.strengths.len(), 1, |k, _| sums[(0, k)] * node.strengths[k]);
+    let rows = fields.with_effects(node);
+    let known = rows.nrows() - fields.effects();
+    // What is stated, in the coordinates, behind the motions, and what of it no wave shows.
+    let (coordinates, products) = fields.coordinates(&observed.stated);
+    let of_effects = fields.of_effects(&observed.stated);
+    let stated = observed.stated.ncols();
+    let shown = DMatrix::from_fn(stated, stated, |a, b| {
+        products[(a, b)] - (0..known).map(|k| coordinates[(k, a)] * coordinates[(k, b)]).sum::<f64>()
+    });
+    let beside = shown.clone().cholesky().map_or_else(|| DMatrix::zeros(stated, stated), |root| root.l().transpose());
+    let effect = |k: usize, e: usize| match k {
+        k if k < known => coordinates[(k, e)],
+        k if k < rows.nrows() => of_effects[(k - known, e)],
+        k => beside[(k - rows.nrows(), e)],
+    };
+    // All coordinates, or all but those of the motions.
+    let by =
+        |chosen: &[usize]| {
+            let some = Mat::from_fn(chosen.len(), own.nrows(), |r, c| {
+                if chosen[r] < rows.nrows() { rows[(chosen[r], c)] } else { 0.0 }
+            });
+            let effects = Mat::from_fn(chosen.len(), stated, |r, e| effect(chosen[r], e));
+            let mut covariance = &some * some.transpose() * faer::Scale(field2) + &effects * effects.transpose();
+            (0..chosen.len()).for_each(|k| covariance[(k, k)] += scatter2);
+            let towards = &some * &own * faer::Scale(field2);
+            let weights = Llt::new(covariance.as_ref(), Side::Lower).ok()?.solve(&towards);
+            let explained: f64 = (0..chosen.len()).map(|k| weights[(k, 0)] * towards[(k, 0)]).sum();
+            Some((weights, explained))
+        };
+    let whole = rows.nrows() + stated;
+    let all: Vec<usize> = (0..whole).collect();
+    let free: Vec<usize> = (0..whole).filter(|k| *k < known || *k >= rows.nrows()).collect();
+    let ((weights, explained), (_, explained_free)) = (by(&all)?, by(&free)?);
+    let before: f64 = field2 * (0..own.nrows()).map(|k| own[(k, 0)].powi(2)).sum::<f64>();
+    let pose_known = (before - explained).max(0.0);
+    let scatter = scatter2 * (0..whole).map(|k| weights[(k, 0)].powi(2)).sum::<f64>();
+    let of_stated = |e: usize| (0..whole).map(|k| effect(k, e) * weights[(k, 0)]).sum::<f64>().powi(2);
+    let stated: Vec<f64> = (0..stated).map(of_stated).collect();
+    let form = (pose_known - scatter - stated.iter().sum::<f64>()).max(0.0);
+    Some(Parts { scatter, form, pose: (explained - explained_free).max(0.0), stated })
 }
 
 /// By how much root mean square and peak to valley rise with each place, on the average of the forms, and by the mean of the squares with what

@@ -1,4 +1,4 @@
-//! The model by the covariance of every pair of points: exact, and the measure of the sparse way.
+//! The model by one set of parameters and the covariance of every pair of points.
 //!
 //! With K = k(x_i, x_j) + s^2 R, where R is 1 and, between points of a path on which the probe drifts, the drift to the power of their steps
 //! (an autoregression of the first order), the effects b by generalised least squares, b = (H'K^-1 H)^-1 H'K^-1 d, and what is left told by kriging
@@ -6,15 +6,11 @@
 //! k(x, x) - k'K^-1 k + r'(H'K^-1 H)^-1 r with r = h - H'K^-1 k. Effects E that are stated stand beside those of H and have a variance of 1, so their
 //! part of H'K^-1 H has 1 added to its diagonal; that is the same as E E' in K.
 
-use faer::linalg::solvers::{DenseSolveCore, Llt, Solve};
+use faer::linalg::solvers::{Llt, Solve};
 use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector};
 
-use super::normals::Normals;
 use super::{Hyper, ModelError, Observed};
-
-/// What keeps a covariance definite whose least values are nothing.
-const NEXT_TO_NOTHING: f64 = 1e-9;
 
 /// What the model says of a place.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,8 +25,6 @@ pub struct Predicted {
 pub struct Dense {
     hyper: Hyper,
     places: Vec<[f64; 2]>,
-    path: Vec<f64>,
-    stated: DMatrix<f64>,
     factor: Llt<f64>,
     /// K^-1 (d - H b).
     weights: Vec<f64>,
@@ -57,7 +51,7 @@ impl Dense {
         hyper: Hyper,
         shared_mm2: impl Fn(usize, usize) -> f64,
     ) -> Result<Self, ModelError> {
-        let Observed { places, deviations_mm, path, .. } = observed;
+        let Observed { places, deviations_mm, .. } = observed;
         let Solved { effects, factor, solved, gram, towards, log_det, .. } =
             Solved::with(observed, &hyper, shared_mm2)?;
         let (n, p, vague) = (places.len(), effects.ncols(), observed.effects.ncols());
@@ -72,8 +66,6 @@ impl Dense {
         Ok(Self {
             hyper,
             places: places.clone(),
-            path: path.clone(),
-            stated: observed.stated.clone(),
             weights,
             effects: solved.subcols(0, p).to_owned(),
             found,
@@ -94,63 +86,10 @@ impl Dense {
         observed.deviations_mm.iter().zip(&self.weights).map(|(d, w)| d * w).sum()
     }
 
-    /// What the field and the effects leave of each observation: the most probable scatter, N K^-1 (d - H b) without what is stated.
-    pub(super) fn residuals_mm(&self) -> Vec<f64> {
-        let scatter2 = self.hyper.scatter_mm * self.hyper.scatter_mm;
-        let (n, drifts) = (self.places.len(), self.hyper.drift > 0.0 && !self.path.is_empty());
-        let of = |r: usize| match drifts {
-            true => (0..n).map(|k| shared(&self.hyper, &self.path, r, k) * self.weights[k]).sum(),
-            false => self.weights[r],
-        };
-        (0..n).map(|r| scatter2 * of(r)).collect()
-    }
-
     /// Returns the effects and their covariance, those that are stated behind the others: with the motions of the part as effects, where its nominal frame is, and how well
     /// that is known beside a field that nobody knows either.
     pub fn effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
         (&self.found, &self.covariance)
-    }
-
-    /// Draws what may have been the scatter of each observed point and what is stated to move it; a column a sample. What is left of the
-    /// observations without it, and without the effects that nobody knows, is the field.
-    ///
-    /// With W = K^-1 - K^-1 H (H'K^-1 H)^-1 H'K^-1 and N = s^2 R + E E' that has the mean N W d and the covariance N - N W N; K has E E' in it.
-    pub(super) fn scatters(&self, count: usize, seed: u64) -> Result<Mat<f64>, ModelError> {
-        let n = self.places.len();
-        let scatter2 = self.hyper.scatter_mm * self.hyper.scatter_mm;
-        let inverse = self.factor.inverse();
-        let p = self.found.len();
-        let by_effects =
-            Mat::from_fn(n, p, |r, c| (0..p).map(|k| self.effects[(r, k)] * self.covariance[(k, c)]).sum::<f64>());
-        let weights = inverse - &by_effects * self.effects.transpose();
-        let is_stated = self.stated.ncols() > 0;
-        let drifts = is_stated || self.hyper.drift > 0.0 && !self.path.is_empty();
-        let mut shared = Mat::from_fn(n, n, |r, c| shared(&self.hyper, &self.path, r, c));
-        if is_stated {
-            let stated = Mat::from_fn(n, self.stated.ncols(), |r, c| self.stated[(r, c)] / self.hyper.scatter_mm);
-            shared += &stated * stated.transpose();
-        }
-        let most = (0..n).map(|k| shared[(k, k)]).fold(0.0, f64::max);
-        let told = if drifts { &shared * &weights * &shared } else { weights };
-        let covariance = Mat::from_fn(n, n, |r, c| {
-            let own = if r == c { NEXT_TO_NOTHING * most } else { 0.0 };
-            shared[(r, c)] + own - scatter2 * told[(r, c)]
-        });
-        let mean_of = |r: usize| match drifts {
-            true => (0..n).map(|k| shared[(r, k)] * self.weights[k]).sum(),
-            false => self.weights[r],
-        };
-        let means: Vec<f64> = (0..n).map(mean_of).collect();
-        let root = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
-        let mut normals = Normals::new(seed, 0);
-        let drawn = Mat::from_fn(n, count, |_, _| normals.next());
-        let mut samples = root.L() * &drawn;
-        for c in 0..count {
-            for r in 0..n {
-                samples[(r, c)] = scatter2 * means[r] + self.hyper.scatter_mm * samples[(r, c)];
-            }
-        }
-        Ok(samples)
     }
 
     /// Tells the field at some places, the effects taken off.
@@ -186,35 +125,20 @@ impl Dense {
     }
 }
 
-/// How much of their scatter two points share.
-fn shared(hyper: &Hyper, path: &[f64], r: usize, c: usize) -> f64 {
-    match path.is_empty() {
-        true if r == c => 1.0,
-        true => 0.0,
-        false => hyper.shared(path[r] - path[c]),
-    }
-}
-
 /// What the covariance of points makes of what was measured.
-pub(super) struct Solved {
+struct Solved {
     /// H, and behind it E.
     effects: DMatrix<f64>,
     factor: Llt<f64>,
     /// K^-1 of these, and behind them K^-1 d.
     solved: Mat<f64>,
     /// H'K^-1 H and H'K^-1 d with E behind H, K without E.
-    pub(super) gram: DMatrix<f64>,
-    pub(super) towards: DVector<f64>,
-    /// d'K^-1 d.
-    pub(super) own: f64,
-    pub(super) log_det: f64,
+    gram: DMatrix<f64>,
+    towards: DVector<f64>,
+    log_det: f64,
 }
 
 impl Solved {
-    pub(super) fn of(observed: &Observed, hyper: &Hyper) -> Result<Self, ModelError> {
-        Self::with(observed, hyper, |_, _| 0.0)
-    }
-
     fn with(observed: &Observed, hyper: &Hyper, shared_mm2: impl Fn(usize, usize) -> f64) -> Result<Self, ModelError> {
         observed.check()?;
         hyper.check()?;
@@ -243,10 +167,9 @@ impl Solved {
         let solved = factor.solve(&right);
         let gram = DMatrix::from_fn(p, p, |a, b| dot(right.col_as_slice(a), solved.col_as_slice(b)));
         let towards = DVector::from_fn(p, |a, _| dot(right.col_as_slice(a), solved.col_as_slice(p)));
-        let own = dot(deviations_mm, solved.col_as_slice(p));
         let diagonal = factor.L().diagonal();
         let log_det: f64 = 2.0 * (0..n).map(|k| diagonal[k].ln()).sum::<f64>();
-        Ok(Self { effects, factor, solved, gram, towards, own, log_det })
+        Ok(Self { effects, factor, solved, gram, towards, log_det })
     }
 }
 
@@ -255,7 +178,7 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// Takes in that effects behind the first, which nobody knows, have a variance of 1.
-pub(super) fn with_stated(mut gram: DMatrix<f64>, vague: usize) -> DMatrix<f64> {
+fn with_stated(mut gram: DMatrix<f64>, vague: usize) -> DMatrix<f64> {
     (vague..gram.nrows()).for_each(|k| gram[(k, k)] += 1.0);
     gram
 }
@@ -306,11 +229,6 @@ mod tests {
         );
         let by_hand = -0.5 * (6.5_f64.ln() + 9.0 / 6.5 + std::f64::consts::TAU.ln());
         assert!((model.log_likelihood() - by_hand).abs() < 1e-14);
-        // Scatter and what is stated together have the rest, N W d = 2.5 / 6.5 * 3, with N - N W N.
-        let samples = model.scatters(40_000, 5).unwrap();
-        let mean = (0..40_000).map(|c| samples[(0, c)]).sum::<f64>() / 4e4;
-        let variance = (0..40_000).map(|c| (samples[(0, c)] - mean).powi(2)).sum::<f64>() / 4e4;
-        assert!((mean - 7.5 / 6.5).abs() < 0.03 && (variance - (2.5 - 6.25 / 6.5)).abs() < 0.05, "{mean} {variance}");
     }
 
     #[test]
@@ -330,21 +248,6 @@ mod tests {
         let apart = Dense::fit(&at([7.0, 900.0]), drifting).unwrap();
         let alone = Dense::fit(&at([7.0, 8.0]), HYPER).unwrap();
         assert!((apart.log_likelihood() - alone.log_likelihood()).abs() < 1e-13);
-        // What may have been their scatter has the mean s^2 R K^-1 d and the covariance s^2 R - s^4 R K^-1 R.
-        let samples = model.scatters(40_000, 3).unwrap();
-        let k = nalgebra::Matrix2::new(4.25, 4.125, 4.125, 4.25).try_inverse().unwrap();
-        let r = nalgebra::Matrix2::new(0.25, 0.125, 0.125, 0.25);
-        let mean = r * k * nalgebra::Vector2::new(3.0, 1.0);
-        let covariance = r - r * k * r;
-        for a in 0..2 {
-            let found = (0..40_000).map(|c| samples[(a, c)]).sum::<f64>() / 4e4;
-            assert!((found - mean[a]).abs() < 0.01, "{found} {}", mean[a]);
-            for b in 0..2 {
-                let of = |c: usize| (samples[(a, c)] - mean[a]) * (samples[(b, c)] - mean[b]);
-                let found = (0..40_000).map(of).sum::<f64>() / 4e4;
-                assert!((found - covariance[(a, b)]).abs() < 0.005, "{found} {}", covariance[(a, b)]);
-            }
-        }
     }
 
     fn wave(places: &[[f64; 2]]) -> Vec<f64> {

@@ -19,10 +19,6 @@ pub enum ModelError {
         "the lay of the field goes along {along:?} and stretches it {stretch} times; it must be a unit vector, and 1 time at least"
     )]
     Lay { along: [f64; 2], stretch: f64 },
-    #[error("an endlessly smooth field has no precision on a grid; take one that can be differentiated three times")]
-    NoPrecision,
-    #[error("the grid is that of a field with another smoothness or another lay")]
-    OtherGrid,
     #[error(
         "the standard uncertainty of the {what} is {value} (mm, rad or a share); it must be 0 at least and what a machine or a fixture can have: correct what is stated of it"
     )]
@@ -39,10 +35,6 @@ pub enum ModelError {
     NotDefinite,
     #[error("the effects cannot be told apart by these points; leave out what the surface does not show")]
     EffectsAlike,
-    #[error(
-        "a grid for the field would have {nodes} nodes, more than {most}; the range of {range_mm} mm is too short for the part"
-    )]
-    TooManyNodes { nodes: usize, most: usize, range_mm: f64 },
     #[error(
         "the points are of {sessions} session; what differs between sessions is told by {least} at least: measure once more, or from another station"
     )]

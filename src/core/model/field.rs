@@ -21,11 +21,11 @@ pub struct Field {
 /// How smooth a field is: the nu of its Matern covariance, or how often it can be differentiated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Smoothness {
-    /// nu = 2, the roughest: once.
+    /// nu = 1/2, exp(-2 r / range), the roughest: nowhere.
+    Never,
+    /// nu = 2: once.
     Once,
-    /// nu = 4: three times.
-    Thrice,
-    /// nu without end, exp(-2 (r / range)^2): as often as one likes. It has no precision on a grid.
+    /// nu without end, exp(-2 (r / range)^2): as often as one likes.
     Endless,
 }
 
@@ -42,8 +42,8 @@ impl Smoothness {
     /// Returns its word.
     pub fn name(self) -> &'static str {
         match self {
+            Self::Never => "never",
             Self::Once => "once",
-            Self::Thrice => "thrice",
             Self::Endless => "endless",
         }
     }

@@ -64,11 +64,12 @@ pub struct IsoFigures {
 }
 
 impl SlopeFigures {
-    /// Of smooth forms, a column each.
-    pub(super) fn of(slopes: &SlopesAt, forms: &DMatrix<f64>, (is_seen, given): (bool, &Given)) -> Self {
-        let found = each(forms, |form| slopes.of(form));
+    /// Of smooth forms, a column each, and of those that tell extremes from above.
+    pub(super) fn of(slopes: &SlopesAt, forms: &[DMatrix<f64>; 2], (is_seen, given): (bool, &Given)) -> Self {
+        let found = forms.each_ref().map(|forms| each(forms, |form| slopes.of(form)));
         let [rms, largest] = [0, 1].map(|k| {
-            let of = Interval::of(found.iter().map(|of| of[k]).collect(), is_seen, given);
+            let values = |of: usize| found[of].iter().map(|of| of[k]).collect();
+            let of = Interval::of(values(0), (k == 1).then(|| values(1)).into_iter(), is_seen, given);
             AngleInterval { median_rad: of.median_mm, low_rad: of.low_mm, high_rad: of.high_mm }
         });
         Self { rms, largest, integration_mm: slopes.integration_mm, places: slopes.nodes }
@@ -76,18 +77,21 @@ impl SlopeFigures {
 }
 
 impl IsoFigures {
-    /// Of forms, a column each.
-    pub(super) fn of(fits: &IsoFits, forms: &DMatrix<f64>, is_seen: bool, given: &Given) -> Self {
-        let found = each(forms, |form| fits.of(form));
+    /// Of forms, a column each, and of those that tell extremes from above.
+    pub(super) fn of(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool, given: &Given) -> Self {
+        let found = forms.each_ref().map(|forms| each(forms, |form| fits.of(form)));
+        let values = |k: usize, of: fn(&IsoOfForm) -> f64| found[k].iter().map(of).collect::<Vec<f64>>();
         let interval =
-            |of: fn(&IsoOfForm) -> f64, has_low: bool| Interval::of(found.iter().map(of).collect(), has_low, given);
+            |of: fn(&IsoOfForm) -> f64, has_low: bool| Interval::of(values(0, of), std::iter::empty(), has_low, given);
+        let extreme =
+            |of: fn(&IsoOfForm) -> f64| Interval::of(values(0, of), std::iter::once(values(1, of)), is_seen, given);
         let power_rim = interval(|of| of.power_rim_mm, true);
         let has_sign = power_rim.low_mm * power_rim.high_mm > 0.0;
         Self {
             power: interval(|of| of.power_mm, is_seen && has_sign),
             power_rim,
-            irregularity: interval(|of| of.irregularity_mm, is_seen),
-            symmetric: interval(|of| of.symmetric_mm, is_seen),
+            irregularity: extreme(|of| of.irregularity_mm),
+            symmetric: extreme(|of| of.symmetric_mm),
             rms_total: interval(|of| of.rms_total_mm, is_seen),
             rms_irregularity: interval(|of| of.rms_irregularity_mm, is_seen),
             rms_varying: interval(|of| of.rms_varying_mm, is_seen),

@@ -2,23 +2,25 @@
 //!
 //! The registration put the part where the deviations are smallest. What the part's own form did to that is told by the model: the motions
 //! that the registration was free to make are its effects, the form is its field. The figures are those of the form after its own
-//! best fit, over fields drawn from what the measurement leaves possible; so the scatter of the probe is taken off them, and the pose is
-//! in their uncertainty.
+//! best fit, over fields drawn from what the measurement leaves possible ([`super::posterior`]); so the scatter of the probe is taken off them, and
+//! the pose is in their uncertainty.
 
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SymmetricEigen, Vector6};
+use nalgebra::{DMatrix, Matrix3, Matrix6, SymmetricEigen, Vector6};
 
 use rayon::prelude::*;
 
+use super::between::Between;
 use super::budget::{self, Share};
-use super::field::Pairs;
-use super::likelihood::{ANY, ON_A_GRID, Told};
+use super::fields::Fields;
+use super::kind::kind;
 use super::machine::{Effects, Machine, Source, unsound};
 use super::normals::Normals;
+use super::posterior::{Draws, Posterior, Probe};
 use super::spacing_mm;
 use super::{AreaOptions, IsoFigures, SlopeFigures};
-use super::{Dense, Hyper, Lattice, ModelError, Observed, Predicted, Priors, Sparse};
+use super::{Hyper, ModelError, Observed, Predicted, Priors};
 use crate::form::{IsoFits, SlopesAt};
-use crate::geometry::{Point, Vector};
+use crate::geometry::{Nearest, Point, Vector};
 use crate::registration::{Deviation, LEAST_SIGMA_MM, PointStatus, Registration, robust_sigma};
 
 /// What a registered measurement says of the form of a part.
@@ -42,6 +44,8 @@ pub struct Form {
     pub known_mm: f64,
     /// What the standard uncertainties of the figures come from, source by source; empty where they cannot be parted.
     pub budget: Vec<Share>,
+    /// What the points alone tell of the parameters, whatever was expected of them: it teaches of the parts that follow. None where no form is seen.
+    pub alone: Option<Hyper>,
     /// Whether the points show a form at all. Where they do not, the figures are known from above alone, and their intervals begin at 0.
     pub is_seen: bool,
 }
@@ -62,9 +66,10 @@ pub struct FormPoint {
 pub struct FormFigures {
     /// Root mean square.
     pub rms: Interval,
-    /// Largest less least.
+    /// Largest less least at the places of the form: of a whole pattern the touched points.
     pub pv: Interval,
-    /// The same without the outermost 0.1 % at either end.
+    /// The same of the aperture, the places between them in it: without the outermost 0.1 % at either end, but none of the touched places is left
+    /// out.
     pub pv_most_points: Interval,
 }
 
@@ -94,20 +99,16 @@ pub struct Interval {
 /// Fields that are drawn, and places at which they are looked at, at most.
 const SAMPLES: usize = 1000;
 const MOST_PLACES: usize = 6000;
-/// Fewer tell nothing.
-const FEWEST_SAMPLES: usize = 30;
-/// Points whose every pair is worked with, at most; of more the grid is faster.
-const MOST_DENSE: usize = 700;
-/// By how much more a form has to be spoken for than none, in the logarithm of the likelihood: by chance it is so in one part of twenty.
-const EVIDENCE: f64 = 2.6;
-/// Points of which every pair is looked at, at most.
-const MOST_PAIRED: usize = 1500;
-/// What is less likely than this counts for nothing.
-const FEW: f64 = 1e-3;
+/// Drawn fields that are worked on at a time.
+const A_TIME: usize = 50;
+/// By how much more a form has to be spoken for than none, in the logarithm of the likelihood of the best one: without a form it is so in one part of a hundred.
+const EVIDENCE: f64 = 3.0;
 /// A point further from the field than this many robust sigmas is none that scattered.
 const STANDS_OUT: f64 = 6.0;
 /// Where more than this share of the points stood out, they would not be apart from the form: it has no other.
 const MOST_APART: f64 = 0.1;
+/// Where the fit leaves fewer degrees of freedom, no field tells the scatter from the form.
+const FEW_FREE: f64 = 20.0;
 /// A direction whose variance is less than this share of the largest was held.
 const HELD: f64 = 1e-13;
 
@@ -118,24 +119,19 @@ impl Form {
     /// Too few points, and points that leave nothing to tell the form by.
     pub fn of(registration: &Registration, given: &Given) -> Result<Self, ModelError> {
         let seen = Seen::of(registration, given, true)?;
-        let drawn = Drawn::of(&seen.observed, &seen.told.likely)?;
+        let posterior = seen.posterior(given);
+        let chosen: Vec<usize> = thinned(seen.observed.places.len()).collect();
+        let some = seen.observed.only(&chosen);
+        let drawn = Drawn::by(&seen.fields, posterior.draws(SAMPLES, 1), some.places, some.effects, true);
+        let drawn = Drawn { chosen: chosen.clone(), ..drawn }.known_as(&seen.observed);
         let at = |chosen: &[usize]| seen.ground_in.as_ref().map(|ground_in| ground_in.select_rows(chosen));
-        let ground_in = at(&seen.of_all(&drawn.chosen));
-        let slope = seen.slope(given, drawn.clone().without(ground_in.as_ref()));
-        let drawn = drawn.with_the_scatter(&seen.observed, &seen.told, given).without(ground_in.as_ref());
+        let ground_in = at(&seen.of_all(&chosen));
+        let drawn = drawn.without(ground_in.as_ref());
+        let slope = seen.slope(given, &posterior, &drawn);
+        let drawn = drawn.with_the_scatter(&seen.observed, &posterior, given);
         let drawn = seen.with_those_apart(drawn, given).after_best_fit();
         let ground_in = at(&drawn.chosen);
-        Ok(Self { slope, ..seen.form(given, &drawn, ground_in) })
-    }
-
-    /// Tells the parameters of the form by the points alone, whatever is expected of it beforehand: what a part teaches of those that
-    /// follow. None where no form is seen. `in_order` says that the points may lie along a path.
-    ///
-    /// # Errors
-    /// Those of [`Form::of`].
-    pub fn alone(registration: &Registration, given: &Given, in_order: bool) -> Result<Option<Hyper>, ModelError> {
-        let seen = Seen::of(registration, &Given { priors: None, ..*given }, in_order)?;
-        Ok(seen.is_seen.then(|| seen.told.likely[0].0))
+        Ok(Self { slope, ..seen.form(given, &posterior, &drawn, ground_in, true) })
     }
 
     /// Tells the form at places of the part that need not have been touched: points of the nominal surface with their normals, in the model
@@ -145,25 +141,39 @@ impl Form {
     /// nothing says how wide it is, every place has one of its own.
     ///
     /// # Errors
-    /// Those of [`Form::of`], and places that are too many for the range of the form.
+    /// Those of [`Form::of`].
     pub fn over(registration: &Registration, given: &Given, places: &[(Point, Vector)]) -> Result<Self, ModelError> {
+        Self::told_over(registration, given, places, true)
+    }
+
+    /// The same; where not all is asked for without slopes, ISO figures and the budget, which cost most where few points were touched.
+    pub(super) fn told_over(
+        registration: &Registration,
+        given: &Given,
+        places: &[(Point, Vector)],
+        is_whole: bool,
+    ) -> Result<Self, ModelError> {
         let seen = Seen::of(registration, given, false)?;
+        let posterior = seen.posterior(given);
         let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
         let effects = seen.motions.rows(places.iter().copied());
-        let drawn = Drawn::over(&seen.observed, &seen.told.likely, places.iter().map(plane).collect(), effects)?;
+        // Many more places than touches are close enough to each other.
+        let is_between = places.len() < 2 * seen.kept.len();
+        let at = places.iter().map(plane).collect();
+        let drawn = Drawn::by(&seen.fields, posterior.draws(SAMPLES, 1), at, effects, is_between);
+        let drawn = drawn.rough_where_touched(&seen.observed.places).known_as(&seen.observed);
         let ground_in = seen.ground_in.is_some().then(|| seen.stated.columns(places.iter().copied()));
         let drawn = drawn.without(ground_in.as_ref());
-        let slope = seen.slope(given, drawn.clone());
-        let drawn = seen.with_those_apart(drawn.with_what_is_narrow(&seen.told, given), given).after_best_fit();
-        Ok(Self { slope, ..seen.form(given, &drawn, ground_in) })
+        let slope = if is_whole { seen.slope(given, &posterior, &drawn) } else { None };
+        let drawn = seen.with_those_apart(drawn.with_what_is_narrow(given), given).after_best_fit();
+        Ok(Self { slope, ..seen.form(given, &posterior, &drawn, ground_in, is_whole) })
     }
 }
 
 /// A registration as the model sees it, with what speaks for which parameters.
 struct Seen {
     motions: Motions,
-    /// All points that were used, and what was observed at them.
-    used: Vec<Deviation>,
+    /// What was observed at all points that were used.
     all: Observed,
     /// Those of them that no field explains, ascending: what stands there is form all the same.
     apart: Vec<usize>,
@@ -174,52 +184,59 @@ struct Seen {
     stated: Effects,
     /// What of that has been ground into the part, at all points: nothing before the first correction.
     ground_in: Option<DMatrix<f64>>,
-    told: Told,
-    is_seen: bool,
+    fields: Fields,
 }
 
 impl Seen {
-    /// Tells the parameters, without the points that no field explains by them.
+    /// Lays the fields, without the points that none of them explains.
     fn of(registration: &Registration, given: &Given, at_points: bool) -> Result<Self, ModelError> {
         /// Each round tells the parameters anew, and without the tallest of a defect its flanks stand out.
         const ROUNDS: usize = 3;
+        if let Some(priors) = &given.priors {
+            priors.check()?;
+        }
         let mut seen = Self::with_all_in_the_fit(registration, given, at_points)?;
         for _ in 0..ROUNDS {
-            let more = seen.unexplained()?;
+            let more = seen.unexplained(given);
             let apart = seen.apart.len() + more.len();
             if more.is_empty() || apart as f64 > MOST_APART * seen.all.places.len() as f64 {
                 break;
             }
             let mut apart = [&seen.apart[..], &more[..]].concat();
             apart.sort_unstable();
-            let kept: Vec<usize> = (0..seen.used.len()).filter(|k| apart.binary_search(k).is_err()).collect();
+            let kept: Vec<usize> = (0..seen.all.places.len()).filter(|k| apart.binary_search(k).is_err()).collect();
             let observed = seen.all.only(&kept);
             // What is left may be too few to tell anything; then it is told with them.
-            let Ok((told, is_seen)) = told(&observed, seen.motions.size_mm, given, at_points) else { break };
-            seen = Self { apart, kept, observed, told, is_seen, ..seen };
+            let Ok(fields) = Fields::over(&observed, seen.fields.kind) else { break };
+            seen = Self { apart, kept, observed, fields, ..seen };
         }
         Ok(seen)
     }
 
+    fn posterior(&self, given: &Given) -> Posterior<'_> {
+        Posterior::of(&self.fields, &self.observed, given.priors.as_ref(), probe(given))
+    }
+
     /// The points that are further from the field than its scatter lets any of them be, of all that were used.
-    fn unexplained(&self) -> Result<Vec<usize>, ModelError> {
+    fn unexplained(&self, given: &Given) -> Vec<usize> {
         /// Of fewer points nobody knows what is usual.
         const FEWEST: usize = 40;
-        let (observed, hyper) = (&self.observed, self.told.likely[0].0);
-        if observed.places.len() < FEWEST {
-            return Ok(Vec::new());
+        let Observed { places, deviations_mm, effects, stated, .. } = &self.observed;
+        if places.len() < FEWEST {
+            return Vec::new();
         }
-        let residuals_mm = if observed.places.len() <= MOST_DENSE {
-            Dense::fit(observed, hyper)?.residuals_mm()
-        } else {
-            let lattice = Lattice::over(&observed.places, &hyper.field)?;
-            Sparse::fit(&lattice, observed, hyper)?.residuals_mm().to_vec()
-        };
+        let posterior = self.posterior(given);
+        let (waves, of_stated) = posterior.mean();
+        let told = self.fields.at_points(&waves);
+        let moved = stated * of_stated;
+        let left = |k: usize| deviations_mm[k] - told[k] - moved[k];
+        let residuals_mm = best_fitted(DMatrix::from_fn(places.len(), 1, |k, _| left(k)), effects);
         let (middle_mm, sigma_mm) = robust_sigma(residuals_mm.iter().copied());
         // Where a field goes through every point, what is left of them is no scatter.
-        let limit_mm = STANDS_OUT * sigma_mm.max(0.5 * hyper.scatter_mm).max(LEAST_SIGMA_MM);
+        let scatter_mm = posterior.middle().scatter_mm;
+        let limit_mm = STANDS_OUT * sigma_mm.max(0.5 * scatter_mm).max(LEAST_SIGMA_MM);
         let stands_out = |k: &usize| (residuals_mm[*k] - middle_mm).abs() > limit_mm;
-        Ok(self.of_all(&(0..residuals_mm.len()).filter(stands_out).collect::<Vec<_>>()))
+        self.of_all(&(0..places.len()).filter(stands_out).collect::<Vec<_>>())
     }
 
     /// The numbers among all that were used of some that were kept.
@@ -243,33 +260,35 @@ impl Seen {
             apart.truncate((self.apart.len() * rows).div_ceil(self.kept.len().max(1)));
             apart.sort_unstable();
         }
-        let found = self.touched_at(&apart, drawn.forms.ncols(), given);
+        let found = self.touched_at(&apart, &drawn.scatter_mm, given);
         if at_points { drawn.beside(found) } else { drawn.replaced_by(&found) }
     }
 
     /// What some of the points found, as often as forms are drawn.
-    fn touched_at(&self, points: &[usize], count: usize, given: &Given) -> Drawn {
-        let scatter_mm = self.told.likely[0].0.scatter_mm;
-        let of_probe_mm =
-            if given.probe_scatter_mm[0] > 0.0 { scatter_mm.min(given.probe_scatter_mm[0]) } else { scatter_mm };
-        let mut forms = DMatrix::zeros(points.len(), count);
+    fn touched_at(&self, points: &[usize], scatter_mm: &[f64], given: &Given) -> Drawn {
+        let mut forms = DMatrix::zeros(points.len(), scatter_mm.len());
+        let of_probe = |mm: f64| probe(given).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
         for (c, mut form) in forms.column_iter_mut().enumerate() {
             let mut normals = Normals::new(6, c as u64);
             for (value, &k) in form.iter_mut().zip(points) {
-                *value = self.all.deviations_mm[k] - of_probe_mm * normals.next();
+                *value = self.all.deviations_mm[k] - of_probe(scatter_mm[c]) * normals.next();
             }
         }
         let found = Drawn {
-            forms,
+            forms: [forms.clone(), forms],
+            all: None,
             places: points.iter().map(|&k| self.all.places[k]).collect(),
             effects: self.all.effects.select_rows(points),
             chosen: points.to_vec(),
-            smooth_sigma_mm: vec![scatter_mm; points.len()],
+            smooth_sigma_mm: vec![mean(scatter_mm); points.len()],
+            scatter_mm: scatter_mm.to_vec(),
+            narrow_mm: [Vec::new(), Vec::new()],
+            between: None,
         };
         found.without(self.ground_in.as_ref().map(|columns| columns.select_rows(points)).as_ref())
     }
 
-    /// Tells the parameters by the points that the pose was fitted to. The others are far from the surface, and no field.
+    /// Lays the fields over the points that the pose was fitted to. The others are far from the surface, and no field.
     fn with_all_in_the_fit(registration: &Registration, given: &Given, at_points: bool) -> Result<Self, ModelError> {
         let all = registration.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Used);
         let (path, used): (Vec<f64>, Vec<&Deviation>) = all.map(|(k, d)| (k as f64, d)).unzip();
@@ -287,42 +306,47 @@ impl Seen {
         let (kept, apart): (Vec<usize>, Vec<usize>) = (0..used.len()).partition(|&k| used[k].in_fit);
         let (all, observed) =
             if apart.is_empty() { (observed.clone(), observed) } else { (observed.clone(), observed.only(&kept)) };
-        let (told, is_seen) = told(&observed, motions.size_mm, given, at_points)?;
-        let used = used.into_iter().copied().collect();
-        Ok(Self { motions, used, all, apart, kept, observed, stated, ground_in, told, is_seen })
+        let fields = Fields::over(&observed, kind(&observed))?;
+        Ok(Self { motions, all, apart, kept, observed, stated, ground_in, fields })
     }
 
     /// The slopes of what is drawn, before anything is added that has none.
-    fn slope(&self, given: &Given, drawn: Drawn) -> Option<SlopeFigures> {
+    fn slope(&self, given: &Given, posterior: &Posterior, drawn: &Drawn) -> Option<SlopeFigures> {
         let slopes = SlopesAt::over(&drawn.places, given.area.integration_mm)?;
-        let smooth = drawn.after_best_fit();
-        Some(SlopeFigures::of(&slopes, &smooth.forms, (self.is_seen, given)))
+        let smooth = [0, 1].map(|k| best_fitted(drawn.forms[k].clone(), &drawn.effects));
+        Some(SlopeFigures::of(&slopes, &smooth, (is_seen(posterior), given)))
     }
 
     /// The form by what is drawn, without its slopes; `ground_in` is what of it each of the stated effects may have made there.
-    fn form(&self, given: &Given, drawn: &Drawn, ground_in: Option<DMatrix<f64>>) -> Form {
+    fn form(
+        &self,
+        given: &Given,
+        posterior: &Posterior,
+        drawn: &Drawn,
+        ground_in: Option<DMatrix<f64>>,
+        is_whole: bool,
+    ) -> Form {
         let ground_into_kept = self.ground_in.as_ref().map(|columns| columns.select_rows(&self.kept));
         let alike = ground_into_kept.as_ref().unwrap_or(&self.observed.stated);
-        let covariance = of_the_fit(&self.observed, &self.told.wide, alike);
+        let covariance = of_the_fit(&self.observed, (&self.fields, posterior), alike);
         // What stands apart is seen, whatever the rest shows.
-        let is_seen = self.is_seen || !self.apart.is_empty();
+        let is_seen = is_seen(posterior) || !self.apart.is_empty();
         let figures = drawn.figures(is_seen, given);
-        let hyper = self.told.likely[0].0;
-        let on_a_grid = if ON_A_GRID.contains(&hyper.field.smoothness) { hyper } else { self.told.plain };
-        let ground_in = ground_in.map(|columns| best_fitted(columns, &drawn.effects));
-        let of_drawn = budget::Drawn { forms: &drawn.forms, places: &drawn.places, effects: &drawn.effects, ground_in };
-        let uncertainties_mm = [figures.rms, figures.pv_most_points].map(|of| of.standard_mm());
-        let mut budget =
-            budget::parted((&self.observed, &self.stated.sources()), &on_a_grid, &of_drawn, uncertainties_mm);
-        budget.retain(|share| share.source != Source::Datum || given.datum.is_some());
+        let budget = if is_whole { self.budget(given, posterior, drawn, ground_in, &figures) } else { Vec::new() };
+        let iso = IsoFits::over(&drawn.places, given.area.middle_mm).filter(|_| is_whole);
+        let hyper = posterior.middle();
+        let alone = match given.priors {
+            None => hyper,
+            Some(_) => self.posterior(&Given { priors: None, ..*given }).middle(),
+        };
         Form {
             hyper,
+            alone: is_seen.then_some(alone),
             frame_covariance: self.motions.to_twist(&covariance),
             points: drawn.points(),
             figures,
             budget,
-            iso: IsoFits::over(&drawn.places, given.area.middle_mm)
-                .map(|fits| IsoFigures::of(&fits, &drawn.forms, is_seen, given)),
+            iso: iso.map(|fits| IsoFigures::of(&fits, &drawn.forms, is_seen, given)),
             slope: None,
             known_mm: drawn.known_mm(),
             is_seen,
@@ -330,19 +354,39 @@ impl Seen {
     }
 }
 
-/// Tells which parameters the observations speak for, and whether they show a form at all.
-fn told(observed: &Observed, size_mm: f64, given: &Given, at_points: bool) -> Result<(Told, bool), ModelError> {
-    let priors = given.priors.unwrap_or_else(|| Priors::of_size(size_mm));
-    let is_dense = at_points && observed.places.len() <= MOST_DENSE;
-    let mut told = Hyper::told(observed, &priors, if is_dense { &ANY } else { &ON_A_GRID })?;
-    let is_seen = told.plain.evidence(observed) > EVIDENCE;
-    if !is_seen {
-        // What is spoken for by next to nothing is as good as what is spoken for by a little more.
-        let on_a_grid = told.wide.iter().filter(|(wide, _)| ON_A_GRID.contains(&wide.field.smoothness));
-        told.likely.extend(on_a_grid.copied());
-        told.likely.iter_mut().for_each(|(_, weight)| *weight = 1.0);
+impl Seen {
+    fn budget(
+        &self,
+        given: &Given,
+        posterior: &Posterior,
+        drawn: &Drawn,
+        ground_in: Option<DMatrix<f64>>,
+        figures: &FormFigures,
+    ) -> Vec<Share> {
+        let ground_in = ground_in.map(|columns| best_fitted(columns, &drawn.effects));
+        let of_drawn =
+            budget::Drawn { forms: &drawn.forms[0], places: &drawn.places, effects: &drawn.effects, ground_in };
+        let uncertainties_mm = [figures.rms, figures.pv_most_points].map(|of| of.standard_mm());
+        let sources = self.stated.sources();
+        let mut budget =
+            budget::parted((&self.observed, &sources), (&self.fields, posterior), &of_drawn, uncertainties_mm);
+        budget.retain(|share| share.source != Source::Datum || given.datum.is_some());
+        budget
     }
-    Ok((told, is_seen))
+}
+
+/// Whether the points show a form at all.
+fn is_seen(posterior: &Posterior) -> bool {
+    posterior.evidence > EVIDENCE
+}
+
+/// What is known of the scatter of the probe itself.
+fn probe(given: &Given) -> Probe {
+    (given.probe_scatter_mm[0] > 0.0).then_some(given.probe_scatter_mm)
+}
+
+fn mean(of: &[f64]) -> f64 {
+    of.iter().sum::<f64>() / of.len().max(1) as f64
 }
 
 /// Whether points follow each other like those of a path that is gone along: most are near the one before.
@@ -415,127 +459,186 @@ impl Default for Given {
 }
 
 /// The covariance of the motions as the registration finds them, by least squares of deviations that a form makes alike: A+ (K + s^2) A+'
-/// with A+ = (H'H)^-1 H' (Aitken 1935), and of what adds to all points alike. K is the mean of those of fields that it may be, each as
-/// likely as it is said. Of many points some tell the part of the form.
-fn of_the_fit(observed: &Observed, likely: &[(Hyper, f64)], alike: &DMatrix<f64>) -> DMatrix<f64> {
-    let Observed { places, effects, .. } = observed;
-    let inverse = |rows: &DMatrix<f64>| {
-        rows.tr_mul(rows).pseudo_inverse(f64::EPSILON).unwrap_or_else(|_| DMatrix::zeros(rows.ncols(), rows.ncols()))
-    };
-    let whole: f64 = likely.iter().map(|(_, weight)| weight).sum();
-    let scatter2: f64 = likely.iter().map(|(hyper, weight)| weight / whole * hyper.white_scatter_mm().powi(2)).sum();
-    let n = places.len();
-    let chosen: Vec<usize> = (0..n.min(MOST_PAIRED)).map(|k| k * n / n.min(MOST_PAIRED)).collect();
-    let rows = effects.select_rows(&chosen);
+/// with A+ = (H'H)^-1 H' (Aitken 1935), and of what adds to all points alike. K is the mean of those of all fields that it may be.
+fn of_the_fit(observed: &Observed, (fields, posterior): (&Fields, &Posterior), alike: &DMatrix<f64>) -> DMatrix<f64> {
+    let rows = &observed.effects;
+    let inverse = rows.tr_mul(rows).pseudo_inverse(f64::EPSILON);
+    let inverse = inverse.unwrap_or_else(|_| DMatrix::zeros(rows.ncols(), rows.ncols()));
     // A+, a row a point.
-    let weights = &rows * inverse(&rows);
-    let p = rows.ncols();
-    let counting = likely.iter().filter(|(_, weight)| *weight > FEW * whole);
-    let fields: Vec<_> = counting.map(|(hyper, weight)| (hyper.field.pairs(), weight / whole)).collect();
-    let covered: Vec<f64> = chosen
-        .par_iter()
-        .flat_map_iter(|&a| {
-            let mut sum = vec![0.0; p];
-            for (k, &b) in chosen.iter().enumerate() {
-                let of = |(pairs, weight): &(Pairs, f64)| weight * pairs.covariance_mm2(places[a], places[b]);
-                let covariance: f64 = fields.iter().map(of).sum();
-                sum.iter_mut().zip(weights.row(k).iter()).for_each(|(sum, weight)| *sum += covariance * weight);
-            }
-            sum
-        })
-        .collect();
-    let covered = DMatrix::from_row_slice(chosen.len(), p, &covered);
-    let of_alike = weights.tr_mul(&alike.select_rows(&chosen));
-    inverse(effects) * scatter2 + weights.tr_mul(&covered) + &of_alike * of_alike.transpose()
+    let weights = rows * &inverse;
+    let (covered, scatter2) = posterior.covered(&fields.sums(&weights));
+    let drift = fields.kind.drift;
+    let of_alike = weights.tr_mul(alike);
+    inverse * (scatter2 * (1.0 + drift) / (1.0 - drift)) + covered + &of_alike * of_alike.transpose()
 }
 
 /// Forms that may have been, a column each, at some places.
-#[derive(Clone)]
 struct Drawn {
-    forms: DMatrix<f64>,
+    /// The forms, and those by fields that follow the points more closely: by these the upper ends of extremes are told.
+    forms: [DMatrix<f64>; 2],
+    /// Where the points are few: forms that are all of what was found, but for the scatter.
+    all: Option<DMatrix<f64>>,
     places: Vec<[f64; 2]>,
     effects: DMatrix<f64>,
     /// Which of the points the places are, where they are points.
     chosen: Vec<usize>,
     /// Standard uncertainty of what is told of each place, as far as it is smooth.
     smooth_sigma_mm: Vec<f64>,
+    /// The scatter of each form, and what of either kind is in waves too short to be told.
+    scatter_mm: Vec<f64>,
+    narrow_mm: [Vec<f64>; 2],
+    /// The same forms between the places.
+    between: Option<Beside>,
+}
+
+/// Forms between places.
+struct Beside {
+    between: Between,
+    forms: [DMatrix<f64>; 2],
+    effects: DMatrix<f64>,
 }
 
 impl Drawn {
-    /// At the points, by each of the likely parameters as many as speaks for them.
-    fn of(observed: &Observed, likely: &[(Hyper, f64)]) -> Result<Self, ModelError> {
-        let n = observed.places.len();
-        let chosen: Vec<usize> = thinned(n).collect();
-        let seen = observed.only(&chosen);
-        let forms = mixed(chosen.len(), likely, |hyper, count, seed| {
-            if n <= MOST_DENSE {
-                // What was observed less scatters that may have been.
-                let scatters = Dense::fit(observed, hyper)?.scatters(count, seed)?;
-                return Ok(DMatrix::from_fn(n, count, |r, c| observed.deviations_mm[r] - scatters[(r, c)]));
+    /// At some places, and where it is asked for between them.
+    fn by(fields: &Fields, draws: Draws, places: Vec<[f64; 2]>, effects: DMatrix<f64>, is_between: bool) -> Self {
+        let Draws { waves, scatter_mm, narrow_mm } = draws;
+        let count = scatter_mm.len();
+        let at = fields.waves.at(&places);
+        let firsts: Vec<usize> = (0..count).step_by(A_TIME).collect();
+        let is_between = is_between && places.len() < MOST_PLACES;
+        let between = if is_between { Between::of(&places, &fields.waves) } else { None };
+        let axes = between.as_ref().map(|between| fields.waves.grid(&between.grid));
+        let forms = waves.each_ref().map(|waves| {
+            let some = |first: &usize| {
+                let of = &at * waves.subcols(*first, A_TIME.min(count - first));
+                (0..of.ncols()).flat_map(|c| of.col_as_slice(c).to_vec()).collect::<Vec<f64>>()
+            };
+            DMatrix::from_vec(places.len(), count, firsts.par_iter().flat_map_iter(some).collect())
+        });
+        let between = between.zip(axes).map(|(between, axes)| {
+            let on = waves.each_ref().map(|waves| {
+                let one = |c: usize| {
+                    let field = fields.waves.on_grid(&axes, waves.col_as_slice(c));
+                    let along = between.grid.counts[0];
+                    between.nodes.iter().map(|node| field[(node % along, node / along)]).collect::<Vec<f64>>()
+                };
+                let all = (0..count).into_par_iter().flat_map_iter(one).collect();
+                DMatrix::from_vec(between.nodes.len(), count, all)
+            });
+            Beside { effects: between.rows(&effects), forms: on, between }
+        });
+        Self {
+            forms,
+            all: None,
+            places,
+            effects,
+            chosen: Vec::new(),
+            smooth_sigma_mm: Vec::new(),
+            scatter_mm,
+            narrow_mm,
+            between,
+        }
+    }
+
+    /// Leaves the fields that follow the points more closely to the places that were touched: of others they say no more than that they may be anything.
+    fn rough_where_touched(mut self, touched: &[[f64; 2]]) -> Self {
+        let at = |&[x, y]: &[f64; 2]| Point::new(x, y, 0.0);
+        let near2 = (0.5 * spacing_mm(&self.places)).powi(2);
+        let tree = Nearest::of(touched.iter().map(at));
+        let is_touched = |k: &usize| tree.to(&at(&self.places[*k]), 1).any(|(_, square)| square < near2);
+        let (rough, plain): (Vec<usize>, Vec<usize>) = (0..self.places.len()).partition(is_touched);
+        // Each kind has motions of its own, which the touches do not see: they are taken off before both are one form.
+        if rough.len() < self.effects.ncols() {
+            self.forms[1] = self.forms[0].clone();
+            return self;
+        }
+        let factor = self.effects.select_rows(&rough).qr();
+        let (base, upper) = (factor.q(), factor.r());
+        for (k, forms) in self.forms.iter_mut().enumerate() {
+            let Some(moved) = upper.solve_upper_triangular(&base.tr_mul(&forms.select_rows(&rough))) else { continue };
+            *forms -= &self.effects * &moved;
+            if let Some(Beside { forms, effects, .. }) = &mut self.between {
+                forms[k] -= &*effects * moved;
             }
-            let lattice = Lattice::over(&observed.places, &hyper.field)?;
-            Sparse::fit(&lattice, observed, hyper)?.samples(&seen.places, count, seed)
-        })?;
-        // What is stated moves the part too, and that is no form.
-        let smooth_sigma_mm = match observed.stated.ncols() {
-            0 => spread_mm(&forms),
-            _ => spread_mm(&best_fitted(forms.clone(), &seen.effects)),
+        }
+        for k in plain {
+            let row = self.forms[0].row(k).into_owned();
+            self.forms[1].set_row(k, &row);
+        }
+        self
+    }
+
+    /// Tells how well the smooth form is known. What is stated moves the part too, and so do motions at other places: neither is form.
+    fn known_as(self, observed: &Observed) -> Self {
+        let at_points = !self.chosen.is_empty();
+        let smooth_sigma_mm = match at_points && observed.stated.ncols() == 0 {
+            true => spread_mm(&self.forms[0]),
+            false => spread_mm(&best_fitted(self.forms[0].clone(), &self.effects)),
         };
-        Ok(Self { smooth_sigma_mm, forms, places: seen.places, effects: seen.effects, chosen })
+        Self { smooth_sigma_mm, ..self }
     }
 
-    /// The same at other places.
-    fn over(
-        observed: &Observed,
-        likely: &[(Hyper, f64)],
-        places: Vec<[f64; 2]>,
-        effects: DMatrix<f64>,
-    ) -> Result<Self, ModelError> {
-        let everywhere: Vec<[f64; 2]> = observed.places.iter().chain(&places).copied().collect();
-        let forms = mixed(places.len(), likely, |hyper, count, seed| {
-            let lattice = Lattice::over(&everywhere, &hyper.field)?;
-            Sparse::fit(&lattice, observed, hyper)?.samples(&places, count, seed)
-        })?;
-        let drawn = Self { forms, places, effects, chosen: Vec::new(), smooth_sigma_mm: Vec::new() }.after_best_fit();
-        Ok(Self { smooth_sigma_mm: spread_mm(&drawn.forms), ..drawn })
-    }
-
-    /// Takes in what is not known of the scatter, and what of it is too narrow a form to be told from it.
+    /// Takes in what of the scatter is too narrow a form to be told from it.
     ///
-    /// What a smooth form leaves of the observations is the scatter, as far as that is known, and that is the
-    /// probe's but for a share of its square. That share of what is left at a point is form; how much more or less
-    /// is as uncertain as the scatter of the probe lets it be. Motions are in what is left too; they are taken off
-    /// afterwards.
-    fn with_the_scatter(mut self, observed: &Observed, told: &Told, given: &Given) -> Self {
-        let mut normals = Normals::new(2, 0);
-        // What is stated is left of the observations as well, and is no scatter.
+    /// What a smooth form leaves of the observations is the scatter of the probe and, as far as it is more than that, form. That share of what is left at a point is form; how much more or less is as uncertain as
+    /// the scatter of the probe lets it be.
+    fn with_the_scatter(mut self, observed: &Observed, posterior: &Posterior, given: &Given) -> Self {
+        // Motions are left of the observations as well, and what is stated: neither is scatter. Between the touches the forms have all of their motions.
         let seen = observed.only(&self.chosen);
-        let stated = (seen.stated.ncols() > 0).then(|| seen.all_effects().qr().q());
-        for mut form in self.forms.column_iter_mut() {
-            let share = (told.scatter_u * normals.next()).exp() - 1.0;
-            let [probe_mm, narrow_mm] = parted(told, given, &mut normals);
-            let is_form = narrow_mm.powi(2) / (probe_mm.powi(2) + narrow_mm.powi(2)).max(f64::MIN_POSITIVE);
-            let moved_mm = is_form.sqrt() * probe_mm;
-            let left = DVector::from_fn(form.len(), |k, _| seen.deviations_mm[k] - form[k]);
-            let left = stated.as_ref().map_or_else(|| left.clone(), |base| &left - base * base.tr_mul(&left));
-            for (value, left) in form.iter_mut().zip(&left) {
-                *value += (is_form - share * (1.0 - is_form)) * left;
-                if moved_mm > 0.0 {
-                    *value += moved_mm * normals.next();
-                }
+        let effects = seen.all_effects();
+        let base = if effects.ncols() > 0 { effects.qr().q() } else { effects };
+        let fitted = |column: DMatrix<f64>| &column - &base * base.tr_mul(&column);
+        let found = DMatrix::from_column_slice(seen.deviations_mm.len(), 1, &seen.deviations_mm);
+        if posterior.free() < FEW_FREE && probe(given).is_none() {
+            let whole = fitted(found.clone());
+            let mut all = DMatrix::zeros(whole.nrows(), self.scatter_mm.len());
+            for (c, mut form) in all.column_iter_mut().enumerate() {
+                let mut normals = Normals::new(7, c as u64);
+                form.iter_mut().zip(&whole).for_each(|(value, of)| *value = of + self.scatter_mm[c] * normals.next());
             }
+            self.all = Some(all);
         }
+        let Self { forms, scatter_mm, narrow_mm, .. } = &mut self;
+        for (forms, narrow_mm) in forms.iter_mut().zip(narrow_mm) {
+            let rows = forms.nrows();
+            let of = |(c, form): (usize, &mut [f64])| {
+                let mut normals = Normals::new(2, c as u64);
+                let [probe_mm, more_mm] = parted(scatter_mm[c], narrow_mm[c], given, &mut normals);
+                let is_form = more_mm.powi(2) / (probe_mm.powi(2) + more_mm.powi(2)).max(f64::MIN_POSITIVE);
+                if is_form < 1e-6 {
+                    return;
+                }
+                let left = fitted(DMatrix::from_fn(rows, 1, |k, _| found[k] - form[k]));
+                let moved_mm = is_form.sqrt() * probe_mm;
+                form.iter_mut()
+                    .zip(&left)
+                    .for_each(|(value, left)| *value += is_form * left + moved_mm * normals.next());
+            };
+            forms.as_mut_slice().par_chunks_mut(rows.max(1)).enumerate().for_each(of);
+        }
+        self.narrow_between(given);
         self
     }
 
-    /// Adds what is too narrow to be told at places that were not touched: what the scatter is more than that of the probe.
-    fn with_what_is_narrow(mut self, told: &Told, given: &Given) -> Self {
-        for (c, mut form) in self.forms.column_iter_mut().enumerate() {
-            let mut normals = Normals::new(4, c as u64);
-            let [_, narrow_mm] = parted(told, given, &mut normals);
-            form.iter_mut().for_each(|value| *value += narrow_mm * normals.next());
-        }
+    /// Adds what is too narrow to be told at places that were not touched: what the scatter is more than that of the probe, and short waves.
+    fn with_what_is_narrow(mut self, given: &Given) -> Self {
+        let Self { forms, scatter_mm, narrow_mm, .. } = &mut self;
+        forms
+            .iter_mut()
+            .zip(narrow_mm)
+            .for_each(|(forms, narrow_mm)| add_narrow(forms, (scatter_mm, narrow_mm), given, 4));
+        self.narrow_between(given);
         self
+    }
+
+    fn narrow_between(&mut self, given: &Given) {
+        let Self { between, scatter_mm, narrow_mm, .. } = self;
+        if let Some(Beside { forms, .. }) = between {
+            forms
+                .iter_mut()
+                .zip(narrow_mm)
+                .for_each(|(forms, narrow_mm)| add_narrow(forms, (scatter_mm, narrow_mm), given, 8));
+        }
     }
 
     /// Takes off what was ground in: each column as often as a normal number says.
@@ -544,32 +647,43 @@ impl Drawn {
     /// show neither: t is as little known as before anything was measured.
     fn without(mut self, ground_in: Option<&DMatrix<f64>>) -> Self {
         let Some(columns) = ground_in.filter(|columns| columns.ncols() > 0) else { return self };
-        for (c, mut form) in self.forms.column_iter_mut().enumerate() {
-            let mut normals = Normals::new(5, c as u64);
-            for column in columns.column_iter() {
-                form.axpy(-normals.next(), &column, 1.0);
+        let take = |forms: &mut DMatrix<f64>, columns: &DMatrix<f64>| {
+            for (c, mut form) in forms.column_iter_mut().enumerate() {
+                let mut normals = Normals::new(5, c as u64);
+                for column in columns.column_iter() {
+                    form.axpy(-normals.next(), &column, 1.0);
+                }
             }
+        };
+        self.forms.iter_mut().for_each(|forms| take(forms, columns));
+        if let Some(Beside { between, forms, .. }) = &mut self.between {
+            let columns = between.rows(columns);
+            forms.iter_mut().for_each(|forms| take(forms, &columns));
         }
         self
     }
 
     /// Both, in the order of the points.
     fn beside(self, other: Self) -> Self {
-        let (rows, more) = (self.places.len(), other.places.len());
-        let [mut forms, mut effects] = [self.forms, self.effects].map(|of| of.resize_vertically(rows + more, 0.0));
-        forms.rows_mut(rows, more).copy_from(&other.forms);
-        effects.rows_mut(rows, more).copy_from(&other.effects);
-        let places = [self.places, other.places].concat();
-        let chosen = [self.chosen, other.chosen].concat();
-        let smooth_sigma_mm = [self.smooth_sigma_mm, other.smooth_sigma_mm].concat();
+        let chosen = [&self.chosen[..], &other.chosen].concat();
         let mut order: Vec<usize> = (0..chosen.len()).collect();
         order.sort_unstable_by_key(|&row| chosen[row]);
+        let joined = |of: &DMatrix<f64>, other: &DMatrix<f64>| {
+            let rows = of.nrows();
+            let mut of = of.clone().resize_vertically(rows + other.nrows(), 0.0);
+            of.rows_mut(rows, other.nrows()).copy_from(other);
+            of.select_rows(&order)
+        };
+        let places = [&self.places[..], &other.places].concat();
+        let sigma_mm = [&self.smooth_sigma_mm[..], &other.smooth_sigma_mm].concat();
         Self {
-            forms: forms.select_rows(&order),
-            effects: effects.select_rows(&order),
+            forms: [0, 1].map(|k| joined(&self.forms[k], &other.forms[k])),
+            all: self.all.as_ref().map(|all| joined(all, &other.forms[0])),
+            effects: joined(&self.effects, &other.effects),
             places: order.iter().map(|&row| places[row]).collect(),
             chosen: order.iter().map(|&row| chosen[row]).collect(),
-            smooth_sigma_mm: order.iter().map(|&row| smooth_sigma_mm[row]).collect(),
+            smooth_sigma_mm: order.iter().map(|&row| sigma_mm[row]).collect(),
+            ..self
         }
     }
 
@@ -580,23 +694,46 @@ impl Drawn {
             let nearer =
                 |a: &usize, b: &usize| square(self.places[*a], *place).total_cmp(&square(self.places[*b], *place));
             let Some(nearest) = (0..self.places.len()).min_by(nearer) else { continue };
-            self.forms.row_mut(nearest).copy_from(&other.forms.row(r));
+            for k in [0, 1] {
+                self.forms[k].row_mut(nearest).copy_from(&other.forms[k].row(r));
+            }
             self.effects.row_mut(nearest).copy_from(&other.effects.row(r));
             self.smooth_sigma_mm[nearest] = other.smooth_sigma_mm[r];
         }
         self
     }
 
-    /// Each form after its own best fit.
+    /// Each form after its own best fit to the places.
     fn after_best_fit(mut self) -> Self {
-        self.forms = best_fitted(self.forms, &self.effects);
+        if self.effects.ncols() == 0 {
+            return self;
+        }
+        let factor = self.effects.clone().qr();
+        let (base, upper) = (factor.q(), factor.r());
+        let fit = |forms: &mut DMatrix<f64>| {
+            let taken = base.tr_mul(forms);
+            *forms -= &base * &taken;
+            taken
+        };
+        let taken = self.forms.each_mut().map(fit);
+        self.all.iter_mut().for_each(|all| {
+            fit(all);
+        });
+        if let Some(Beside { forms, effects, .. }) = &mut self.between {
+            for (forms, taken) in forms.iter_mut().zip(&taken) {
+                // What the registration was free to do is seen by the points: the factor has an inverse.
+                if let Some(moved) = upper.solve_upper_triangular(taken) {
+                    *forms -= &*effects * moved;
+                }
+            }
+        }
         self
     }
 
     fn points(&self) -> Vec<FormPoint> {
-        let count = self.forms.ncols() as f64;
+        let count = self.forms[0].ncols() as f64;
         let of = |(k, at_mm): (usize, &[f64; 2])| {
-            let row = self.forms.row(k);
+            let row = self.forms[0].row(k);
             let mean_mm = row.sum() / count;
             let sigma_mm = (row.iter().map(|v| (v - mean_mm).powi(2)).sum::<f64>() / (count - 1.0)).sqrt();
             let smooth_sigma_mm = self.smooth_sigma_mm[k];
@@ -613,34 +750,62 @@ impl Drawn {
 
     /// The figures; where no form is seen they are known from above alone.
     fn figures(&self, is_seen: bool, given: &Given) -> FormFigures {
-        let mut found: [Vec<f64>; 3] = Default::default();
-        let mut sorted = Vec::with_capacity(self.forms.nrows());
-        for form in self.forms.column_iter() {
-            sorted.clear();
-            sorted.extend(form.iter().copied());
-            sorted.sort_unstable_by(f64::total_cmp);
-            let n = sorted.len();
-            let left_out = n / 1000;
-            found[0].push((sorted.iter().map(|v| v * v).sum::<f64>() / n as f64).sqrt());
-            found[1].push(sorted[n - 1] - sorted[0]);
-            found[2].push(sorted[n - 1 - left_out] - sorted[left_out]);
-        }
-        let [rms, pv, pv_most_points] = found.map(|values| Interval::of(values, is_seen, given));
-        FormFigures { rms, pv, pv_most_points }
+        let [plain, rough] =
+            [0, 1].map(|k| self.figures_of(&self.forms[k], self.between.as_ref().map(|of| &of.forms[0])));
+        let all = self.all.as_ref().map(|all| self.figures_of(all, None));
+        let interval = |k: usize, is_extreme: bool| {
+            let of = |figures: &[[f64; 3]]| figures.iter().map(|of| of[k]).collect::<Vec<f64>>();
+            let higher = is_extreme.then(|| of(&rough)).into_iter().chain(all.as_deref().map(of));
+            Interval::of(of(&plain), higher, is_seen, given)
+        };
+        FormFigures { rms: interval(0, false), pv: interval(1, true), pv_most_points: interval(2, true) }
+    }
+
+    /// Root mean square, peak to valley, and that of the aperture, of each form.
+    fn figures_of(&self, forms: &DMatrix<f64>, between: Option<&DMatrix<f64>>) -> Vec<[f64; 3]> {
+        let rows = forms.nrows();
+        let of = |(c, form): (usize, &[f64])| {
+            let squares: f64 = form.iter().map(|v| v * v).sum();
+            let [low, high] = ends(form.iter().copied());
+            let [mut lowest, mut highest] = [low, high];
+            if let Some(between) = between {
+                // The outermost of all places, of which those that were touched stay.
+                let mut others: Vec<f64> = between.column(c).iter().copied().collect();
+                let left_out = ((rows + others.len()) / 1000).min(others.len() - 1);
+                let mut nth = |k: usize| *others.select_nth_unstable_by(k, f64::total_cmp).1;
+                lowest = low.min(nth(left_out));
+                let last = between.nrows() - 1;
+                highest = high.max(nth(last - left_out));
+            }
+            [(squares / rows as f64).sqrt(), high - low, highest - lowest]
+        };
+        forms.as_slice().par_chunks(rows.max(1)).enumerate().map(of).collect()
     }
 }
 
-/// The scatter of the probe and what of the scatter is too narrow a form, each as it may be. Where nothing tells how
-/// far the probe scatters it is the scatter that was found.
-fn parted(told: &Told, given: &Given, normals: &mut Normals) -> [f64; 2] {
-    let ([probe_mm, probe_u], scatter_mm) = (given.probe_scatter_mm, told.likely[0].0.scatter_mm);
-    if probe_mm <= 0.0 {
-        return [scatter_mm, 0.0];
-    }
-    let may_be = |mm: f64, share: f64, z: f64| (mm * (share * z).exp()).powi(2);
-    let found = may_be(scatter_mm, told.scatter_u, normals.next());
-    let own = may_be(probe_mm, probe_u, normals.next());
-    [own.min(found).sqrt(), (found - own).max(0.0).sqrt()]
+fn ends(of: impl Iterator<Item = f64>) -> [f64; 2] {
+    of.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
+}
+
+/// Adds to every place of each form what is too narrow to be told there.
+fn add_narrow(forms: &mut DMatrix<f64>, (scatter_mm, narrow_mm): (&[f64], &[f64]), given: &Given, stream: u64) {
+    let rows = forms.nrows();
+    let of = |(c, form): (usize, &mut [f64])| {
+        let [_, more_mm] = parted(scatter_mm[c], narrow_mm[c], given, &mut Normals::new(2, c as u64));
+        let mut normals = Normals::new(stream, c as u64);
+        if more_mm > 0.0 {
+            form.iter_mut().for_each(|value| *value += more_mm * normals.next());
+        }
+    };
+    forms.as_mut_slice().par_chunks_mut(rows.max(1)).enumerate().for_each(of);
+}
+
+/// The scatter of the probe and what beside it is too narrow a form, each as it may be. Where nothing tells how
+/// far the probe scatters all of the scatter is its own.
+fn parted(scatter_mm: f64, narrow_mm: f64, given: &Given, normals: &mut Normals) -> [f64; 2] {
+    let Some([probe_mm, probe_u]) = probe(given) else { return [scatter_mm, narrow_mm] };
+    let own_mm = (probe_mm * (probe_u * normals.next()).exp()).min(scatter_mm);
+    [own_mm, (scatter_mm.powi(2) - own_mm.powi(2)).max(0.0).sqrt().hypot(narrow_mm)]
 }
 
 /// Each form after its own best fit.
@@ -658,27 +823,6 @@ fn spread_mm(forms: &DMatrix<f64>) -> Vec<f64> {
     forms.row_iter().map(|row| row.variance().sqrt()).collect()
 }
 
-/// Forms drawn by each of the likely parameters, as many as speaks for them, one beside the other.
-fn mixed(
-    rows: usize,
-    likely: &[(Hyper, f64)],
-    draw: impl Fn(Hyper, usize, u64) -> Result<DMatrix<f64>, ModelError>,
-) -> Result<DMatrix<f64>, ModelError> {
-    let whole: f64 = likely.iter().map(|(_, weight)| weight).sum();
-    let mut forms = DMatrix::zeros(rows, 0);
-    for (seed, (hyper, weight)) in (1..).zip(likely) {
-        let count = (SAMPLES as f64 * weight / whole).round() as usize;
-        if count < FEWEST_SAMPLES {
-            continue;
-        }
-        let drawn = draw(*hyper, count, seed)?;
-        let before = forms.ncols();
-        forms = forms.resize(rows, before + count, 0.0);
-        forms.columns_mut(before, count).copy_from(&drawn);
-    }
-    Ok(forms)
-}
-
 impl Interval {
     /// The probabilities of the quantiles by which a figure is recorded.
     pub const PROBABILITIES: [f64; 15] =
@@ -690,11 +834,26 @@ impl Interval {
         (self.high_mm - self.low_mm) / WIDTH
     }
 
-    /// Of values that are equally probable.
-    pub(super) fn of(mut values: Vec<f64>, has_low: bool, given: &Given) -> Self {
+    /// Of values that are equally probable; from above by whichever of others are higher.
+    pub(super) fn of(
+        mut values: Vec<f64>,
+        higher: impl Iterator<Item = Vec<f64>>,
+        has_low: bool,
+        given: &Given,
+    ) -> Self {
         values.sort_unstable_by(f64::total_cmp);
+        let higher: Vec<Vec<f64>> = higher
+            .map(|mut of| {
+                of.sort_unstable_by(f64::total_cmp);
+                of
+            })
+            .collect();
         let Given { look_risk, probability, .. } = *given;
-        let at = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
+        let nth = |of: &[f64], share: f64| of[((of.len() - 1) as f64 * share).round() as usize];
+        let at = |share: f64| {
+            let own = nth(&values, share);
+            if share > 0.5 { higher.iter().fold(own, |most, of| most.max(nth(of, share))) } else { own }
+        };
         let low = |share: f64| if has_low { at(share) } else { 0.0 };
         Self {
             median_mm: at(0.5),

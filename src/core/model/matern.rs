@@ -1,8 +1,8 @@
 //! The correlation of a field at a distance, by its smoothness.
 //!
-//! Matern's of smoothness nu is M(x) = 2^(1 - nu) x^nu K_nu(x) / Gamma(nu) with x = kappa r, kappa = sqrt(8 nu) / range: x^2 K_2(x) / 2 and
-//! x^4 K_4(x) / 48. At one range it has fallen to 0.14, and without end of nu it is exp(-2 (r / range)^2). K_nu is the modified
-//! Bessel function of the second kind; its integral over exp(-x cosh t) cosh(nu t) is summed once at equal steps of x, and read by cubics
+//! Matern's of smoothness nu is M(x) = 2^(1 - nu) x^nu K_nu(x) / Gamma(nu) with x = kappa r, kappa = sqrt(8 nu) / range: exp(-x) of nu = 1/2, and
+//! x^2 K_2(x) / 2. At one range it has fallen to 0.14, and without end of nu it is exp(-2 (r / range)^2). K_2 is the modified
+//! Bessel function of the second kind; its integral over exp(-x cosh t) cosh(2 t) is summed once at equal steps of x, and read by cubics
 //! between them: within 1e-10.
 
 use std::sync::OnceLock;
@@ -12,6 +12,7 @@ use super::Smoothness;
 /// Steps of the table in 1, and where it ends: both are below 1e-14 there.
 const STEPS: usize = 256;
 const LAST: usize = 45;
+const STEPS_A_RANGE: f64 = 4.0 * STEPS as f64;
 
 /// A table of the correlation and its slope.
 type Table = OnceLock<Vec<[f64; 2]>>;
@@ -21,26 +22,23 @@ type Table = OnceLock<Vec<[f64; 2]>>;
 pub(super) struct Curve {
     /// The steps in which the correlation is read; none where it is an exponential.
     table: Option<&'static [[f64; 2]]>,
-    /// Steps of the table in one range.
-    steps: f64,
+    /// Whether the exponential is one of the distance, not of its square.
+    is_rough: bool,
 }
 
 impl Curve {
     pub(super) fn of(smoothness: Smoothness) -> Self {
         static ONCE: Table = Table::new();
-        static THRICE: Table = Table::new();
-        match smoothness {
-            Smoothness::Once => Self { table: Some(read(&ONCE, 2)), steps: 4.0 * STEPS as f64 },
-            Smoothness::Thrice => Self { table: Some(read(&THRICE, 4)), steps: 32_f64.sqrt() * STEPS as f64 },
-            Smoothness::Endless => Self { table: None, steps: 0.0 },
-        }
+        Self { table: (smoothness == Smoothness::Once).then(|| read(&ONCE)), is_rough: smoothness == Smoothness::Never }
     }
 
     /// Returns the correlation at a distance in ranges, by its square.
     #[inline]
     pub(super) fn at(&self, ranges2: f64) -> f64 {
-        let Some(table) = self.table else { return (-2.0 * ranges2).exp() };
-        let at = (self.steps * ranges2.sqrt()).min((LAST * STEPS) as f64);
+        let Some(table) = self.table else {
+            return (-2.0 * if self.is_rough { ranges2.sqrt() } else { ranges2 }).exp();
+        };
+        let at = (STEPS_A_RANGE * ranges2.sqrt()).min((LAST * STEPS) as f64);
         let k = at as usize;
         let Some([[a, da], [b, db]]) = table.get(k..k + 2).and_then(|pair| pair.first_chunk::<2>()) else { return 0.0 };
         let t = at - k as f64;
@@ -50,19 +48,16 @@ impl Curve {
     }
 }
 
-fn read(table: &'static Table, nu: i32) -> &'static [[f64; 2]] {
-    table.get_or_init(|| (0..=LAST * STEPS).map(|k| exact(nu, k as f64 / STEPS as f64)).collect())
+fn read(table: &'static Table) -> &'static [[f64; 2]] {
+    table.get_or_init(|| (0..=LAST * STEPS).map(|k| exact(k as f64 / STEPS as f64)).collect())
 }
 
-/// The correlation and its slope, M' = -2^(1 - nu) x^nu K_(nu-1)(x) / Gamma(nu).
-fn exact(nu: i32, x: f64) -> [f64; 2] {
+/// The correlation of nu = 2 and its slope, M' = -x^2 K_1(x) / 2.
+fn exact(x: f64) -> [f64; 2] {
     if x == 0.0 {
         return [1.0, 0.0];
     }
-    // 2^(nu - 1) Gamma(nu)
-    let scale = (1..nu).map(|k| 2.0 * f64::from(k)).product::<f64>();
-    let power = x.powi(nu) / scale;
-    [power * bessel(f64::from(nu), x), -power * bessel(f64::from(nu - 1), x)]
+    [0.5 * x * x * bessel(2.0, x), -0.5 * x * x * bessel(1.0, x)]
 }
 
 /// K_nu(x) by equal steps: the integrand is analytic and falls doubly exponentially, so the sum is exact to rounding.
@@ -91,25 +86,22 @@ mod tests {
         Curve::of(smoothness).at(ranges * ranges)
     }
 
-    /// K_2 and K_4 from tables (Abramowitz and Stegun, 9.8; Wolfram): 0.1, 1, 2, 5, 10.
-    const K: [(f64, f64, f64); 5] = [
-        (0.1, 199.503_964_642_114_1, 479_600.249_792_568_27),
-        (1.0, 1.624_838_898_635_177_4, 44.232_415_847_062_84),
-        (2.0, 0.253_759_754_566_055_8, 2.195_915_927_411_958_6),
-        (5.0, 5.308_943_712_223_46e-3, 1.525_906_581_050_080_5e-2),
-        (10.0, 2.150_981_700_693_277e-5, 3.786_143_716_089_198e-5),
+    /// K_2 from tables (Abramowitz and Stegun, 9.8; Wolfram): 0.1, 1, 2, 5, 10.
+    const K: [(f64, f64); 5] = [
+        (0.1, 199.503_964_642_114_1),
+        (1.0, 1.624_838_898_635_177_4),
+        (2.0, 0.253_759_754_566_055_8),
+        (5.0, 5.308_943_712_223_46e-3),
+        (10.0, 2.150_981_700_693_277e-5),
     ];
 
     #[test]
     fn it_is_that_of_the_tables() {
-        for (x, k2, k4) in K {
-            let of = [
-                (correlation(Smoothness::Once, x / 4.0), 0.5 * x * x * k2),
-                (correlation(Smoothness::Thrice, x / 32_f64.sqrt()), x.powi(4) * k4 / 48.0),
-            ];
-            for (found, expected) in of {
-                assert!((found / expected - 1.0).abs() < 1e-10, "{x}: {found} {expected}");
-            }
+        for (x, k2) in K {
+            let (found, expected) = (correlation(Smoothness::Once, x / 4.0), 0.5 * x * x * k2);
+            assert!((found / expected - 1.0).abs() < 1e-10, "{x}: {found} {expected}");
+            let rough = correlation(Smoothness::Never, x / 2.0);
+            assert!((rough / (-x).exp() - 1.0).abs() < 1e-14, "{x}: {rough}");
         }
         for smoothness in ALL {
             assert_eq!(correlation(smoothness, 0.0), 1.0);
@@ -118,17 +110,14 @@ mod tests {
         }
     }
 
-    const ALL: [Smoothness; 3] = [Smoothness::Once, Smoothness::Thrice, Smoothness::Endless];
+    const ALL: [Smoothness; 3] = [Smoothness::Never, Smoothness::Once, Smoothness::Endless];
 
     #[test]
     fn between_the_steps_it_is_as_exact() {
         for k in 0..4000 {
             let x = 1e-4 + 0.011_37 * f64::from(k);
-            for (nu, found) in
-                [(2, correlation(Smoothness::Once, x / 4.0)), (4, correlation(Smoothness::Thrice, x / 32_f64.sqrt()))]
-            {
-                assert!((found - exact(nu, x)[0]).abs() < 1e-10, "{nu} {x}");
-            }
+            let found = correlation(Smoothness::Once, x / 4.0);
+            assert!((found - exact(x)[0]).abs() < 1e-10, "{x}");
         }
     }
 

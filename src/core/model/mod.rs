@@ -1,44 +1,43 @@
 //! One model of the error of a part: a rigid motion, a smooth random field, and the scatter of the probe.
 //!
 //! ```text
-//!  deviations at points --> likelihood --> Hyper: how strong and how wide the field is, how far a point scatters
-//!          |                                  |
-//!          +------> Dense, or Sparse <--------+
-//!                        |
-//!                        +--> mean and sigma anywhere, the motion with its covariance, samples of all of it
+//!  deviations at points --> Fields: smoothness and range, one eigenproblem each --> Posterior: each with every strength and scatter, and its
+//!                                                                                        |            probability
+//!                                                                                        +--> forms drawn from all of them: figures, map, frame
 //! ```
 //!
 //! The deviation of point i is d_i = h_i' b + f(x_i) + e_i. The rows h_i are what the registration could still move (its Jacobian), with
-//! no knowledge of b beforehand; f is a Matern field of smoothness 2; e_i is independent, or shared
+//! no knowledge of b beforehand; f is a field whose smoothness, range and strength nobody knows; e_i is independent, or shared
 //! with the points before it along the path where the probe drifts. Motion and field are told together, for a
 //! direction in which the surface does not hold the part looks like form: whoever takes one for known gives the other a lie.
 //!
-//! Two ways to the same answer. [`Dense`] has the covariance of every pair of points: exact, for some 3,000 points. [`Sparse`] has the
-//! precision of the field on a grid (Lindgren, Rue and Lindstrom 2011, alpha = 3), where each node knows its neighbours alone: for any
-//! number of points, and for samples.
+//! [`Dense`] has the covariance of every pair of points by one set of parameters, [`Growing`] the same as points come.
 //!
 //! [`Sessions`] tells what comes back in several measurements from what is of each alone.
 //!
 //! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
 
+mod between;
 mod budget;
 mod dense;
 mod effects;
 mod error;
 mod field;
+mod fields;
 mod figures;
 mod form;
 mod growing;
 mod hill;
-mod likelihood;
+mod kind;
 mod machine;
 mod matern;
 mod normals;
-mod profile;
+mod posterior;
+mod priors;
 mod sessions;
-mod sparse;
 mod taught;
 mod touches;
+mod waves;
 
 pub use budget::Share;
 pub use dense::{Dense, Predicted};
@@ -48,10 +47,9 @@ pub use field::{Field, Lay, Smoothness};
 pub use figures::{AngleInterval, AreaOptions, IsoFigures, SlopeFigures};
 pub use form::{Form, FormFigures, FormPoint, Given, Interval};
 pub use growing::Growing;
-pub use likelihood::Priors;
 pub use machine::{Machine, Source};
+pub use priors::Priors;
 pub use sessions::{Between, Foretold, Sessions};
-pub use sparse::{Lattice, Sparse};
 pub use taught::{Lesson, Taught};
 pub use touches::{FEWEST, FIRST, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread};
 
@@ -154,6 +152,19 @@ fn spacing_mm(places: &[[f64; 2]]) -> f64 {
 }
 
 impl Hyper {
+    /// Finds the parameters that what was measured speaks for, as one number each: the middle of those that may be.
+    ///
+    /// # Errors
+    /// Rows that do not belong together, too few points, effects that cannot be told apart, expectations that cannot be.
+    pub fn of(observed: &Observed, priors: Option<&Priors>) -> Result<Self, ModelError> {
+        if let Some(priors) = priors {
+            priors.check()?;
+        }
+        observed.check()?;
+        let fields = fields::Fields::over(observed, kind::kind(observed))?;
+        Ok(posterior::Posterior::of(&fields, observed, priors, None).middle())
+    }
+
     /// How much of their scatter two points share that are so many steps of the path apart.
     fn shared(&self, steps: f64) -> f64 {
         // Further apart nothing is left of it.
@@ -163,12 +174,6 @@ impl Hyper {
         }
         let power = steps.abs() * self.drift.ln();
         if power < -FAR { 0.0 } else { power.exp() }
-    }
-
-    /// The scatter of independent points that would leave as much of a field unknown that is wider than the drift is long: that of their
-    /// sum, s^2 (1 + drift) / (1 - drift).
-    fn white_scatter_mm(&self) -> f64 {
-        self.scatter_mm * ((1.0 + self.drift) / (1.0 - self.drift)).sqrt()
     }
 
     /// Says what makes these no parameters.

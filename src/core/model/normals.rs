@@ -26,7 +26,7 @@ impl Normals {
     }
 
     /// From 0 up to, and not, 1.
-    fn uniform(&mut self) -> f64 {
+    pub(super) fn uniform(&mut self) -> f64 {
         (self.bits() >> 11) as f64 / (1_u64 << 53) as f64
     }
 

@@ -45,7 +45,7 @@ pub struct SoFar<'a> {
 /// What is known, and what follows.
 #[derive(Clone, Debug)]
 pub struct Look {
-    /// The form over all targets.
+    /// The form over all targets; without slopes, ISO figures and its budget where touches follow.
     pub form: Form,
     /// The targets to touch next, in the order of a short way; none where enough is known.
     pub next: Vec<usize>,
@@ -128,7 +128,7 @@ pub fn look(
     purpose: &Purpose,
     seed: u64,
 ) -> Result<Look, ModelError> {
-    let form = Form::over(registration, given, so_far.targets)?;
+    let form = Form::told_over(registration, given, so_far.targets, false)?;
     let mut growing = Expected::of(registration, given, &form, so_far)?;
     let count = so_far.touched.len();
     let left = so_far.tried.iter().filter(|tried| tried.is_none()).count();
@@ -154,6 +154,8 @@ pub fn look(
     };
     let is_all = matches!(why, Why::Feature | Why::Late);
     let next = if is_all { next } else { short_way(so_far.targets, next) };
+    // More is said of the last look alone.
+    let form = if next.is_empty() { Form::over(registration, given, so_far.targets)? } else { form };
     Ok(Look { form, next, why })
 }
 

@@ -1,0 +1,173 @@
+//! Places between the touched ones: the nodes of a grid that have touched places near them all around.
+//!
+//! A place that has none within [`FARTHEST`] distances of the points on some side is one that nobody touched, or beyond the edge.
+
+use nalgebra::DMatrix;
+
+use super::spacing_mm;
+use super::waves::{Grid, Waves};
+use crate::geometry::{Nearest, Point};
+
+/// Places at most, and at least so many along the distance of two points.
+const MOST: f64 = 3000.0;
+const A_DISTANCE: f64 = 2.0;
+/// Degree of the polynomials that tell a smooth column between the points, at most.
+const MOST_DEGREE: usize = 9;
+/// Distances of the points within which touched places lie all around.
+const FARTHEST: f64 = 2.5;
+
+/// Nodes of a grid, each between touched places.
+pub(super) struct Between {
+    pub(super) grid: Grid,
+    /// The number of each on the grid, column by column.
+    pub(super) nodes: Vec<usize>,
+    /// Touched places beside each, and how much it has of each.
+    corners: Vec<([usize; 3], [f64; 3])>,
+    /// Polynomials at the touched places and at the nodes.
+    terms: [DMatrix<f64>; 2],
+}
+
+impl Between {
+    /// Lays a grid along the axes of some waves; none where it would hold no place.
+    pub(super) fn of(places: &[[f64; 2]], waves: &Waves) -> Option<Self> {
+        let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.turned(place)).collect();
+        let distance_mm = spacing_mm(&places);
+        let spans = [0, 1].map(|axis| {
+            let of = places.iter().map(|place| place[axis]);
+            [of.clone().fold(f64::INFINITY, f64::min), of.fold(f64::NEG_INFINITY, f64::max)]
+        });
+        let area_mm2: f64 = spans.iter().map(|[low, high]| high - low).product();
+        let spacing_mm = (distance_mm / A_DISTANCE).max((area_mm2 / MOST).sqrt());
+        if !(area_mm2 > 0.0 && spacing_mm > 0.0 && spacing_mm.is_finite()) {
+            return None;
+        }
+        let counts = spans.map(|[low, high]| ((high - low) / spacing_mm) as usize + 1);
+        let corner_mm =
+            [0, 1].map(|axis: usize| 0.5 * (spans[axis][0] + spans[axis][1] - spacing_mm * (counts[axis] - 1) as f64));
+        let grid = Grid { corner_mm, spacing_mm, counts };
+        let at = |node: &usize| {
+            let [i, j] = [node % counts[0], node / counts[0]];
+            [(i, 0), (j, 1)].map(|(k, axis): (usize, usize)| corner_mm[axis] + spacing_mm * k as f64)
+        };
+        let tree = Nearest::of(places.iter().map(|&[x, y]| Point::new(x, y, 0.0)));
+        let beside = |node: usize| Some((node, beside(at(&node), &places, &tree, FARTHEST * distance_mm)?));
+        let (nodes, corners): (Vec<usize>, Vec<_>) = (0..counts[0] * counts[1]).filter_map(beside).unzip();
+        if nodes.is_empty() {
+            return None;
+        }
+        let degree = (0..MOST_DEGREE).take_while(|degree| 3 * (degree + 2) * (degree + 3) / 2 <= places.len()).count();
+        let at_nodes: Vec<[f64; 2]> = nodes.iter().map(at).collect();
+        let terms = [&places, &at_nodes].map(|places| polynomials(places, spans, degree));
+        Some(Self { grid, nodes, corners, terms })
+    }
+
+    /// Columns with a row a touched place, as they are at the nodes: polynomials, and of what these leave as much as the places beside it have.
+    ///
+    /// What a motion does to a curved part is taken off forms that may be thousands of times larger: straight lines alone would leave some of that.
+    pub(super) fn rows(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
+        let [at_points, at_nodes] = &self.terms;
+        let factor = at_points.clone().qr();
+        let fitted = factor.r().solve_upper_triangular(&factor.q().tr_mul(columns));
+        let fitted = fitted.unwrap_or_else(|| DMatrix::zeros(at_points.ncols(), columns.ncols()));
+        let left = columns - at_points * &fitted;
+        let between = DMatrix::from_fn(self.nodes.len(), columns.ncols(), |r, c| {
+            let (corners, shares) = self.corners[r];
+            (0..3).map(|k| shares[k] * left[(corners[k], c)]).sum()
+        });
+        at_nodes * fitted + between
+    }
+}
+
+/// Returns three of the nearest touched places and how much a place has of each, where those that are near lie all around it.
+fn beside(at: [f64; 2], places: &[[f64; 2]], tree: &Nearest, near_mm: f64) -> Option<([usize; 3], [f64; 3])> {
+    const ASKED: u32 = 12;
+    let near: Vec<(usize, f64)> = tree.to(&Point::new(at[0], at[1], 0.0), ASKED).collect();
+    let mut angles: Vec<f64> = Vec::new();
+    for (k, square) in &near {
+        // A touched place is its own.
+        if *square < 1e-12 * near_mm * near_mm {
+            return Some(([*k; 3], [1.0, 0.0, 0.0]));
+        }
+        if *square <= near_mm * near_mm {
+            angles.push((places[*k][1] - at[1]).atan2(places[*k][0] - at[0]));
+        }
+    }
+    angles.sort_unstable_by(f64::total_cmp);
+    let around = angles.first().map(|first| first + std::f64::consts::TAU);
+    let widest = angles.iter().zip(angles.iter().skip(1).copied().chain(around)).map(|(a, b)| b - a);
+    if angles.len() < 3 || widest.fold(0.0, f64::max) > std::f64::consts::PI + 1e-9 {
+        return None;
+    }
+    let whole: f64 = near[..3].iter().map(|(_, square)| square.recip()).sum();
+    Some(([0, 1, 2].map(|k| near[k].0), [0, 1, 2].map(|k| near[k].1.recip() / whole)))
+}
+
+/// Products of Chebyshev's polynomials up to a degree over a rectangle: a row a place.
+fn polynomials(places: &[[f64; 2]], spans: [[f64; 2]; 2], degree: usize) -> DMatrix<f64> {
+    let orders: Vec<[usize; 2]> = (0..=degree).flat_map(|a| (0..=degree - a).map(move |b| [a, b])).collect();
+    let along = |place: &[f64; 2], axis: usize| {
+        let [low, high] = spans[axis];
+        ((2.0 * place[axis] - low - high) / (high - low)).clamp(-1.0, 1.0).acos()
+    };
+    let angles: Vec<[f64; 2]> = places.iter().map(|place| [along(place, 0), along(place, 1)]).collect();
+    DMatrix::from_fn(places.len(), orders.len(), |r, c| {
+        let [a, b] = orders[c];
+        (a as f64 * angles[r][0]).cos() * (b as f64 * angles[r][1]).cos()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Lay;
+    use super::*;
+
+    fn over(places: &[[f64; 2]]) -> Option<Between> {
+        Between::of(places, &Waves::over(places, Lay::NONE, 100))
+    }
+
+    #[test]
+    fn the_nodes_lie_between_the_points_and_what_is_level_or_tilted_stays_so() {
+        let places: Vec<[f64; 2]> = (0..96).map(|k| [4.0 * f64::from(k % 12), 3.0 * f64::from(k / 12)]).collect();
+        let between = over(&places).unwrap();
+        assert!(between.nodes.len() > 3 * places.len() / 2 && between.nodes.len() < 6 * places.len());
+        let tilted = DMatrix::from_fn(96, 2, |r, c| [1.0, 0.3 * places[r][0] - 0.7 * places[r][1]][c]);
+        let rows = between.rows(&tilted);
+        for (r, node) in between.nodes.iter().enumerate() {
+            let [i, j] = [node % between.grid.counts[0], node / between.grid.counts[0]];
+            let [x, y] =
+                [(i, 0), (j, 1)].map(|(k, axis)| between.grid.corner_mm[axis] + between.grid.spacing_mm * k as f64);
+            assert!((rows[(r, 0)] - 1.0).abs() < 1e-12 && (rows[(r, 1)] - 0.3 * x + 0.7 * y).abs() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn a_smooth_column_is_told_as_if_it_were_known_everywhere() {
+        let places: Vec<[f64; 2]> = (0..400).map(|k| [4.0 * f64::from(k % 20), 3.0 * f64::from(k / 20)]).collect();
+        let between = over(&places).unwrap();
+        let bent = |x: f64, y: f64| (0.03 * x).sin() + 1e-3 * x * y + (0.02 * y).cos();
+        let rows = between.rows(&DMatrix::from_fn(400, 1, |r, _| bent(places[r][0], places[r][1])));
+        let off = between.nodes.iter().enumerate().map(|(r, node)| {
+            let [i, j] = [node % between.grid.counts[0], node / between.grid.counts[0]];
+            let at = |k: usize, axis: usize| between.grid.corner_mm[axis] + between.grid.spacing_mm * k as f64;
+            (rows[(r, 0)] - bent(at(i, 0), at(j, 1))).abs()
+        });
+        // Between two places straight lines would be off by 4^2 / 8 0.03^2, some 2e-3.
+        let most = off.fold(0.0, f64::max);
+        assert!(most < 1e-6, "{most}");
+    }
+
+    #[test]
+    fn over_a_quarter_that_nobody_touched_there_is_none() {
+        let all = (0..900).map(|k| [2.0 * f64::from(k % 30), 2.0 * f64::from(k / 30)]);
+        let places: Vec<[f64; 2]> = all.filter(|[x, y]| *x < 30.0 || *y < 30.0).collect();
+        let between = over(&places).unwrap();
+        let inside = between.nodes.iter().filter(|node| {
+            let [i, j] = [*node % between.grid.counts[0], *node / between.grid.counts[0]];
+            let [x, y] =
+                [(i, 0), (j, 1)].map(|(k, axis)| between.grid.corner_mm[axis] + between.grid.spacing_mm * k as f64);
+            x > 36.0 && y > 36.0
+        });
+        assert_eq!(inside.count(), 0);
+        assert!(over(&[[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [1.0, 0.0]]).is_none());
+    }
+}

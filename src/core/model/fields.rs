@@ -1,0 +1,426 @@
+//! The fields that a form may be, over the points of a measurement: everything that does not depend on what was found there.
+//!
+//! ```text
+//!  W d = W H b + W E t + W f + e        e of variance s^2, W takes off what a touch has of the scatter of the one before it
+//!  R K R = U diag(l) U'                 R = 1 - Q Q', Q an orthonormal base of W H; K of W f by the waves of one node
+//! ```
+//!
+//! A node is a smoothness and a range. After this one eigenproblem of it every strength is O(n): with v = U'R W d, the strength tau in
+//! variances of the scatter and l scaled so that tau is the square of the form's RMS after the best fit, -2 ln p = sum ln(1 + l tau) + (n - p) ln sum v^2 / (1 + l tau),
+//! the scatter integrated out with the density 1 / s^2.
+//!
+//! The waves are as many as can be told apart by the points, by a Cholesky factor with pivots of their products. A field has shorter ones too: those are as good
+//! as independent from point to point, and add to every l alike.
+
+use faer::linalg::matmul::triangular::{self, BlockStructure};
+use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
+use faer::{Accum, Mat, Par, Side};
+use nalgebra::DMatrix;
+use rayon::prelude::*;
+
+use super::waves::Waves;
+use super::{Lay, ModelError, Observed, Smoothness, spacing_mm};
+
+/// Kinds of field, from rough to smooth.
+pub(super) const KINDS: [Smoothness; 3] = [Smoothness::Never, Smoothness::Once, Smoothness::Endless];
+/// Ranges of each kind: so many, from so many distances of the points to so many sizes of the part.
+const RANGES: usize = 9;
+const LEAST_RANGE: f64 = 2.5;
+const MOST_RANGE: f64 = 5.0;
+/// A range holds no less than so many of the half of the shortest wave.
+const WAVES_A_RANGE: f64 = 2.0;
+/// Strengths, in variances of the scatter: so many, in equal steps of their logarithm.
+const STRENGTHS: usize = 33;
+const STRENGTH: [f64; 2] = [1e-3, 1e5];
+/// Waves at most, of few points and of many.
+const MOST_WAVES: [usize; 2] = [1000, 600];
+/// Waves a point, at least where the points are few.
+const WAVES_A_POINT: f64 = 5.0;
+const FEWEST_WAVES: usize = 150;
+/// Points that are worked with one by one, at most; of more what their waves have in common.
+const MOST_WHOLE: usize = 600;
+/// A wave that has this share of the strongest adds nothing, nor what is told apart by this share of the variance.
+const NOTHING: f64 = 1e-4;
+const NOT_APART: f64 = 1e-5;
+/// Rows that are worked on at a time.
+const ROWS: usize = 1024;
+
+/// How the scatter goes on from a point to the next one, and along what lay fields are wider.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Kind {
+    pub(super) lay: Lay,
+    pub(super) drift: f64,
+}
+
+impl Kind {
+    pub(super) const PLAIN: Self = Self { lay: Lay::NONE, drift: 0.0 };
+}
+
+/// Fields over the points of a measurement.
+pub(super) struct Fields {
+    pub(super) kind: Kind,
+    pub(super) waves: Waves,
+    places: Vec<[f64; 2]>,
+    /// What of a point's row and of that of the point before makes its row beside a scatter that is independent.
+    whitening: Vec<[f64; 2]>,
+    /// Q.
+    base: DMatrix<f64>,
+    /// n - p.
+    pub(super) free: f64,
+    reduced: Reduced,
+    /// Q'W phi: what the best fit takes of the waves.
+    taken: Mat<f64>,
+    pub(super) nodes: Vec<Node>,
+}
+
+/// What the waves are at the points, in as few coordinates as tell them apart.
+struct Reduced {
+    /// A row a coordinate, a column a wave.
+    rows: Mat<f64>,
+    /// The waves by whose products the coordinates are made; none where each point is one.
+    pivots: Option<Vec<usize>>,
+}
+
+/// A smoothness and a range.
+pub(super) struct Node {
+    pub(super) smoothness: Smoothness,
+    pub(super) range_mm: f64,
+    /// Standard deviations of the first waves, in a field of strength 1.
+    pub(super) strengths: Vec<f64>,
+    /// The variance of a point that is in shorter waves.
+    pub(super) narrow: f64,
+    /// What makes tau s^2 the variance of the field.
+    pub(super) scale: f64,
+    /// Eigenvalues of the waves, unscaled, and U in the coordinates.
+    pub(super) values: Vec<f64>,
+    pub(super) vectors: Mat<f64>,
+    /// The logarithm of what is known of each strength beforehand.
+    pub(super) prior: Vec<f64>,
+}
+
+/// All strengths.
+pub(super) fn strengths() -> impl Iterator<Item = f64> {
+    let [least, most] = STRENGTH.map(f64::ln);
+    (0..STRENGTHS).map(move |k| (least + (most - least) * k as f64 / (STRENGTHS - 1) as f64).exp())
+}
+
+impl Fields {
+    /// Lays the fields of every node over the points.
+    ///
+    /// # Errors
+    /// Rows that do not belong together, too few points, effects that cannot be told apart.
+    pub(super) fn over(observed: &Observed, kind: Kind) -> Result<Self, ModelError> {
+        let mut fields = Self::bare(observed, kind)?;
+        let ranges_mm = fields.ranges_mm(RANGES);
+        // Rough fields hardly differ from one range to the next, and take longest.
+        let is_laid = |k: usize, smoothness: Smoothness| smoothness != Smoothness::Never || k.is_multiple_of(2);
+        let all = ranges_mm.enumerate().flat_map(|(k, range_mm)| KINDS.map(|smoothness| (k, smoothness, range_mm)));
+        let all: Vec<_> =
+            all.filter(|of| is_laid(of.0, of.1)).map(|(_, smoothness, range_mm)| (smoothness, range_mm)).collect();
+        fields.nodes = fields.laid(&all);
+        Ok(fields)
+    }
+
+    /// So many ranges, in equal steps of their logarithm: from what the points and the waves tell apart to more than the part.
+    fn ranges_mm(&self, count: usize) -> impl Iterator<Item = f64> + use<> {
+        let least_mm = (LEAST_RANGE * spacing_mm(&self.places)).max(WAVES_A_RANGE * self.waves.shortest_mm());
+        let most_mm = (MOST_RANGE * size_mm(&self.places)).max(1.5 * least_mm);
+        let ratio = (most_mm / least_mm).ln() / (count - 1) as f64;
+        (0..count).map(move |k| least_mm * (ratio * k as f64).exp())
+    }
+
+    /// Lays the fields of some nodes only.
+    #[cfg(test)]
+    pub(super) fn of_nodes(observed: &Observed, kind: Kind, nodes: &[(Smoothness, f64)]) -> Result<Self, ModelError> {
+        let mut fields = Self::bare(observed, kind)?;
+        fields.nodes = fields.laid(nodes);
+        Ok(fields)
+    }
+
+    fn laid(&self, nodes: &[(Smoothness, f64)]) -> Vec<Node> {
+        let node = |&(smoothness, range_mm): &(Smoothness, f64)| self.node(smoothness, range_mm);
+        nodes.par_iter().filter_map(node).collect()
+    }
+
+    fn bare(observed: &Observed, kind: Kind) -> Result<Self, ModelError> {
+        observed.check()?;
+        let places = observed.places.clone();
+        let n = places.len();
+        let count = ((WAVES_A_POINT * n as f64) as usize).clamp(FEWEST_WAVES, MOST_WAVES[usize::from(n > MOST_WHOLE)]);
+        let waves = Waves::over(&places, kind.lay, count);
+        let whitening = whitening(&observed.path, n, kind.drift);
+        let effects = whitened(&whitening, &observed.effects);
+        super::dense::told_apart(effects.tr_mul(&effects))?;
+        let base = if effects.ncols() > 0 { effects.qr().q() } else { effects };
+        let free = (n - base.ncols()) as f64;
+        let reduced = Reduced { rows: Mat::new(), pivots: None };
+        let mut fields =
+            Self { kind, waves, places, whitening, base, free, reduced, taken: Mat::new(), nodes: Vec::new() };
+        (fields.reduced, fields.taken) = if n <= MOST_WHOLE { fields.whole() } else { fields.told_apart() };
+        Ok(fields)
+    }
+
+    /// R W phi, point by point.
+    fn whole(&self) -> (Reduced, Mat<f64>) {
+        let mut rows = self.rows_of(0, self.places.len());
+        let (n, p) = self.base.shape();
+        let base = Mat::from_fn(n, p, |r, c| self.base[(r, c)]);
+        let taken = base.transpose() * &rows;
+        rows -= &base * &taken;
+        (Reduced { rows, pivots: None }, taken)
+    }
+
+    /// The products of the waves over all points, in a factor that ends where nothing more is told apart.
+    fn told_apart(&self) -> (Reduced, Mat<f64>) {
+        let (n, p, count) = (self.places.len(), self.base.ncols(), self.waves.len());
+        let of = |first: &usize| {
+            let rows = self.rows_of(*first, (first + ROWS).min(n));
+            let base = Mat::from_fn(rows.nrows(), p, |r, c| self.base[(first + r, c)]);
+            let mut products = Mat::zeros(count, count);
+            lower_product(&mut products, &rows);
+            (products, base.transpose() * &rows)
+        };
+        let firsts: Vec<usize> = (0..n).step_by(ROWS).collect();
+        let zero = || (Mat::zeros(count, count), Mat::zeros(p, count));
+        let both = |(a, b): (Mat<f64>, Mat<f64>), (c, d): (Mat<f64>, Mat<f64>)| (a + c, b + d);
+        let (mut products, taken) = firsts.par_iter().map(of).reduce(zero, both);
+        products -= taken.transpose() * &taken;
+        (pivoted(&products), taken)
+    }
+
+    /// W phi of some of the points.
+    fn rows_of(&self, first: usize, until: usize) -> Mat<f64> {
+        let before = first.saturating_sub(1);
+        let waves = self.waves.at(&self.places[before..until]);
+        let mut rows = Mat::zeros(until - first, self.waves.len());
+        for c in 0..self.waves.len() {
+            let (from, into) = (waves.col_as_slice(c), rows.col_as_slice_mut(c));
+            for (r, value) in into.iter_mut().enumerate() {
+                let [own, last] = self.whitening[first + r];
+                let at = first + r - before;
+                *value = own * from[at] - if last == 0.0 { 0.0 } else { last * from[at - 1] };
+            }
+        }
+        rows
+    }
+
+    /// R W of columns that have a row a point, in the coordinates, and the products of all pairs of them.
+    pub(super) fn coordinates(&self, columns: &DMatrix<f64>) -> (Mat<f64>, DMatrix<f64>) {
+        let mut columns = whitened(&self.whitening, columns);
+        let taken = &self.base * self.base.tr_mul(&columns);
+        columns -= taken;
+        let products = columns.tr_mul(&columns);
+        let (n, count) = columns.shape();
+        let Some(pivots) = &self.reduced.pivots else {
+            return (Mat::from_fn(n, count, |r, c| columns[(r, c)]), products);
+        };
+        let of = |first: &usize| {
+            let rows = self.rows_of(*first, (first + ROWS).min(n));
+            rows.transpose() * Mat::from_fn(rows.nrows(), count, |r, c| columns[(first + r, c)])
+        };
+        let firsts: Vec<usize> = (0..n).step_by(ROWS).collect();
+        let zero = || Mat::zeros(self.waves.len(), count);
+        let by_waves = firsts.par_iter().map(of).reduce(zero, |a, b| a + b);
+        let mut coordinates = Mat::from_fn(pivots.len(), count, |r, c| by_waves[(pivots[r], c)]);
+        let factor = Mat::from_fn(pivots.len(), pivots.len(), |r, c| self.reduced.rows[(c, pivots[r])]);
+        solve_lower_triangular_in_place(factor.as_ref(), coordinates.as_mut(), Par::Seq);
+        (coordinates, products)
+    }
+
+    /// The eigenproblem of a node; none where it has no field that the fit leaves.
+    fn node(&self, smoothness: Smoothness, range_mm: f64) -> Option<Node> {
+        let (mut strengths, narrow) = self.waves.strengths(smoothness, range_mm);
+        let least = NOTHING * strengths.iter().copied().fold(0.0, f64::max);
+        strengths.truncate(strengths.iter().take_while(|strength| **strength > least).count());
+        let (r, c) = (self.reduced.rows.nrows(), strengths.len());
+        let rows = Mat::from_fn(r, c, |k, wave| self.reduced.rows[(k, wave)] * strengths[wave]);
+        let by_waves = c < r;
+        let mut products = Mat::zeros(c.min(r), c.min(r));
+        match by_waves {
+            true => lower_product(&mut products, &rows),
+            false => lower_product(&mut products, &rows.transpose().to_owned()),
+        }
+        let eigen = products.self_adjoint_eigen(Side::Lower).ok()?;
+        let (all, found) = (eigen.S().column_vector(), eigen.U());
+        let top = (0..all.nrows()).map(|k| all[k]).fold(0.0, f64::max);
+        let kept: Vec<usize> = (0..all.nrows()).filter(|&k| all[k] > 1e-7 * top && all[k] > 0.0).collect();
+        let values: Vec<f64> = kept.iter().map(|&k| all[k]).collect();
+        let first = all.nrows() - kept.len();
+        let found = found.subcols(first, kept.len());
+        let vectors = match by_waves {
+            true => {
+                let mut vectors = &rows * found;
+                for (k, value) in values.iter().enumerate() {
+                    let by = value.sqrt().recip();
+                    vectors.col_as_slice_mut(k).iter_mut().for_each(|v| *v *= by);
+                }
+                vectors
+            }
+            false => found.to_owned(),
+        };
+        let n = self.places.len() as f64;
+        let whole = values.iter().sum::<f64>() + narrow * self.free;
+        let scale = n / whole;
+        let prior = strengths_prior(&values, narrow, scale, self.free);
+        (whole.is_finite() && whole > 0.0).then_some(Node {
+            smoothness,
+            range_mm,
+            strengths,
+            narrow,
+            scale,
+            values,
+            vectors,
+            prior,
+        })
+    }
+
+    /// The coefficients of waves that coordinates make by a node: D R'.
+    pub(super) fn by_waves(&self, node: &Node, coordinates: &Mat<f64>) -> Mat<f64> {
+        let c = node.strengths.len();
+        let mut coefficients = self.reduced.rows.subcols(0, c).transpose() * coordinates;
+        for k in 0..coefficients.ncols() {
+            coefficients.col_as_slice_mut(k).iter_mut().zip(&node.strengths).for_each(|(value, d)| *value *= d);
+        }
+        coefficients
+    }
+
+    /// The coordinates that coefficients of waves make by a node: R D.
+    pub(super) fn by_points(&self, node: &Node, coefficients: &Mat<f64>) -> Mat<f64> {
+        let c = node.strengths.len();
+        let strong = Mat::from_fn(c, coefficients.ncols(), |r, k| node.strengths[r] * coefficients[(r, k)]);
+        self.reduced.rows.subcols(0, c) * &strong
+    }
+
+    /// How many effects nobody knows.
+    pub(super) fn effects(&self) -> usize {
+        self.base.ncols()
+    }
+
+    /// What columns with a row a point are of the effects: Q'W of them.
+    pub(super) fn of_effects(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
+        self.base.tr_mul(&whitened(&self.whitening, columns))
+    }
+
+    /// The coordinates of a node's coefficients, R D, and behind them what the best fit takes of them, Q'W phi D.
+    pub(super) fn with_effects(&self, node: &Node) -> Mat<f64> {
+        let (r, p) = (self.reduced.rows.nrows(), self.taken.nrows());
+        Mat::from_fn(r + p, node.strengths.len(), |k, wave| {
+            let of = if k < r { self.reduced.rows[(k, wave)] } else { self.taken[(k - r, wave)] };
+            of * node.strengths[wave]
+        })
+    }
+
+    /// Sums over the points of each wave by some weights: a row a column of weights, a column a wave.
+    pub(super) fn sums(&self, weights: &DMatrix<f64>) -> DMatrix<f64> {
+        let n = self.places.len();
+        let of = |first: &usize| {
+            let until = (first + ROWS).min(n);
+            let weights = Mat::from_fn(weights.ncols(), until - first, |r, c| weights[(first + c, r)]);
+            weights * self.waves.at(&self.places[*first..until])
+        };
+        let firsts: Vec<usize> = (0..n).step_by(ROWS).collect();
+        let zero = || Mat::zeros(weights.ncols(), self.waves.len());
+        let sums = firsts.par_iter().map(of).reduce(zero, |a, b| a + b);
+        DMatrix::from_fn(sums.nrows(), sums.ncols(), |r, c| sums[(r, c)])
+    }
+
+    /// A field at the points, by the coefficients of its waves.
+    pub(super) fn at_points(&self, coefficients: &[f64]) -> Vec<f64> {
+        let column = Mat::from_fn(coefficients.len(), 1, |r, _| coefficients[r]);
+        let of = |places: &[[f64; 2]]| (self.waves.at(places) * &column).col_as_slice(0).to_vec();
+        self.places.par_chunks(ROWS).flat_map_iter(of).collect()
+    }
+}
+
+/// The logarithm of J / (1 + J) of every strength: J^2 is Fisher's information on ln tau with the scatter unknown,
+/// (sum q^2 - (sum q)^2 / (n - p)) / 2 with q = l tau / (1 + l tau). What cannot be told from scatter has none, and it saturates at one wave seen.
+fn strengths_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
+    let of = |tau: f64| {
+        let share = |l: f64| l * tau / (1.0 + l * tau);
+        let rest = free - values.len() as f64;
+        let alike = share(scale * narrow);
+        let (mut sum, mut squares) = (rest * alike, rest * alike * alike);
+        for l in values {
+            let q = share(scale * (l + narrow));
+            sum += q;
+            squares += q * q;
+        }
+        let told = (0.5 * (squares - sum * sum / free)).max(0.0).sqrt();
+        (told / (1.0 + told)).max(f64::MIN_POSITIVE).ln()
+    };
+    strengths().map(of).collect()
+}
+
+/// Adds the lower triangle of rows' rows.
+fn lower_product(products: &mut Mat<f64>, rows: &Mat<f64>) {
+    triangular::matmul(
+        products.as_mut(),
+        BlockStructure::TriangularLower,
+        Accum::Add,
+        rows.transpose(),
+        BlockStructure::Rectangular,
+        rows.as_ref(),
+        BlockStructure::Rectangular,
+        1.0,
+        Par::Seq,
+    );
+}
+
+/// A Cholesky factor with pivots of what has its lower triangle given.
+fn pivoted(products: &Mat<f64>) -> Reduced {
+    let count = products.nrows();
+    let at = |a: usize, b: usize| if a >= b { products[(a, b)] } else { products[(b, a)] };
+    let mut left: Vec<f64> = (0..count).map(|k| products[(k, k)]).collect();
+    let most = left.iter().copied().fold(0.0, f64::max);
+    let mut pivots = Vec::new();
+    // Columns of the factor, which are rows of the coordinates.
+    let mut rows: Vec<Vec<f64>> = Vec::new();
+    while pivots.len() < count {
+        let pivot = (0..count).fold(0, |best, k| if left[k] > left[best] { k } else { best });
+        if left[pivot] <= NOT_APART * most {
+            break;
+        }
+        let mut row: Vec<f64> = (0..count).map(|k| at(k, pivot)).collect();
+        for before in &rows {
+            let by = before[pivot];
+            row.iter_mut().zip(before).for_each(|(value, of)| *value -= by * of);
+        }
+        let root = left[pivot].sqrt();
+        row.iter_mut().for_each(|value| *value /= root);
+        pivots.iter().for_each(|&before: &usize| row[before] = 0.0);
+        row[pivot] = root;
+        left.iter_mut().zip(&row).for_each(|(left, value)| *left -= value * value);
+        left[pivot] = 0.0;
+        pivots.push(pivot);
+        rows.push(row);
+    }
+    Reduced { rows: Mat::from_fn(rows.len(), count, |r, c| rows[r][c]), pivots: Some(pivots) }
+}
+
+/// How much of each point's row and of that before it makes one whose scatter is independent and has the same variance.
+fn whitening(path: &[f64], points: usize, drift: f64) -> Vec<[f64; 2]> {
+    if drift == 0.0 || path.is_empty() {
+        return vec![[1.0, 0.0]; points];
+    }
+    let of = |k: usize| {
+        let shared = if k == 0 { 0.0 } else { drift.powf((path[k] - path[k - 1]).abs()) };
+        let own = (1.0 - shared * shared).sqrt().recip();
+        [own, own * shared]
+    };
+    (0..points).map(of).collect()
+}
+
+fn whitened(whitening: &[[f64; 2]], columns: &DMatrix<f64>) -> DMatrix<f64> {
+    DMatrix::from_fn(columns.nrows(), columns.ncols(), |r, c| {
+        let [own, last] = whitening[r];
+        own * columns[(r, c)] - if last == 0.0 { 0.0 } else { last * columns[(r - 1, c)] }
+    })
+}
+
+/// The root mean square distance of places from their middle.
+pub(super) fn size_mm(places: &[[f64; 2]]) -> f64 {
+    let n = places.len() as f64;
+    let middle = [0, 1].map(|axis| places.iter().map(|place| place[axis]).sum::<f64>() / n);
+    let squares = places.iter().map(|[x, y]| (x - middle[0]).powi(2) + (y - middle[1]).powi(2));
+    (squares.sum::<f64>() / n).sqrt()
+}

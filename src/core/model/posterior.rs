@@ -1,0 +1,581 @@
+//! What a measurement says of the fields that its form may be: every node and strength with its probability, and forms drawn from all of them.
+//!
+//! With the strength tau, w = V'z of the field's own coefficients z and q = l tau / (1 + l tau) the posterior of a node is that of independent numbers (Rasmussen
+//! and Williams 2006, 2.7). Scatter, strength, smoothness and range are drawn together with the field, for a larger scatter is a weaker form: s^2 from its inverse
+//! gamma, or, beside effects of a stated uncertainty and a scatter that the probe is known to have, from its density by equal steps of ln s.
+//!
+//! A field alike everywhere takes a lone peak for scatter and draws it down. So what is told of extremes from above is told by fields of
+//! [`UNDER`] times the variance: they follow the points more closely.
+
+use faer::Mat;
+use nalgebra::{DMatrix, DVector, SymmetricEigen};
+use rayon::prelude::*;
+
+use super::fields::{Fields, Kind, Node, strengths};
+use super::normals::Normals;
+use super::{Field, Hyper, Observed, Priors, Smoothness};
+
+/// By how much the variance of fields is raised for the upper ends of extremes.
+const UNDER: f64 = 16.0;
+/// By what factor a field may be stronger than what is seen of it (one standard deviation of its logarithm), where the pose is told.
+const STRONGER: f64 = 3.0;
+
+/// What is known of the scatter of the probe beforehand: its size, and the standard deviation of the logarithm of that.
+pub(super) type Probe = Option<[f64; 2]>;
+
+/// Fields with their probabilities.
+pub(super) struct Posterior<'f> {
+    fields: &'f Fields,
+    observed: &'f Observed,
+    probe: Probe,
+    /// U' of what was found and of what is stated, by node.
+    seen: Vec<Seen>,
+    /// The logarithm of the density of each node and strength, the strengths of a node side by side.
+    densities: Vec<Vec<f64>>,
+    /// By how much the likelihood of the best field is above that of none, in its logarithm.
+    pub(super) evidence: f64,
+    squares: f64,
+}
+
+/// What a node sees: the columns are what was found, and behind it what is stated.
+struct Seen {
+    /// U' of the columns.
+    v: Mat<f64>,
+    /// The products of all columns, less those of V.
+    rest: DMatrix<f64>,
+}
+
+/// Fields that were drawn.
+pub(super) struct Draws {
+    /// The coefficients of their waves, a column each, and those of fields that follow the points more closely.
+    pub(super) waves: [Mat<f64>; 2],
+    /// The scatter of each, and the standard deviation of what is in waves that are too short to be told, of either kind.
+    pub(super) scatter_mm: Vec<f64>,
+    pub(super) narrow_mm: [Vec<f64>; 2],
+}
+
+impl<'f> Posterior<'f> {
+    pub(super) fn of(fields: &'f Fields, observed: &'f Observed, priors: Option<&Priors>, probe: Probe) -> Self {
+        let stated = observed.stated.ncols();
+        let columns = DMatrix::from_fn(observed.places.len(), 1 + stated, |r, c| match c {
+            0 => observed.deviations_mm[r],
+            c => observed.stated[(r, c - 1)],
+        });
+        let (coordinates, products) = fields.coordinates(&columns);
+        let see = |node: &Node| {
+            let v = node.vectors.transpose() * &coordinates;
+            let rest = DMatrix::from_fn(1 + stated, 1 + stated, |a, b| {
+                products[(a, b)] - (0..v.nrows()).map(|k| v[(k, a)] * v[(k, b)]).sum::<f64>()
+            });
+            Seen { v, rest }
+        };
+        let seen: Vec<Seen> = fields.nodes.iter().map(see).collect();
+        let posterior =
+            Self { fields, observed, probe, seen, densities: Vec::new(), evidence: 0.0, squares: products[(0, 0)] };
+        let of = |(k, node): (usize, &Node)| {
+            let likelihoods: Vec<f64> = strengths().map(|tau| posterior.scale(k, tau).integral()).collect();
+            let expected = |(at, likelihood): (usize, &f64)| {
+                let expected = priors.map_or(node.prior[at], |priors| {
+                    let tau = strengths().nth(at).unwrap_or_default();
+                    priors.log_density(node.range_mm, (tau * node.scale).sqrt().recip())
+                });
+                likelihood + expected
+            };
+            let densities: Vec<f64> = likelihoods.iter().enumerate().map(expected).collect();
+            (likelihoods, densities)
+        };
+        let all: Vec<(Vec<f64>, Vec<f64>)> = fields.nodes.par_iter().enumerate().map(of).collect();
+        let best = all.iter().flat_map(|(likelihoods, _)| likelihoods).copied().fold(f64::NEG_INFINITY, f64::max);
+        let none = if fields.nodes.is_empty() { best } else { posterior.scale(0, 0.0).integral() };
+        let densities: Vec<Vec<f64>> = all.into_iter().map(|(_, densities)| densities).collect();
+        Self { densities, evidence: best - none, ..posterior }
+    }
+
+    /// What tells the scatter by a node and a strength.
+    fn scale(&self, node: usize, tau: f64) -> Scale {
+        let (Node { values, narrow, scale, .. }, Seen { v, rest }) = (&self.fields.nodes[node], &self.seen[node]);
+        let stated = rest.nrows() - 1;
+        let alike = 1.0 + scale * narrow * tau;
+        let mut products = rest / alike;
+        let mut logs = (self.fields.free - values.len() as f64) * alike.ln();
+        for (k, l) in values.iter().enumerate() {
+            let own = 1.0 + scale * (l + narrow) * tau;
+            logs += own.ln();
+            for a in 0..=stated {
+                for b in 0..=stated {
+                    products[(a, b)] += v[(k, a)] * v[(k, b)] / own;
+                }
+            }
+        }
+        Scale::of(&products, logs, self.fields.free, self.probe)
+    }
+
+    /// The most probable node and strength, with the scatter by them.
+    pub(super) fn best(&self) -> Option<(&Node, f64, f64)> {
+        let (number, tau, _) = self.probabilities().into_iter().max_by(|a, b| a.2.total_cmp(&b.2))?;
+        Some((&self.fields.nodes[number], tau, self.scale(number, tau).best_mm()))
+    }
+
+    /// How many degrees of freedom the fit leaves.
+    pub(super) fn free(&self) -> f64 {
+        self.fields.free
+    }
+
+    /// The root mean square of what the fit leaves.
+    fn rms_mm(&self) -> f64 {
+        (self.squares / self.observed.places.len() as f64).max(0.0).sqrt()
+    }
+
+    /// The probability of each node and strength, all together 1.
+    fn probabilities(&self) -> Vec<(usize, f64, f64)> {
+        let top = self.densities.iter().flatten().copied().fold(f64::NEG_INFINITY, f64::max);
+        let all =
+            self.densities.iter().enumerate().flat_map(|(node, of)| {
+                strengths().zip(of).map(move |(tau, density)| (node, tau, (density - top).exp()))
+            });
+        let some: Vec<_> = all.filter(|(.., weight)| *weight > 1e-7).collect();
+        let whole: f64 = some.iter().map(|(.., weight)| weight).sum();
+        some.into_iter().map(|(node, tau, weight)| (node, tau, weight / whole)).collect()
+    }
+
+    /// The parameters of one node and strength.
+    fn hyper(&self, node: usize, tau: f64) -> Hyper {
+        let Node { smoothness, range_mm, scale, .. } = &self.fields.nodes[node];
+        // No deviation at all is a field of no strength.
+        let scatter_mm = self.scale(node, tau).best_mm().max(f64::MIN_POSITIVE.sqrt());
+        let sigma_mm = scatter_mm * (tau * scale).sqrt();
+        let Kind { lay, drift } = self.fields.kind;
+        Hyper { field: Field { sigma_mm, range_mm: *range_mm, smoothness: *smoothness, lay }, scatter_mm, drift }
+    }
+
+    /// How much less likely a field is whose strength is beyond what is seen: of it the points would show next to nothing.
+    fn doubt(&self, hyper: &Hyper) -> f64 {
+        let beyond = (hyper.field.sigma_mm / self.rms_mm().max(f64::MIN_POSITIVE)).ln().max(0.0) / STRONGER.ln();
+        (-0.5 * beyond * beyond).exp()
+    }
+
+    /// Parameters that may be, with their probabilities: of each node at its most probable strength. The most probable ones come first.
+    /// Only those of some kinds, beside each other.
+    pub(super) fn likely(&self, is_of: impl Fn(Smoothness) -> bool) -> Vec<(Hyper, f64)> {
+        let of = |(node, densities): (usize, &Vec<f64>)| {
+            if !is_of(self.fields.nodes[node].smoothness) {
+                return None;
+            }
+            let taus: Vec<f64> = strengths().collect();
+            let best = (0..densities.len()).max_by(|a, b| densities[*a].total_cmp(&densities[*b]))?;
+            let hyper = self.hyper(node, taus[best]);
+            let sum: f64 = densities.iter().map(|of| (of - densities[best]).exp()).sum();
+            Some((hyper, densities[best] + sum.ln() + self.doubt(&hyper).max(f64::MIN_POSITIVE).ln()))
+        };
+        let mut all: Vec<(Hyper, f64)> = self.densities.iter().enumerate().filter_map(of).collect();
+        all.sort_by(|a, b| b.1.total_cmp(&a.1));
+        let top = all.first().map_or(0.0, |(_, of)| *of);
+        all.into_iter().map(|(hyper, of)| (hyper, (of - top).exp())).collect()
+    }
+
+    /// The parameters as one number each: the means of their logarithms over the nodes that are as smooth as the most probable one. Of a field that is
+    /// nowhere smooth nobody could say how much of it is scatter: it is none of these.
+    pub(super) fn middle(&self) -> Hyper {
+        let likely = self.likely(|smoothness| smoothness != Smoothness::Never);
+        let Some((first, _)) = likely.first().copied() else {
+            let scatter_mm = self.rms_mm().max(f64::MIN_POSITIVE.sqrt());
+            return Hyper { field: Field::new(scatter_mm, 1.0), scatter_mm, drift: self.fields.kind.drift };
+        };
+        let alike: Vec<_> = likely.iter().filter(|(of, _)| of.field.smoothness == first.field.smoothness).collect();
+        let whole: f64 = alike.iter().map(|(_, weight)| weight).sum();
+        let mean = |of: fn(&Hyper) -> f64| {
+            (alike.iter().map(|(hyper, weight)| weight * of(hyper).ln()).sum::<f64>() / whole).exp()
+        };
+        let field =
+            Field { sigma_mm: mean(|of| of.field.sigma_mm), range_mm: mean(|of| of.field.range_mm), ..first.field };
+        Hyper { field, scatter_mm: mean(|of| of.scatter_mm), ..first }
+    }
+
+    /// Draws so many fields; the same seed gives the same ones.
+    pub(super) fn draws(&self, count: usize, seed: u64) -> Draws {
+        let probabilities = self.probabilities();
+        // Equal steps through all of them: each as often as it is probable, to one.
+        let mut chosen: Vec<(usize, f64, usize)> = Vec::with_capacity(count);
+        let (mut until, mut next) = (0.0, probabilities.iter());
+        let mut now = next.next();
+        for k in 0..count {
+            let at = (k as f64 + 0.5) / count as f64;
+            while let Some((_, _, weight)) = now
+                && until + weight < at
+                && next.len() > 0
+            {
+                until += weight;
+                now = next.next();
+            }
+            if let Some((node, tau, _)) = now {
+                chosen.push((*node, *tau, k));
+            }
+        }
+        let nodes: Vec<&[(usize, f64, usize)]> =
+            chosen.chunk_by(|a, b| a.0 == b.0).flat_map(|of| of.chunks(64)).collect();
+        let made: Vec<Draws> = nodes.par_iter().map(|of| self.drawn(of[0].0, of, seed)).collect();
+        let mut draws = Draws {
+            waves: [0, 1].map(|_| Mat::zeros(self.fields.waves.len(), chosen.len())),
+            scatter_mm: Vec::new(),
+            narrow_mm: [Vec::new(), Vec::new()],
+        };
+        for of in made {
+            let first = draws.scatter_mm.len();
+            for (into, from) in draws.waves.iter_mut().zip(&of.waves) {
+                for c in 0..from.ncols() {
+                    into.col_as_slice_mut(first + c)[..from.nrows()].copy_from_slice(from.col_as_slice(c));
+                }
+            }
+            draws.scatter_mm.extend(of.scatter_mm);
+            draws.narrow_mm.iter_mut().zip(of.narrow_mm).for_each(|(into, from)| into.extend(from));
+        }
+        draws
+    }
+
+    /// Draws of one node: z = sigma z0 + D R' U (w - sigma V'z0) / sqrt l.
+    fn drawn(&self, number: usize, chosen: &[(usize, f64, usize)], seed: u64) -> Draws {
+        let (node, Seen { v, .. }) = (&self.fields.nodes[number], &self.seen[number]);
+        let (waves, seen, count) = (node.strengths.len(), node.values.len(), chosen.len());
+        let mut streams: Vec<Normals> = chosen.iter().map(|(.., k)| Normals::new(seed, *k as u64)).collect();
+        let told: Vec<(f64, DVector<f64>)> = chosen
+            .iter()
+            .zip(&mut streams)
+            .map(|((_, tau, _), normals)| {
+                let scale = self.scale(number, *tau);
+                let scatter_mm = scale.drawn_mm(normals);
+                (scatter_mm, scale.stated(scatter_mm, normals))
+            })
+            .collect();
+        let mut before = Mat::<f64>::zeros(waves, count);
+        let mut by_points = Mat::<f64>::zeros(seen, count);
+        for (c, normals) in streams.iter_mut().enumerate() {
+            before.col_as_slice_mut(c).iter_mut().for_each(|value| *value = normals.next());
+            by_points.col_as_slice_mut(c).iter_mut().for_each(|value| *value = normals.next());
+        }
+        let of_before = node.vectors.transpose() * self.fields.by_points(node, &before);
+        let strength2 = |c: usize, under: f64| under * chosen[c].1 * node.scale * told[c].0.powi(2);
+        let of = |under: f64| {
+            let left = Mat::from_fn(seen, count, |k, c| {
+                let (scatter2, field2, l) = (told[c].0.powi(2), strength2(c, under), node.values[k]);
+                let found = v[(k, 0)] - (0..told[c].1.len()).map(|e| told[c].1[e] * v[(k, 1 + e)]).sum::<f64>();
+                let all = field2 * (l + node.narrow) + scatter2;
+                // l^(1/2) w: its mean and its spread.
+                let mean = field2 * l / all * found;
+                let spread = (field2 * l * (field2 * node.narrow + scatter2) / all).sqrt();
+                (mean + spread * by_points[(k, c)] - field2.sqrt() * of_before[(k, c)]) / l
+            });
+            let mut coefficients = self.fields.by_waves(node, &(&node.vectors * left));
+            for c in 0..count {
+                let sigma_mm = strength2(c, under).sqrt();
+                let column = coefficients.col_as_slice_mut(c).iter_mut().zip(before.col_as_slice(c));
+                column.zip(&node.strengths).for_each(|((value, z), d)| *value = d * (*value + sigma_mm * z));
+            }
+            coefficients
+        };
+        let narrow_mm =
+            [1.0, UNDER].map(|under| (0..count).map(|c| (strength2(c, under) * node.narrow).sqrt()).collect());
+        Draws {
+            waves: [1.0, UNDER].map(of),
+            scatter_mm: told.into_iter().map(|(scatter_mm, _)| scatter_mm).collect(),
+            narrow_mm,
+        }
+    }
+
+    /// The mean of the field by its most probable node and strength, in coefficients of the waves.
+    pub(super) fn mean(&self) -> (Vec<f64>, DVector<f64>) {
+        let none = || (vec![0.0; self.fields.waves.len()], DVector::zeros(self.observed.stated.ncols()));
+        let best = self.probabilities().into_iter().max_by(|a, b| a.2.total_cmp(&b.2));
+        let Some((number, tau, _)) = best else { return none() };
+        let (node, Seen { v, .. }) = (&self.fields.nodes[number], &self.seen[number]);
+        let scale = self.scale(number, tau);
+        let scatter_mm = scale.best_mm();
+        let stated = scale.stated_mean(scatter_mm);
+        let field2 = tau * node.scale;
+        let left = Mat::from_fn(node.values.len(), 1, |k, _| {
+            let found = v[(k, 0)] - (0..stated.len()).map(|e| stated[e] * v[(k, 1 + e)]).sum::<f64>();
+            field2 / (field2 * (node.values[k] + node.narrow) + 1.0) * found
+        });
+        let coefficients = self.fields.by_waves(node, &(&node.vectors * left));
+        let mut waves = none().0;
+        coefficients
+            .col_as_slice(0)
+            .iter()
+            .zip(&node.strengths)
+            .zip(&mut waves)
+            .for_each(|((of, d), into)| *into = of * d);
+        (waves, stated)
+    }
+
+    /// The mean over all fields of A K A' with K the covariance of the field, of what takes the waves to some sums: a row a sum, a column a wave. Fields
+    /// beyond what is seen count less. Also that of the square of the scatter, a touch's share of shorter waves in it.
+    pub(super) fn covered(&self, sums: &DMatrix<f64>) -> (DMatrix<f64>, f64) {
+        let p = sums.nrows();
+        let (mut covered, mut scatter2, mut whole) = (DMatrix::zeros(p, p), 0.0, 0.0);
+        for (number, tau, weight) in self.probabilities() {
+            let node = &self.fields.nodes[number];
+            let weight = weight * self.doubt(&self.hyper(number, tau));
+            if weight < 1e-6 {
+                continue;
+            }
+            let own2 = self.scale(number, tau).best_mm().powi(2);
+            let strength2 = own2 * tau * node.scale;
+            let strong = DMatrix::from_fn(p, node.strengths.len(), |r, k| sums[(r, k)] * node.strengths[k]);
+            covered += &strong * strong.transpose() * (weight * strength2);
+            scatter2 += weight * (own2 + strength2 * node.narrow);
+            whole += weight;
+        }
+        if whole > 0.0 { (covered / whole, scatter2 / whole) } else { (covered, self.rms_mm().powi(2)) }
+    }
+}
+
+/// What tells the scatter s: -2 ln p(s) = 2 m ln s + logs + sum ln(1 + u / s^2) + (S - sum b^2 / (s^2 + u)) / s^2, with u the eigenvalues of E'K0^-1 E
+/// and b of E'K0^-1 d beside them.
+struct Scale {
+    free: f64,
+    logs: f64,
+    squares: f64,
+    by_stated: Vec<[f64; 2]>,
+    axes: DMatrix<f64>,
+    probe: Probe,
+}
+
+impl Scale {
+    fn of(products: &DMatrix<f64>, logs: f64, free: f64, probe: Probe) -> Self {
+        let stated = products.nrows() - 1;
+        let (by_stated, axes) = if stated == 0 {
+            (Vec::new(), DMatrix::zeros(0, 0))
+        } else {
+            let own = products.view((1, 1), (stated, stated)).into_owned();
+            let SymmetricEigen { eigenvalues, eigenvectors } = own.symmetric_eigen();
+            let beside = eigenvectors.tr_mul(&products.view((1, 0), (stated, 1)));
+            (eigenvalues.iter().zip(&beside).map(|(u, b)| [u.max(0.0), *b]).collect(), eigenvectors)
+        };
+        Self { free, logs, squares: products[(0, 0)].max(f64::MIN_POSITIVE), by_stated, axes, probe }
+    }
+
+    /// The logarithm of the density over ln s.
+    fn density(&self, log_mm: f64) -> f64 {
+        let s2 = (2.0 * log_mm).exp();
+        let mut value = 2.0 * self.free * log_mm + self.logs;
+        let mut squares = self.squares;
+        for [u, b] in &self.by_stated {
+            value += (u / s2).ln_1p();
+            squares -= b * b / (s2 + u);
+        }
+        value += squares.max(0.0) / s2;
+        // A touch scatters no less than the probe does, and more where a form is too narrow to be told.
+        let below = self.probe.map_or(0.0, |[probe_mm, u]| ((log_mm - probe_mm.ln()) / u.max(0.02)).min(0.0));
+        -0.5 * (value + below * below)
+    }
+
+    /// Equal steps of ln s that hold all of it: the first, their width, the logarithm of the density at each.
+    fn steps(&self) -> (f64, f64, Vec<f64>) {
+        const COARSE: usize = 24;
+        const FINE: usize = 41;
+        let told: f64 = self.by_stated.iter().map(|[u, b]| b * b / u.max(f64::MIN_POSITIVE)).sum();
+        let wide = (16.0 / (2.0 * self.free).sqrt()).max(0.05);
+        let least = (self.squares - told).max(1e-12 * self.squares);
+        let [mut low, mut high] = [0.5 * (least / self.free).ln() - wide, 0.5 * (self.squares / self.free).ln() + wide];
+        if let Some([probe_mm, u]) = self.probe {
+            high = high.max(probe_mm.ln() + 4.0 * u);
+        }
+        let best = |low: f64, step: f64, count: usize| {
+            let values = (0..=count).map(|k| self.density(low + step * k as f64));
+            values.enumerate().fold((0, f64::NEG_INFINITY), |a, b| if b.1 > a.1 { b } else { a })
+        };
+        let mut at = low;
+        let mut sigma = high - low;
+        for _ in 0..24 {
+            let step = (high - low) / COARSE as f64;
+            at = low + step * best(low, step, COARSE).0 as f64;
+            let [a, b, c] = [-step, 0.0, step].map(|off| self.density(at + off));
+            let falls = (2.0 * b - a - c).max(f64::MIN_POSITIVE);
+            sigma = step / falls.sqrt();
+            if step < 0.5 * sigma {
+                break;
+            }
+            (low, high) = (at - 1.5 * step, at + 1.5 * step);
+        }
+        let wide = 7.0 * sigma.min(wide);
+        let step = 2.0 * wide / (FINE - 1) as f64;
+        let first = at - wide;
+        (first, step, (0..FINE).map(|k| self.density(first + step * k as f64)).collect())
+    }
+
+    fn is_plain(&self) -> bool {
+        self.by_stated.is_empty() && self.probe.is_none()
+    }
+
+    /// The logarithm of the likelihood with s integrated out, but for what is the same of every field.
+    fn integral(&self) -> f64 {
+        if self.is_plain() {
+            return -0.5 * (self.logs + self.free * self.squares.ln());
+        }
+        let (_, step, densities) = self.steps();
+        let top = densities.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        top + (step * densities.iter().map(|of| (of - top).exp()).sum::<f64>()).ln()
+    }
+
+    /// The most probable s.
+    fn best_mm(&self) -> f64 {
+        if self.is_plain() {
+            return (self.squares / self.free).sqrt();
+        }
+        let (first, step, densities) = self.steps();
+        let best = (0..densities.len()).fold(0, |best, k| if densities[k] > densities[best] { k } else { best });
+        (first + step * best as f64).exp()
+    }
+
+    fn drawn_mm(&self, normals: &mut Normals) -> f64 {
+        if self.is_plain() {
+            // Chi-squared by its degrees of freedom: exact by normal numbers where they are few, else by its cube root (Wilson and Hilferty 1931).
+            const MANY: f64 = 60.0;
+            let chi2 = if self.free <= MANY {
+                (0..self.free as usize).map(|_| normals.next().powi(2)).sum::<f64>()
+            } else {
+                let ninth = 2.0 / (9.0 * self.free);
+                self.free * (1.0 - ninth + ninth.sqrt() * normals.next()).powi(3)
+            };
+            return (self.squares / chi2.max(f64::MIN_POSITIVE)).sqrt();
+        }
+        let (first, step, densities) = self.steps();
+        let top = densities.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let weights: Vec<f64> = densities.iter().map(|of| (of - top).exp()).collect();
+        let mut left = normals.uniform() * weights.iter().sum::<f64>();
+        let at = weights.iter().position(|weight| {
+            left -= weight;
+            left <= 0.0
+        });
+        (first + step * (at.unwrap_or(0) as f64 + normals.uniform() - 0.5)).exp()
+    }
+
+    /// The most probable size of what is stated, each beside its standard uncertainty.
+    fn stated_mean(&self, scatter_mm: f64) -> DVector<f64> {
+        let along = self.by_stated.iter().map(|[u, b]| b / (scatter_mm * scatter_mm + u));
+        &self.axes * DVector::from_iterator(self.by_stated.len(), along)
+    }
+
+    fn stated(&self, scatter_mm: f64, normals: &mut Normals) -> DVector<f64> {
+        let scatter2 = scatter_mm * scatter_mm;
+        let spread = self.by_stated.iter().map(|[u, _]| (1.0 + u / scatter2).sqrt().recip() * normals.next());
+        let spread = &self.axes * DVector::from_iterator(self.by_stated.len(), spread);
+        self.stated_mean(scatter_mm) + spread
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Places of a part of 102 x 62 mm that go everywhere and repeat nothing.
+    fn places(count: u32) -> Vec<[f64; 2]> {
+        let at = (0..count).map(|k| f64::from(k) + 0.5);
+        at.map(|k| [(0.754_877_666 * k).fract() * 102.0, (0.569_840_291 * k).fract() * 62.0]).collect()
+    }
+
+    /// A field of known parameters, moved and tilted by what nobody knows.
+    fn drawn(hyper: Hyper, places: Vec<[f64; 2]>, path: Vec<f64>, seed: u64) -> Observed {
+        let n = places.len();
+        let covariance = DMatrix::from_fn(n, n, |r, c| {
+            hyper.field.covariance_mm2(places[r], places[c]) + if r == c { 1e-14 } else { 0.0 }
+        });
+        let mut normals = Normals::new(seed, 0);
+        let field = covariance.cholesky().unwrap().l() * DVector::from_fn(n, |_, _| normals.next());
+        let mut last = normals.next();
+        let mut of = |k: usize| {
+            last = hyper.drift * last + (1.0 - hyper.drift * hyper.drift).sqrt() * normals.next();
+            field[k] + hyper.scatter_mm * last + 0.3 - 0.01 * places[k][0]
+        };
+        let deviations_mm = (0..n).map(&mut of).collect();
+        let effects = DMatrix::from_fn(n, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
+        Observed { effects, path, ..Observed::without_effects(places, deviations_mm) }
+    }
+
+    const PLANTED: Hyper = Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift: 0.0 };
+
+    #[test]
+    fn planted_parameters_are_found_again() {
+        let (mut sigma, mut range, mut scatter) = (0.0, 0.0, 0.0);
+        const PARTS: u32 = 6;
+        for seed in 0..PARTS {
+            let found =
+                Hyper::of(&drawn(PLANTED, places(300), Vec::new(), u64::from(seed)), Some(&Priors::of_size(102.0)))
+                    .unwrap();
+            sigma += (found.field.sigma_mm / PLANTED.field.sigma_mm).ln() / f64::from(PARTS);
+            range += (found.field.range_mm / PLANTED.field.range_mm).ln() / f64::from(PARTS);
+            scatter += (found.scatter_mm / PLANTED.scatter_mm).ln() / f64::from(PARTS);
+        }
+        let off = [sigma, range, scatter].map(f64::exp);
+        println!("sigma, range, scatter: {off:.3?} of what was planted");
+        assert!((off[0] - 1.0).abs() < 0.3 && (off[1] - 1.0).abs() < 0.25 && (off[2] - 1.0).abs() < 0.12, "{off:?}");
+    }
+
+    #[test]
+    fn a_drift_along_the_path_is_found_again_and_none_is_seen_where_there_is_none() {
+        let at = |k: usize| {
+            [if (k / 30).is_multiple_of(2) { k % 30 } else { 29 - k % 30 }, k / 30].map(|at| 3.5 * at as f64)
+        };
+        for drift in [0.0, 0.7, 0.9] {
+            let planted = Hyper { drift, ..PLANTED };
+            // Of a strong drift few independent touches are left, and how much it is spoken for is chance.
+            const PARTS: u64 = 5;
+            let path: Vec<f64> = (0..540).map(f64::from).collect();
+            let told = |seed| {
+                Hyper::of(
+                    &drawn(planted, (0..540).map(at).collect(), path.clone(), seed),
+                    Some(&Priors::of_size(102.0)),
+                )
+                .unwrap()
+            };
+            let all: Vec<Hyper> = (1..=PARTS).map(told).collect();
+            let median = |of: &dyn Fn(&Hyper) -> f64| {
+                let mut values: Vec<f64> = all.iter().map(of).collect();
+                values.sort_unstable_by(f64::total_cmp);
+                values[values.len() / 2]
+            };
+            let off = [median(&|h| h.drift) - drift, median(&|h| (h.scatter_mm / planted.scatter_mm).ln())];
+            println!("drift {drift}: off by {off:.3?}, {:.3?}", all.iter().map(|h| h.drift).collect::<Vec<_>>());
+            assert!(off[0].abs() < 0.2 && off[1].abs() < 0.3, "{off:?} {all:?}");
+            assert!(drift > 0.0 || all.iter().all(|h| h.drift == 0.0), "{all:?}");
+        }
+    }
+
+    #[test]
+    fn the_scale_of_everything_is_the_scale_of_what_is_found() {
+        let observed = drawn(PLANTED, places(120), Vec::new(), 1);
+        let tenfold =
+            Observed { deviations_mm: observed.deviations_mm.iter().map(|d| 10.0 * d).collect(), ..observed.clone() };
+        let [a, b] = [observed, tenfold].map(|observed| Hyper::of(&observed, None).unwrap());
+        assert!((b.field.sigma_mm / a.field.sigma_mm - 10.0).abs() < 1e-6);
+        assert!((b.field.range_mm / a.field.range_mm - 1.0).abs() < 1e-9);
+    }
+
+    /// Whether points are taken one by one or by what their waves have in common: -2 ln p = ln |K| + ln |H'K^-1 H| - ln |H'H| + m ln d'K^-1 (d - H b).
+    #[test]
+    fn the_likelihood_is_that_of_the_covariance_that_the_waves_make() {
+        for (count, near) in [(60, 1e-6), (500, 0.2)] {
+            let observed = drawn(PLANTED, places(count), Vec::new(), 3);
+            let n = observed.places.len();
+            let fields = Fields::of_nodes(&observed, Kind::PLAIN, &[(Smoothness::Once, 30.0)]).unwrap();
+            let posterior = Posterior::of(&fields, &observed, None, None);
+            let node = &fields.nodes[0];
+            let waves = fields.waves.at(&observed.places);
+            let rows = DMatrix::from_fn(n, node.strengths.len(), |r, c| waves[(r, c)] * node.strengths[c]);
+            let field = &rows * rows.transpose() + DMatrix::identity(n, n) * node.narrow;
+            let (h, d) = (&observed.effects, DVector::from_column_slice(&observed.deviations_mm));
+            let by_hand = |tau: f64| {
+                let k = (&field * (tau * node.scale) + DMatrix::identity(n, n)).cholesky().unwrap();
+                let log_det = |of: nalgebra::Cholesky<f64, nalgebra::Dyn>| 2.0 * of.l().diagonal().map(f64::ln).sum();
+                let gram = h.tr_mul(&k.solve(h));
+                let b = gram.clone().cholesky().unwrap().solve(&h.tr_mul(&k.solve(&d)));
+                let squares = d.dot(&k.solve(&(&d - h * b)));
+                let logs = log_det(k) + log_det(gram.cholesky().unwrap()) - log_det(h.tr_mul(h).cholesky().unwrap());
+                -0.5 * (logs + fields.free * squares.ln())
+            };
+            for tau in [0.0, 0.3, 30.0, 1000.0] {
+                let [told, exact] = [posterior.scale(0, tau).integral(), by_hand(tau)];
+                assert!((told - exact).abs() < near, "{count} {tau}: {told} {exact}");
+            }
+        }
+    }
+}

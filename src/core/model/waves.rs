@@ -1,0 +1,214 @@
+//! Cosines over a rectangle that is wider than the part: a field of any covariance is a sum of them.
+//!
+//! ```text
+//!  phi_ab(x, y) = c_a c_b cos(pi a u / L_u) cos(pi b v / L_v) / sqrt(L_u L_v)        c_0 = 1, else c = sqrt 2
+//!  f = sum z_ab sqrt(S(w_ab)) phi_ab        z independent and standard normal, w_ab = pi (a / L_u, b / L_v)
+//! ```
+//!
+//! S is the spectral density of the covariance (Solin and Sarkka 2020). A cosine is level where it meets the edge of the rectangle; so the rectangle
+//! begins well before the part. u and v lie along and across the lay of the field.
+
+use faer::Mat;
+
+use super::{Lay, Smoothness};
+
+/// By how much the rectangle is wider than the part on either side, as a share of the longer side of the part.
+const WIDER: f64 = 0.15;
+
+/// The cosines of the longest waves over a rectangle.
+pub(super) struct Waves {
+    lay: Lay,
+    corner_mm: [f64; 2],
+    lengths_mm: [f64; 2],
+    /// a and b of each.
+    orders: Vec<[usize; 2]>,
+    /// One more than the highest order along either axis.
+    counts: [usize; 2],
+    /// The square of each wave's number in the plane in which the field is alike in all directions, in 1 / mm^2.
+    numbers2: Vec<f64>,
+}
+
+impl Waves {
+    /// Takes so many waves over some places, those first of which a field with this lay has most.
+    pub(super) fn over(places: &[[f64; 2]], lay: Lay, count: usize) -> Self {
+        let spans = [0, 1].map(|axis| {
+            let of = places.iter().map(|&place| turned(lay, place)[axis]);
+            [of.clone().fold(f64::INFINITY, f64::min), of.fold(f64::NEG_INFINITY, f64::max)]
+        });
+        let longest_mm = spans.iter().map(|[low, high]| high - low).fold(0.0, f64::max);
+        let wider_mm = WIDER * longest_mm.max(f64::MIN_POSITIVE.sqrt());
+        let corner_mm = spans.map(|[low, _]| low - wider_mm);
+        let lengths_mm = spans.map(|[low, high]| high - low + 2.0 * wider_mm);
+        let root = lay.stretch.sqrt();
+        let steps = [root / lengths_mm[0], 1.0 / (root * lengths_mm[1])].map(|step| step * std::f64::consts::PI);
+        // A quarter of an ellipse has this area; a wave more than it has is always among these.
+        let longest = (4.0 * count as f64 * steps[0] * steps[1] / std::f64::consts::PI).sqrt();
+        let most = steps.map(|step| (longest / step) as usize + 2);
+        let number2 = |[a, b]: [usize; 2]| (a as f64 * steps[0]).powi(2) + (b as f64 * steps[1]).powi(2);
+        let mut orders: Vec<[usize; 2]> = (0..most[0]).flat_map(|a| (0..most[1]).map(move |b| [a, b])).collect();
+        orders.sort_by(|a, b| number2(*a).total_cmp(&number2(*b)).then(a.cmp(b)));
+        orders.truncate(count);
+        let counts = [0, 1].map(|axis| orders.iter().map(|order| order[axis] + 1).max().unwrap_or(1));
+        let numbers2 = orders.iter().map(|&order| number2(order)).collect();
+        Self { lay, corner_mm, lengths_mm, orders, counts, numbers2 }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.orders.len()
+    }
+
+    /// Half the length of the shortest wave.
+    pub(super) fn shortest_mm(&self) -> f64 {
+        std::f64::consts::PI / self.numbers2.last().copied().unwrap_or(0.0).sqrt()
+    }
+
+    /// The standard deviation of each wave's coefficient in a field of strength 1, and the share of the field's variance that is in shorter ones.
+    pub(super) fn strengths(&self, smoothness: Smoothness, range_mm: f64) -> (Vec<f64>, f64) {
+        let strength = |number2: &f64| density_mm2(smoothness, range_mm, *number2).sqrt();
+        let last2 = self.numbers2.last().copied().unwrap_or(0.0);
+        (self.numbers2.iter().map(strength).collect(), beyond(smoothness, range_mm, last2))
+    }
+
+    /// Every wave at some places: a row a place, a column a wave.
+    pub(super) fn at(&self, places: &[[f64; 2]]) -> Mat<f64> {
+        let along: [Vec<Vec<f64>>; 2] = [0, 1].map(|axis| {
+            let at = places.iter().map(|&place| turned(self.lay, place)[axis]);
+            self.cosines(axis, &at.collect::<Vec<_>>())
+        });
+        let mut waves = Mat::zeros(places.len(), self.len());
+        for (k, [a, b]) in self.orders.iter().enumerate() {
+            let column = waves.col_as_slice_mut(k);
+            column.iter_mut().zip(along[0][*a].iter().zip(&along[1][*b])).for_each(|(value, (u, v))| *value = u * v);
+        }
+        waves
+    }
+
+    /// The cosines along an axis at some distances: a vector an order, a number a distance.
+    fn cosines(&self, axis: usize, at_mm: &[f64]) -> Vec<Vec<f64>> {
+        let length_mm = self.lengths_mm[axis];
+        let scale = |order: usize| if order == 0 { 1.0 } else { 2.0_f64.sqrt() } / length_mm.sqrt();
+        let phases: Vec<f64> =
+            at_mm.iter().map(|at| std::f64::consts::PI * (at - self.corner_mm[axis]) / length_mm).collect();
+        let of = |order: usize| phases.iter().map(|phase| scale(order) * (order as f64 * phase).cos()).collect();
+        (0..self.counts[axis]).map(of).collect()
+    }
+
+    /// The waves along either axis of a grid, by which [`Self::on_grid`] tells fields there.
+    pub(super) fn grid(&self, grid: &Grid) -> [Mat<f64>; 2] {
+        [0, 1].map(|axis| {
+            let at_mm: Vec<f64> =
+                (0..grid.counts[axis]).map(|k| grid.corner_mm[axis] + grid.spacing_mm * k as f64).collect();
+            let cosines = self.cosines(axis, &at_mm);
+            Mat::from_fn(at_mm.len(), cosines.len(), |r, c| cosines[c][r])
+        })
+    }
+
+    /// A field by its coefficients at all nodes of a grid: u by v.
+    pub(super) fn on_grid(&self, [along, across]: &[Mat<f64>; 2], coefficients: &[f64]) -> Mat<f64> {
+        let mut square = Mat::<f64>::zeros(self.counts[0], self.counts[1]);
+        self.orders.iter().zip(coefficients).for_each(|([a, b], of)| square[(*a, *b)] = *of);
+        along * &square * across.transpose()
+    }
+
+    /// Takes a place to the axes along and across the lay.
+    pub(super) fn turned(&self, place: [f64; 2]) -> [f64; 2] {
+        turned(self.lay, place)
+    }
+}
+
+/// A square grid along the axes of the waves.
+#[derive(Clone, Debug)]
+pub(super) struct Grid {
+    pub(super) corner_mm: [f64; 2],
+    pub(super) spacing_mm: f64,
+    pub(super) counts: [usize; 2],
+}
+
+fn turned(lay: Lay, [x, y]: [f64; 2]) -> [f64; 2] {
+    let [c, s] = lay.along;
+    [c * x + s * y, c * y - s * x]
+}
+
+/// The spectral density of a field of strength 1: of exp(-2 (r / range)^2), and of Matern's with kappa^2 = 8 nu / range^2, which is
+/// 4 pi nu kappa^(2 nu) / (kappa^2 + w^2)^(nu + 1) (Rasmussen and Williams 2006, 4.15).
+fn density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
+    let matern = |nu: f64| {
+        let kappa2 = 8.0 * nu / (range_mm * range_mm);
+        2.0 * std::f64::consts::TAU * nu * kappa2.powf(nu) / (kappa2 + number2).powf(nu + 1.0)
+    };
+    match smoothness {
+        Smoothness::Never => matern(0.5),
+        Smoothness::Once => matern(2.0),
+        Smoothness::Endless => {
+            0.25 * std::f64::consts::TAU * range_mm.powi(2) * (-number2 * range_mm.powi(2) / 8.0).exp()
+        }
+    }
+}
+
+/// The share of the variance in waves of a larger number: the integral of the density over the plane outside of a circle.
+fn beyond(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
+    let matern = |nu: f64| {
+        let kappa2 = 8.0 * nu / (range_mm * range_mm);
+        (kappa2 / (kappa2 + number2)).powf(nu)
+    };
+    match smoothness {
+        Smoothness::Never => matern(0.5),
+        Smoothness::Once => matern(2.0),
+        Smoothness::Endless => (-number2 * range_mm.powi(2) / 8.0).exp(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Field;
+    use super::*;
+
+    const PART: [[f64; 2]; 2] = [[-30.0, -20.0], [30.0, 20.0]];
+
+    /// The covariance of two places that the waves make.
+    fn covariance(waves: &Waves, field: &Field, places: [[f64; 2]; 2]) -> f64 {
+        let (strengths, _) = waves.strengths(field.smoothness, field.range_mm);
+        let at = waves.at(&places);
+        (0..waves.len()).map(|k| strengths[k].powi(2) * at[(0, k)] * at[(1, k)]).sum()
+    }
+
+    #[test]
+    fn within_the_part_they_make_the_covariance_of_the_field() {
+        for (smoothness, near) in [(Smoothness::Never, 0.05), (Smoothness::Once, 0.02), (Smoothness::Endless, 0.02)] {
+            for lay in [Lay::NONE, Lay::at(0.7, 3.0)] {
+                let field = Field { smoothness, lay, ..Field::new(1.0, 12.0) };
+                let waves = Waves::over(&PART, lay, 3000);
+                for (a, b) in [([0.0, 0.0], [3.0, 1.0]), ([10.0, -5.0], [14.0, 2.0]), ([20.0, 10.0], [20.0, 2.0])] {
+                    let [made, exact] = [covariance(&waves, &field, [a, b]), field.covariance_mm2(a, b)];
+                    assert!((made - exact).abs() < near, "{smoothness:?} {lay:?} {a:?}: {made} {exact}");
+                }
+                let (_, left) = waves.strengths(smoothness, 12.0);
+                let [made, all] = [covariance(&waves, &field, [[1.0, 2.0]; 2]), 1.0 - left];
+                assert!((made - all).abs() < 0.03, "{smoothness:?} {lay:?}: {made} {all}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_shorter_waves_would_have_is_told() {
+        let waves = Waves::over(&PART, Lay::NONE, 200);
+        let left = [20.0, 5.0, 1.0].map(|range_mm| waves.strengths(Smoothness::Never, range_mm).1);
+        assert!(left[0] < 0.2 && left[1] > 0.3 && left[2] > 0.8 && left[2] < 1.0, "{left:?}");
+        assert!(waves.strengths(Smoothness::Endless, 30.0).1 < 0.02);
+    }
+
+    #[test]
+    fn on_a_grid_a_field_is_what_it_is_at_each_of_its_places() {
+        let waves = Waves::over(&PART, Lay::at(0.4, 2.0), 60);
+        let grid = Grid { corner_mm: [-5.0, 2.0], spacing_mm: 1.5, counts: [4, 3] };
+        let coefficients: Vec<f64> = (0..60).map(|k| (f64::from(k) * 0.7).sin()).collect();
+        let on = waves.on_grid(&waves.grid(&grid), &coefficients);
+        let (c, s) = (0.4_f64.cos(), 0.4_f64.sin());
+        for (i, j) in [(0, 0), (3, 2), (1, 2)] {
+            let [u, v] = [grid.corner_mm[0] + 1.5 * i as f64, grid.corner_mm[1] + 1.5 * j as f64];
+            let at = waves.at(&[[c * u - s * v, s * u + c * v]]);
+            let by_hand: f64 = (0..60).map(|k| at[(0, k)] * coefficients[k]).sum();
+            assert!((on[(i, j)] - by_hand).abs() < 1e-12);
+        }
+    }
+}
