@@ -14,7 +14,7 @@ use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use regrind::geometry::{Point, Pose};
 use regrind::model::{Form, Given, Interval};
-use regrind::registration::{Options, PointStatus, Start, register};
+use regrind::registration::{Deviation, Options, PointStatus, Start, register};
 use regrind::surface::{Nominal, Projection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise};
@@ -160,14 +160,19 @@ fn told(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64
     let options = Options { start: Start::Pose(pose(&placement)), ..Options::new(RADIUS_MM) };
     let found = register(nominal, &cloud, &options).ok()?;
     let told = Form::of(&found, &Given::default()).ok()?;
-    // The form as it lies on the part, not where the registration found the part.
+    // The same part without scatter, where the registration found it: a tilt moves the feet, and over strong forms that is no effect of first order.
+    let held = Options { start: Start::Pose(found.cmm_from_model), locked: [true; 6], ..options };
+    let true_at = |places: &[[f64; 2]]| {
+        let cloud: Vec<Point> = places.iter().map(|place| touch((place, &[0.0; 3]))).collect();
+        Some(register(nominal, &cloud, &held).ok()?.deviations)
+    };
+    let heights = |of: &[Deviation]| DVector::from_iterator(of.len(), of.iter().map(|d| d.deviation_mm));
     let used = found.deviations.iter().zip(&places).filter(|(d, _)| d.status == PointStatus::Used);
-    let used: Vec<[f64; 2]> = used.map(|(_, place)| *place).collect();
-    let heights = DVector::from_iterator(used.len(), used.iter().map(|[x, y]| form(*x, *y)));
-    let motions = motions(used.iter().map(|[x, y]| (shape.point(*x, *y), shape.normal(*x, *y))));
-    let factor = motions.clone().qr();
-    let moved = factor.r().solve_upper_triangular(&factor.q().tr_mul(&heights))?;
-    let left = heights - motions * &moved;
+    let touched = true_at(&used.map(|(_, place)| *place).collect::<Vec<_>>())?;
+    let factor = motions(&touched).qr();
+    let moved = factor.r().solve_upper_triangular(&factor.q().tr_mul(&heights(&touched)))?;
+    let after_best_fit = |of: &[Deviation]| heights(of) - motions(of) * &moved;
+    let left = after_best_fit(&touched);
     let rms = (left.norm_squared() / left.len() as f64).sqrt();
     // The aperture: all that the points lie around.
     const ACROSS: usize = 160;
@@ -182,10 +187,7 @@ fn told(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64
     };
     let all = (0..=ACROSS).flat_map(|i| (0..=ACROSS * 2 / 3).map(move |j| [i, j]));
     let all = all.map(|at| [0, 1].map(|k: usize| at[k] as f64 * step_mm - HALF_MM[k])).filter(|at| inside(*at));
-    let all: Vec<[f64; 2]> = all.collect();
-    let rows = self::motions(all.iter().map(|[x, y]| (shape.point(*x, *y), shape.normal(*x, *y))));
-    let between = DVector::from_iterator(all.len(), all.iter().map(|[x, y]| form(*x, *y))) - rows * moved;
-    let mut between: Vec<f64> = between.iter().copied().collect();
+    let mut between: Vec<f64> = after_best_fit(&true_at(&all.collect::<Vec<_>>())?).iter().copied().collect();
     between.sort_by(f64::total_cmp);
     let left_out = between.len() / 1000;
     // No touched place is left out.
@@ -350,11 +352,12 @@ fn planted(truth: Truth, places: &[[f64; 2]], rms_mm: f64, rng: &mut Rng) -> Box
 }
 
 /// What a unit of each coordinate of the twist adds to the distance of each point from the surface.
-fn motions(of: impl Iterator<Item = (Vec3, Vec3)>) -> DMatrix<f64> {
+fn motions(of: &[Deviation]) -> DMatrix<f64> {
     let rows: Vec<[f64; 6]> = of
-        .map(|(p, n)| {
-            let turn = |a: usize, b: usize| (p[a] * n[b] - p[b] * n[a]) / HALF_MM[0];
-            [n[0], n[1], n[2], turn(1, 2), turn(2, 0), turn(0, 1)]
+        .iter()
+        .map(|d| {
+            let arm = d.point.coords.cross(&d.normal) / HALF_MM[0];
+            [d.normal.x, d.normal.y, d.normal.z, arm.x, arm.y, arm.z]
         })
         .collect();
     DMatrix::from_fn(rows.len(), 6, |r, c| rows[r][c])

@@ -12,6 +12,8 @@
 //! The waves are as many as can be told apart by the points, by a Cholesky factor with pivots of their products. A field has shorter ones too: those are as good
 //! as independent from point to point, and add to every l alike.
 
+use std::f64::consts::LN_2;
+
 use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::{Accum, Mat, Par, Side};
@@ -67,6 +69,8 @@ pub(super) struct Fields {
     base: DMatrix<f64>,
     /// n - p.
     pub(super) free: f64,
+    /// ln |W| - 1/2 ln |H'W'W H|: what makes likelihoods with a drift and without one those of the same points.
+    pub(super) log_whitened: f64,
     reduced: Reduced,
     /// Q'W phi: what the best fit takes of the waves.
     taken: Mat<f64>,
@@ -118,6 +122,9 @@ impl Fields {
         let all: Vec<_> =
             all.filter(|of| is_laid(of.0, of.1)).map(|(_, smoothness, range_mm)| (smoothness, range_mm)).collect();
         fields.nodes = fields.laid(&all);
+        // One of two stands for both.
+        let rough = fields.nodes.iter_mut().filter(|node| node.smoothness == Smoothness::Never);
+        rough.for_each(|node| node.prior.iter_mut().for_each(|of| *of += LN_2));
         Ok(fields)
     }
 
@@ -150,12 +157,24 @@ impl Fields {
         let waves = Waves::over(&places, kind.lay, count);
         let whitening = whitening(&observed.path, n, kind.drift);
         let effects = whitened(&whitening, &observed.effects);
-        super::dense::told_apart(effects.tr_mul(&effects))?;
+        let factor = super::dense::told_apart(effects.tr_mul(&effects))?;
+        let log_whitened =
+            whitening.iter().map(|[own, _]| own.ln()).sum::<f64>() - factor.l().diagonal().map(f64::ln).sum();
         let base = if effects.ncols() > 0 { effects.qr().q() } else { effects };
         let free = (n - base.ncols()) as f64;
         let reduced = Reduced { rows: Mat::new(), pivots: None };
-        let mut fields =
-            Self { kind, waves, places, whitening, base, free, reduced, taken: Mat::new(), nodes: Vec::new() };
+        let mut fields = Self {
+            kind,
+            waves,
+            places,
+            whitening,
+            base,
+            free,
+            log_whitened,
+            reduced,
+            taken: Mat::new(),
+            nodes: Vec::new(),
+        };
         (fields.reduced, fields.taken) = if n <= MOST_WHOLE { fields.whole() } else { fields.told_apart() };
         Ok(fields)
     }

@@ -69,7 +69,7 @@ impl SlopeFigures {
         let found = forms.each_ref().map(|forms| each(forms, |form| slopes.of(form)));
         let [rms, largest] = [0, 1].map(|k| {
             let values = |of: usize| found[of].iter().map(|of| of[k]).collect();
-            let of = Interval::of(values(0), (k == 1).then(|| values(1)).into_iter(), is_seen, given);
+            let of = Interval::of(values(0), (Vec::new(), (k == 1).then(|| values(1)).into_iter()), is_seen, given);
             AngleInterval { median_rad: of.median_mm, low_rad: of.low_mm, high_rad: of.high_mm }
         });
         Self { rms, largest, integration_mm: slopes.integration_mm, places: slopes.nodes }
@@ -81,10 +81,12 @@ impl IsoFigures {
     pub(super) fn of(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool, given: &Given) -> Self {
         let found = forms.each_ref().map(|forms| each(forms, |form| fits.of(form)));
         let values = |k: usize, of: fn(&IsoOfForm) -> f64| found[k].iter().map(of).collect::<Vec<f64>>();
-        let interval =
-            |of: fn(&IsoOfForm) -> f64, has_low: bool| Interval::of(values(0, of), std::iter::empty(), has_low, given);
-        let extreme =
-            |of: fn(&IsoOfForm) -> f64| Interval::of(values(0, of), std::iter::once(values(1, of)), is_seen, given);
+        let interval = |of: fn(&IsoOfForm) -> f64, has_low: bool| {
+            Interval::of(values(0, of), (Vec::new(), std::iter::empty()), has_low, given)
+        };
+        let extreme = |of: fn(&IsoOfForm) -> f64| {
+            Interval::of(values(0, of), (Vec::new(), std::iter::once(values(1, of))), is_seen, given)
+        };
         let power_rim = interval(|of| of.power_rim_mm, true);
         let has_sign = power_rim.low_mm * power_rim.high_mm > 0.0;
         Self {

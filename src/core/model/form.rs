@@ -5,17 +5,17 @@
 //! best fit, over fields drawn from what the measurement leaves possible ([`super::posterior`]); so the scatter of the probe is taken off them, and
 //! the pose is in their uncertainty.
 
-use nalgebra::{DMatrix, Matrix3, Matrix6, SymmetricEigen, Vector6};
+use faer::Mat;
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SymmetricEigen, Vector6};
 
 use rayon::prelude::*;
 
 use super::between::Between;
 use super::budget::{self, Share};
 use super::fields::Fields;
-use super::kind::kind;
 use super::machine::{Effects, Machine, Source, unsound};
 use super::normals::Normals;
-use super::posterior::{Draws, Posterior, Probe};
+use super::posterior::{Draws, Posterior, Probe, Which, laid};
 use super::spacing_mm;
 use super::{AreaOptions, IsoFigures, SlopeFigures};
 use super::{Hyper, ModelError, Observed, Predicted, Priors};
@@ -98,6 +98,10 @@ pub struct Interval {
 
 /// Fields that are drawn, and places at which they are looked at, at most.
 const SAMPLES: usize = 1000;
+/// Fields of one kind that are drawn, where one kind is looked at: the smooth ones for the lower ends, the rough ones for the upper ones where these are at
+/// least so probable.
+const FEWER: usize = 250;
+const MAY_BE: f64 = 0.025;
 const MOST_PLACES: usize = 6000;
 /// Drawn fields that are worked on at a time.
 const A_TIME: usize = 50;
@@ -122,16 +126,26 @@ impl Form {
         let posterior = seen.posterior(given);
         let chosen: Vec<usize> = thinned(seen.observed.places.len()).collect();
         let some = seen.observed.only(&chosen);
-        let drawn = Drawn::by(&seen.fields, posterior.draws(SAMPLES, 1), some.places, some.effects, true);
-        let drawn = Drawn { chosen: chosen.clone(), ..drawn }.known_as(&seen.observed);
         let at = |chosen: &[usize]| seen.ground_in.as_ref().map(|ground_in| ground_in.select_rows(chosen));
-        let ground_in = at(&seen.of_all(&chosen));
-        let drawn = drawn.without(ground_in.as_ref());
+        let of = |draws: Draws, is_between: bool| {
+            let drawn = seen.drawn(draws, some.places.clone(), some.effects.clone(), is_between);
+            let drawn = Drawn { chosen: chosen.clone(), ..drawn }.known_as(&seen.observed);
+            drawn.without(at(&seen.of_all(&chosen)).as_ref())
+        };
+        let whole = |drawn: Drawn, apart: &[usize]| {
+            seen.with_those(apart, drawn.with_the_scatter(&seen.observed, &posterior, given), given).after_best_fit()
+        };
+        let drawn = of(posterior.draws(Which::All, SAMPLES, 1), true);
         let slope = seen.slope(given, &posterior, &drawn);
-        let drawn = drawn.with_the_scatter(&seen.observed, &posterior, given);
-        let drawn = seen.with_those_apart(drawn, given).after_best_fit();
+        let drawn = whole(drawn, &seen.apart);
+        let form = if seen.is_chance { &[][..] } else { &seen.agreed };
+        let least = whole(of(posterior.draws(Which::Smooth, FEWER, 2), false), form).told_by();
+        let most = match posterior.is_rough() > MAY_BE {
+            true => whole(of(posterior.draws(Which::Rough, FEWER, 3), false), &seen.apart).told_by(),
+            false => Vec::new(),
+        };
         let ground_in = at(&drawn.chosen);
-        Ok(Self { slope, ..seen.form(given, &posterior, &drawn, ground_in, true) })
+        Ok(Self { slope, ..seen.form(given, &posterior, (&drawn, [&least, &most]), ground_in, true) })
     }
 
     /// Tells the form at places of the part that need not have been touched: points of the nominal surface with their normals, in the model
@@ -160,13 +174,13 @@ impl Form {
         // Many more places than touches are close enough to each other.
         let is_between = places.len() < 2 * seen.kept.len();
         let at = places.iter().map(plane).collect();
-        let drawn = Drawn::by(&seen.fields, posterior.draws(SAMPLES, 1), at, effects, is_between);
+        let drawn = seen.drawn(posterior.draws(Which::All, SAMPLES, 1), at, effects, is_between);
         let drawn = drawn.rough_where_touched(&seen.observed.places).known_as(&seen.observed);
         let ground_in = seen.ground_in.is_some().then(|| seen.stated.columns(places.iter().copied()));
         let drawn = drawn.without(ground_in.as_ref());
         let slope = if is_whole { seen.slope(given, &posterior, &drawn) } else { None };
-        let drawn = seen.with_those_apart(drawn.with_what_is_narrow(given), given).after_best_fit();
-        Ok(Self { slope, ..seen.form(given, &posterior, &drawn, ground_in, is_whole) })
+        let drawn = seen.with_those(&seen.apart, drawn.with_what_is_narrow(given), given).after_best_fit();
+        Ok(Self { slope, ..seen.form(given, &posterior, (&drawn, [&[], &[]]), ground_in, is_whole) })
     }
 }
 
@@ -177,6 +191,10 @@ struct Seen {
     all: Observed,
     /// Those of them that no field explains, ascending: what stands there is form all the same.
     apart: Vec<usize>,
+    /// Those of these that touches beside them agree with.
+    agreed: Vec<usize>,
+    /// Whether so many stand alone that two of them are neighbours by chance.
+    is_chance: bool,
     /// The rest of them, and what was observed at those.
     kept: Vec<usize>,
     observed: Observed,
@@ -195,6 +213,8 @@ impl Seen {
         if let Some(priors) = &given.priors {
             priors.check()?;
         }
+        /// So many touches lie around one.
+        const AROUND: f64 = 8.0;
         let mut seen = Self::with_all_in_the_fit(registration, given, at_points)?;
         for _ in 0..ROUNDS {
             let more = seen.unexplained(given);
@@ -210,11 +230,29 @@ impl Seen {
             let Ok(fields) = Fields::over(&observed, seen.fields.kind) else { break };
             seen = Self { apart, kept, observed, fields, ..seen };
         }
-        Ok(seen)
+        let left_out = registration.deviations.iter().filter(|d| d.status == PointStatus::Outlier).count();
+        let alone = (left_out + seen.apart.len() - seen.agreed.len()) as f64;
+        let by_chance = 0.5 * AROUND * alone * alone / seen.all.places.len() as f64;
+        Ok(Self { is_chance: by_chance > MAY_BE, ..seen })
     }
 
     fn posterior(&self, given: &Given) -> Posterior<'_> {
         Posterior::of(&self.fields, &self.observed, given.priors.as_ref(), probe(given))
+    }
+
+    /// Forms at some places, in the frame of the registration: with the motions that take each to what was found.
+    fn drawn(&self, draws: Draws, places: Vec<[f64; 2]>, effects: DMatrix<f64>, is_between: bool) -> Drawn {
+        let Observed { effects: rows, stated, deviations_mm, .. } = &self.observed;
+        let weights = rows * inverse_of_products(rows);
+        let found = weights.tr_mul(&DVector::from_column_slice(deviations_mm));
+        let beside = weights.tr_mul(stated) * &draws.stated;
+        let sums = self.fields.sums(&weights);
+        let sums = Mat::from_fn(sums.nrows(), sums.ncols(), |r, c| sums[(r, c)]);
+        let moved = draws.waves.each_ref().map(|waves| {
+            let of_form = &sums * waves;
+            DMatrix::from_fn(rows.ncols(), waves.ncols(), |m, c| found[m] - beside[(m, c)] - of_form[(m, c)])
+        });
+        Drawn::by(&self.fields, draws, (places, effects), &moved, is_between)
     }
 
     /// The points that are further from the field than its scatter lets any of them be, of all that were used.
@@ -244,45 +282,53 @@ impl Seen {
         chosen.iter().map(|&k| self.kept[k]).collect()
     }
 
-    /// Puts the points that no field explains into what is drawn, each with the height that was found there but for the scatter of a touch:
+    /// Puts points that no field explains into what is drawn, each with the height that was found there but for the scatter of a touch:
     /// in their order among the points, or in place of the nearest of other places.
-    fn with_those_apart(&self, drawn: Drawn, given: &Given) -> Drawn {
+    fn with_those(&self, apart: &[usize], drawn: Drawn, given: &Given) -> Drawn {
         let (rows, at_points) = (drawn.places.len(), !drawn.chosen.is_empty());
         let chosen = self.of_all(&drawn.chosen);
         let drawn = Drawn { chosen, ..drawn };
-        if self.apart.is_empty() {
+        if apart.is_empty() {
             return drawn;
         }
         // Of the points of a scan as large a share as of the others, the tallest of them.
-        let mut apart = self.apart.clone();
+        let count = apart.len();
+        let mut apart = apart.to_vec();
         if at_points {
             apart.sort_by(|a, b| self.all.deviations_mm[*b].abs().total_cmp(&self.all.deviations_mm[*a].abs()));
-            apart.truncate((self.apart.len() * rows).div_ceil(self.kept.len().max(1)));
+            apart.truncate((count * rows).div_ceil(self.kept.len().max(1)));
             apart.sort_unstable();
         }
-        let found = self.touched_at(&apart, &drawn.scatter_mm, given);
+        let found = self.touched_at(&apart, &drawn, given);
         if at_points { drawn.beside(found) } else { drawn.replaced_by(&found) }
     }
 
     /// What some of the points found, as often as forms are drawn.
-    fn touched_at(&self, points: &[usize], scatter_mm: &[f64], given: &Given) -> Drawn {
-        let mut forms = DMatrix::zeros(points.len(), scatter_mm.len());
+    fn touched_at(&self, points: &[usize], drawn: &Drawn, given: &Given) -> Drawn {
+        let stated = self.all.stated.select_rows(points) * &drawn.stated;
         let of_probe = |mm: f64| probe(given).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
-        for (c, mut form) in forms.column_iter_mut().enumerate() {
+        let mut forms = [0, 1].map(|_| DMatrix::zeros(points.len(), drawn.scatter_mm.len()));
+        for c in 0..drawn.scatter_mm.len() {
             let mut normals = Normals::new(6, c as u64);
-            for (value, &k) in form.iter_mut().zip(points) {
-                *value = self.all.deviations_mm[k] - of_probe(scatter_mm[c]) * normals.next();
+            let scatter_mm = of_probe(drawn.scatter_mm[c]);
+            // The tallest touch of a defect is one that scattered upwards: where extremes are told from below, all of them do.
+            let alike_mm = scatter_mm * normals.next();
+            for (r, &k) in points.iter().enumerate() {
+                let found_mm = self.all.deviations_mm[k] - stated[(r, c)];
+                forms[0][(r, c)] = found_mm - scatter_mm * normals.next();
+                forms[1][(r, c)] = found_mm - alike_mm;
             }
         }
         let found = Drawn {
-            forms: [forms.clone(), forms],
-            all: None,
+            all: drawn.all.is_some().then(|| forms[0].clone()),
+            forms,
             places: points.iter().map(|&k| self.all.places[k]).collect(),
             effects: self.all.effects.select_rows(points),
             chosen: points.to_vec(),
-            smooth_sigma_mm: vec![mean(scatter_mm); points.len()],
-            scatter_mm: scatter_mm.to_vec(),
+            smooth_sigma_mm: vec![mean(&drawn.scatter_mm); points.len()],
+            scatter_mm: drawn.scatter_mm.clone(),
             narrow_mm: [Vec::new(), Vec::new()],
+            stated: drawn.stated.clone(),
             between: None,
         };
         found.without(self.ground_in.as_ref().map(|columns| columns.select_rows(points)).as_ref())
@@ -306,8 +352,19 @@ impl Seen {
         let (kept, apart): (Vec<usize>, Vec<usize>) = (0..used.len()).partition(|&k| used[k].in_fit);
         let (all, observed) =
             if apart.is_empty() { (observed.clone(), observed) } else { (observed.clone(), observed.only(&kept)) };
-        let fields = Fields::over(&observed, kind(&observed))?;
-        Ok(Self { motions, all, apart, kept, observed, stated, ground_in, fields })
+        let fields = laid(&observed)?;
+        Ok(Self {
+            motions,
+            all,
+            agreed: apart.clone(),
+            is_chance: false,
+            apart,
+            kept,
+            observed,
+            stated,
+            ground_in,
+            fields,
+        })
     }
 
     /// The slopes of what is drawn, before anything is added that has none.
@@ -322,7 +379,7 @@ impl Seen {
         &self,
         given: &Given,
         posterior: &Posterior,
-        drawn: &Drawn,
+        (drawn, ends): (&Drawn, [&[[f64; 3]]; 2]),
         ground_in: Option<DMatrix<f64>>,
         is_whole: bool,
     ) -> Form {
@@ -331,7 +388,7 @@ impl Seen {
         let covariance = of_the_fit(&self.observed, (&self.fields, posterior), alike);
         // What stands apart is seen, whatever the rest shows.
         let is_seen = is_seen(posterior) || !self.apart.is_empty();
-        let figures = drawn.figures(is_seen, given);
+        let figures = drawn.figures(is_seen, ends, given);
         let budget = if is_whole { self.budget(given, posterior, drawn, ground_in, &figures) } else { Vec::new() };
         let iso = IsoFits::over(&drawn.places, given.area.middle_mm).filter(|_| is_whole);
         let hyper = posterior.middle();
@@ -462,14 +519,19 @@ impl Default for Given {
 /// with A+ = (H'H)^-1 H' (Aitken 1935), and of what adds to all points alike. K is the mean of those of all fields that it may be.
 fn of_the_fit(observed: &Observed, (fields, posterior): (&Fields, &Posterior), alike: &DMatrix<f64>) -> DMatrix<f64> {
     let rows = &observed.effects;
-    let inverse = rows.tr_mul(rows).pseudo_inverse(f64::EPSILON);
-    let inverse = inverse.unwrap_or_else(|_| DMatrix::zeros(rows.ncols(), rows.ncols()));
+    let inverse = inverse_of_products(rows);
     // A+, a row a point.
     let weights = rows * &inverse;
     let (covered, scatter2) = posterior.covered(&fields.sums(&weights));
     let drift = fields.kind.drift;
     let of_alike = weights.tr_mul(alike);
     inverse * (scatter2 * (1.0 + drift) / (1.0 - drift)) + covered + &of_alike * of_alike.transpose()
+}
+
+/// (H'H)^-1 of the effects H.
+fn inverse_of_products(effects: &DMatrix<f64>) -> DMatrix<f64> {
+    let inverse = effects.tr_mul(effects).pseudo_inverse(f64::EPSILON);
+    inverse.unwrap_or_else(|_| DMatrix::zeros(effects.ncols(), effects.ncols()))
 }
 
 /// Forms that may have been, a column each, at some places.
@@ -487,6 +549,8 @@ struct Drawn {
     /// The scatter of each form, and what of either kind is in waves too short to be told.
     scatter_mm: Vec<f64>,
     narrow_mm: [Vec<f64>; 2],
+    /// How much of what is stated each has beside it.
+    stated: DMatrix<f64>,
     /// The same forms between the places.
     between: Option<Beside>,
 }
@@ -499,16 +563,22 @@ struct Beside {
 }
 
 impl Drawn {
-    /// At some places, and where it is asked for between them.
-    fn by(fields: &Fields, draws: Draws, places: Vec<[f64; 2]>, effects: DMatrix<f64>, is_between: bool) -> Self {
-        let Draws { waves, scatter_mm, narrow_mm } = draws;
+    /// At some places, each with so much of the motions there, and where it is asked for between them.
+    fn by(
+        fields: &Fields,
+        draws: Draws,
+        (places, effects): (Vec<[f64; 2]>, DMatrix<f64>),
+        moved: &[DMatrix<f64>; 2],
+        is_between: bool,
+    ) -> Self {
+        let Draws { waves, scatter_mm, narrow_mm, stated } = draws;
         let count = scatter_mm.len();
         let at = fields.waves.at(&places);
         let firsts: Vec<usize> = (0..count).step_by(A_TIME).collect();
         let is_between = is_between && places.len() < MOST_PLACES;
         let between = if is_between { Between::of(&places, &fields.waves) } else { None };
         let axes = between.as_ref().map(|between| fields.waves.grid(&between.grid));
-        let forms = waves.each_ref().map(|waves| {
+        let mut forms = waves.each_ref().map(|waves| {
             let some = |first: &usize| {
                 let of = &at * waves.subcols(*first, A_TIME.min(count - first));
                 (0..of.ncols()).flat_map(|c| of.col_as_slice(c).to_vec()).collect::<Vec<f64>>()
@@ -527,6 +597,13 @@ impl Drawn {
             });
             Beside { effects: between.rows(&effects), forms: on, between }
         });
+        let mut between = between;
+        for (k, moved) in moved.iter().enumerate() {
+            forms[k] += &effects * moved;
+            if let Some(Beside { forms, effects, .. }) = &mut between {
+                forms[k] += &*effects * moved;
+            }
+        }
         Self {
             forms,
             all: None,
@@ -536,6 +613,7 @@ impl Drawn {
             smooth_sigma_mm: Vec::new(),
             scatter_mm,
             narrow_mm,
+            stated,
             between,
         }
     }
@@ -546,22 +624,7 @@ impl Drawn {
         let near2 = (0.5 * spacing_mm(&self.places)).powi(2);
         let tree = Nearest::of(touched.iter().map(at));
         let is_touched = |k: &usize| tree.to(&at(&self.places[*k]), 1).any(|(_, square)| square < near2);
-        let (rough, plain): (Vec<usize>, Vec<usize>) = (0..self.places.len()).partition(is_touched);
-        // Each kind has motions of its own, which the touches do not see: they are taken off before both are one form.
-        if rough.len() < self.effects.ncols() {
-            self.forms[1] = self.forms[0].clone();
-            return self;
-        }
-        let factor = self.effects.select_rows(&rough).qr();
-        let (base, upper) = (factor.q(), factor.r());
-        for (k, forms) in self.forms.iter_mut().enumerate() {
-            let Some(moved) = upper.solve_upper_triangular(&base.tr_mul(&forms.select_rows(&rough))) else { continue };
-            *forms -= &self.effects * &moved;
-            if let Some(Beside { forms, effects, .. }) = &mut self.between {
-                forms[k] -= &*effects * moved;
-            }
-        }
-        for k in plain {
+        for k in (0..self.places.len()).filter(|k| !is_touched(k)) {
             let row = self.forms[0].row(k).into_owned();
             self.forms[1].set_row(k, &row);
         }
@@ -588,13 +651,12 @@ impl Drawn {
         let effects = seen.all_effects();
         let base = if effects.ncols() > 0 { effects.qr().q() } else { effects };
         let fitted = |column: DMatrix<f64>| &column - &base * base.tr_mul(&column);
-        let found = DMatrix::from_column_slice(seen.deviations_mm.len(), 1, &seen.deviations_mm);
+        let found = &seen.deviations_mm;
         if posterior.free() < FEW_FREE && probe(given).is_none() {
-            let whole = fitted(found.clone());
-            let mut all = DMatrix::zeros(whole.nrows(), self.scatter_mm.len());
+            let mut all = DMatrix::zeros(found.len(), self.scatter_mm.len());
             for (c, mut form) in all.column_iter_mut().enumerate() {
                 let mut normals = Normals::new(7, c as u64);
-                form.iter_mut().zip(&whole).for_each(|(value, of)| *value = of + self.scatter_mm[c] * normals.next());
+                form.iter_mut().zip(found).for_each(|(value, of)| *value = of + self.scatter_mm[c] * normals.next());
             }
             self.all = Some(all);
         }
@@ -748,17 +810,24 @@ impl Drawn {
         (squares / self.smooth_sigma_mm.len().max(1) as f64).sqrt()
     }
 
+    /// The figures of each form at the places alone: RMS by the fields as they are, extremes by the others.
+    fn told_by(&self) -> Vec<[f64; 3]> {
+        let [plain, other] = self.forms.each_ref().map(|forms| self.figures_of(forms, None));
+        plain.iter().zip(&other).map(|([rms, ..], [_, pv, most])| [*rms, *pv, *most]).collect()
+    }
+
     /// The figures; where no form is seen they are known from above alone.
-    fn figures(&self, is_seen: bool, given: &Given) -> FormFigures {
+    fn figures(&self, is_seen: bool, [least, most]: [&[[f64; 3]]; 2], given: &Given) -> FormFigures {
         let [plain, rough] =
             [0, 1].map(|k| self.figures_of(&self.forms[k], self.between.as_ref().map(|of| &of.forms[0])));
         let all = self.all.as_ref().map(|all| self.figures_of(all, None));
-        let interval = |k: usize, is_extreme: bool| {
+        let interval = |k: usize| {
             let of = |figures: &[[f64; 3]]| figures.iter().map(|of| of[k]).collect::<Vec<f64>>();
-            let higher = is_extreme.then(|| of(&rough)).into_iter().chain(all.as_deref().map(of));
-            Interval::of(of(&plain), higher, is_seen, given)
+            let others = if k == 0 { most } else { &rough };
+            let higher = [Some(others), all.as_deref()].into_iter().flatten().filter(|of| !of.is_empty()).map(of);
+            Interval::of(of(&plain), (of(least), higher), is_seen, given)
         };
-        FormFigures { rms: interval(0, false), pv: interval(1, true), pv_most_points: interval(2, true) }
+        FormFigures { rms: interval(0), pv: interval(1), pv_most_points: interval(2) }
     }
 
     /// Root mean square, peak to valley, and that of the aperture, of each form.
@@ -834,14 +903,15 @@ impl Interval {
         (self.high_mm - self.low_mm) / WIDTH
     }
 
-    /// Of values that are equally probable; from above by whichever of others are higher.
+    /// Of values that are equally probable; from below by others where those are lower, from above by whichever of others are higher.
     pub(super) fn of(
         mut values: Vec<f64>,
-        higher: impl Iterator<Item = Vec<f64>>,
+        (mut lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
         has_low: bool,
         given: &Given,
     ) -> Self {
         values.sort_unstable_by(f64::total_cmp);
+        lower.sort_unstable_by(f64::total_cmp);
         let higher: Vec<Vec<f64>> = higher
             .map(|mut of| {
                 of.sort_unstable_by(f64::total_cmp);
@@ -852,7 +922,11 @@ impl Interval {
         let nth = |of: &[f64], share: f64| of[((of.len() - 1) as f64 * share).round() as usize];
         let at = |share: f64| {
             let own = nth(&values, share);
-            if share > 0.5 { higher.iter().fold(own, |most, of| most.max(nth(of, share))) } else { own }
+            match share {
+                _ if share > 0.5 => higher.iter().fold(own, |most, of| most.max(nth(of, share))),
+                _ if share < 0.5 && !lower.is_empty() => own.min(nth(&lower, share)),
+                _ => own,
+            }
         };
         let low = |share: f64| if has_low { at(share) } else { 0.0 };
         Self {

@@ -20,7 +20,7 @@ const SPREAD: usize = 150;
 const DRIFTS: [f64; 3] = [0.3, 0.6, 0.85];
 const DRIFT_STEPS: [f64; 3] = [0.12, 0.06, 0.03];
 const MOST_DRIFT: f64 = 0.97;
-const DRIFT_EVIDENCE: f64 = 2.0;
+pub(super) const DRIFT_EVIDENCE: f64 = 2.0;
 /// The logarithm of the stretch of a lay at which the search begins, the most that is told, and by how much it has to be spoken for.
 const FIRST_STRETCH: f64 = 0.6;
 const MOST_STRETCHED: f64 = 10.0;
@@ -37,15 +37,13 @@ const STRONGER: f64 = 2.0;
 /// A place of range and ratio, by their logarithms, and the logarithm of the likelihood there.
 type Top = ([f64; 2], f64);
 
-/// Tells the kind of the fields that the points speak for.
-pub(super) fn kind(observed: &Observed) -> Kind {
+/// Tells the kinds of field that the points may speak for: one without a drift, and one with a drift where neighbours speak for it.
+pub(super) fn kinds(observed: &Observed) -> (Kind, Option<Kind>) {
     let blocks = Blocks::of(observed);
     let plain = blocks.top(Kind::PLAIN, None);
-    let (kind, top) = match observed.path.is_empty() {
-        true => (Kind::PLAIN, plain),
-        false => blocks.drift(plain),
-    };
-    Kind { lay: blocks.lay(kind, top).unwrap_or(Lay::NONE), ..kind }
+    let with_lay = |kind: Kind, top: Top| Kind { lay: blocks.lay(kind, top).unwrap_or(Lay::NONE), ..kind };
+    let drifting = if observed.path.is_empty() { None } else { blocks.drift(plain) };
+    (with_lay(Kind::PLAIN, plain), drifting.map(|(kind, top)| with_lay(kind, top)))
 }
 
 struct Blocks {
@@ -121,7 +119,7 @@ impl Blocks {
     }
 
     /// The drift that is spoken for most, where it is by enough more than none.
-    fn drift(&self, plain: Top) -> (Kind, Top) {
+    fn drift(&self, plain: Top) -> Option<(Kind, Top)> {
         let of = |drift: f64| Kind { drift, ..Kind::PLAIN };
         let mut best = (0.0, plain);
         for drift in DRIFTS {
@@ -131,7 +129,7 @@ impl Blocks {
             }
         }
         if best.1.1 < plain.1 + DRIFT_EVIDENCE {
-            return (Kind::PLAIN, plain);
+            return None;
         }
         for step in DRIFT_STEPS {
             for drift in [best.0 - step, best.0 + step].map(|drift| drift.clamp(0.0, MOST_DRIFT)) {
@@ -141,7 +139,7 @@ impl Blocks {
                 }
             }
         }
-        (of(best.0), best.1)
+        Some((of(best.0), best.1))
     }
 
     /// The lay of the field, where it is spoken for by enough more than none.

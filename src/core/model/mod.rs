@@ -161,7 +161,7 @@ impl Hyper {
             priors.check()?;
         }
         observed.check()?;
-        let fields = fields::Fields::over(observed, kind::kind(observed))?;
+        let fields = posterior::laid(observed)?;
         Ok(posterior::Posterior::of(&fields, observed, priors, None).middle())
     }
 
