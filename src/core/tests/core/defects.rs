@@ -1,6 +1,9 @@
 //! What is wrong with a part is in its figures, however high and however small; what is wrong with one touch is left out and named.
 
+use std::f64::consts::TAU;
 use std::sync::OnceLock;
+
+use nalgebra::{DMatrix, DVector};
 
 use crate::common::{RADIUS_MM, centres, placed, points};
 use regrind_core::geometry::Point;
@@ -149,5 +152,55 @@ fn the_form_is_as_high_as_what_was_touched() {
             let off_mm = (of.form.mean_mm - d.deviation_mm).abs();
             assert!(off_mm < 6.0 * NOISE_MM + 0.1 * found.verdict.pv_mm, "{name}: {of:?} of {d:?}");
         }
+    }
+}
+
+/// RMS and PV of what is planted, after its own best fit: of the same touches without scatter.
+fn true_figures_mm(counts: [usize; 2], planted_mm: impl Fn(f64, f64) -> f64) -> [f64; 2] {
+    let exact = found(&touched(counts, 0.0, planted_mm)).deviations;
+    let heights = DVector::from_iterator(exact.len(), exact.iter().map(|d| d.deviation_mm));
+    let motions = DMatrix::from_fn(exact.len(), 6, |r, c| {
+        let (normal, arm) = (exact[r].normal, exact[r].point.coords.cross(&exact[r].normal) / HALF_MM[0]);
+        [normal.x, normal.y, normal.z, arm.x, arm.y, arm.z][c]
+    });
+    let base = motions.qr().q();
+    let left = &heights - &base * base.tr_mul(&heights);
+    [(left.norm_squared() / left.len() as f64).sqrt(), left.max() - left.min()]
+}
+
+#[test]
+fn of_a_strong_form_that_the_pose_is_not_fitted_to_everywhere_the_figures_are_true() {
+    const FEW: [usize; 2] = [25, 16];
+    // High at the corners alone, by the fourth power of the distance from the middle.
+    let planted = |x: f64, y: f64| 0.03 * ((x.powi(4) + y.powi(4) - 6.0 * x * x * y * y) / 3400f64.powi(2));
+    let found = found(&touched(FEW, NOISE_MM, planted));
+    let beside = found.deviations.iter().filter(|d| d.status == PointStatus::Used && !d.in_fit).count();
+    let told = Form::of(&found, &Given::default()).unwrap().figures;
+    let [rms_mm, pv_mm] = true_figures_mm(FEW, planted);
+    println!(
+        "{beside} beside the fit; true RMS {rms_mm:.5} PV {pv_mm:.5}, told {:?}",
+        [told.rms, told.pv].map(|of| [of.low_mm, of.high_mm])
+    );
+    assert!(beside > 0);
+    assert!((told.rms.low_mm..told.rms.high_mm).contains(&rms_mm), "{rms_mm} {:?}", told.rms);
+    assert!((told.pv.low_mm..told.pv.high_mm).contains(&pv_mm), "{pv_mm} {:?}", told.pv);
+    assert!(told.rms.high_mm - told.rms.low_mm < 0.1 * rms_mm, "{:?}", told.rms);
+}
+
+#[test]
+fn waves_across_the_path_are_form_and_no_drift() {
+    const FEW: [usize; 2] = [25, 16];
+    for degrees in [60.0f64, 80.0, 90.0, 100.0] {
+        // Five touches a wave, and so nearly the same height from one touch of a row to the next.
+        let (c, s) = (degrees.to_radians().cos() * TAU / 20.0, degrees.to_radians().sin() * TAU / 20.0);
+        let planted = move |x: f64, y: f64| 6e-4 * (c * x + s * y + 0.4).cos();
+        let told = Form::of(&found(&touched(FEW, NOISE_MM, planted)), &Given::default()).unwrap();
+        let [rms_mm, _] = true_figures_mm(FEW, planted);
+        println!(
+            "{degrees}: true RMS {rms_mm:.6}, told {:.6} to {:.6}, {:?}",
+            told.figures.rms.low_mm, told.figures.rms.high_mm, told.hyper
+        );
+        assert_eq!(told.hyper.drift, 0.0, "{degrees}");
+        assert!(told.figures.rms.high_mm > rms_mm, "{degrees}: {rms_mm} {:?}", told.figures.rms);
     }
 }
