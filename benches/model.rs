@@ -111,7 +111,7 @@ fn registered(columns: usize, rows: usize) -> Registration {
     register(&nominal, &points(centres), &options).unwrap()
 }
 
-/// What speaks for which parameters: all fields laid over the points, and the middle of those that may be.
+/// The search for parameters: all fields are laid over the points, and the middle of the possible ones is told.
 #[divan::bench(sample_count = 5)]
 fn the_parameters_of_1800_points(bencher: Bencher) {
     let all = measured(1800);

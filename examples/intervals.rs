@@ -25,7 +25,7 @@ const RADIUS_MM: f64 = 1.5;
 const SCATTER_MM: f64 = 3e-4;
 const HALF_MM: [f64; 2] = [30.0, 20.0];
 
-/// What is planted, with an RMS of 1.
+/// The planted form, with an RMS of 1.
 #[derive(Clone, Copy)]
 enum Truth {
     /// Gaussian correlation of 20 mm.

@@ -63,7 +63,7 @@ impl Between {
 
     /// Columns with a row a touched place, as they are at the nodes: polynomials, and of what these leave as much as the places beside it have.
     ///
-    /// What a motion does to a curved part is taken off forms that may be thousands of times larger: straight lines alone would leave some of that.
+    /// Motions of a curved part are taken off forms that may be thousands of times larger: straight lines alone would leave some of that.
     pub(super) fn rows(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let [at_points, at_nodes] = &self.terms;
         let factor = at_points.clone().qr();

@@ -34,7 +34,7 @@ pub(super) struct Drawn<'a> {
     pub(super) ground_in: Option<DMatrix<f64>>,
 }
 
-/// What a variance comes from.
+/// The parts of a variance.
 struct Parts {
     /// The points by themselves.
     scatter: f64,
@@ -97,7 +97,7 @@ fn parts(
     let own = Mat::from_fn(node.strengths.len(), 1, |k, _| sums[(0, k)] * node.strengths[k]);
     let rows = fields.with_effects(node);
     let known = rows.nrows() - fields.effects();
-    // What is stated, in the coordinates, behind the motions, and what of it no wave shows.
+    // The stated effects in the coordinates, behind the motions, and the part of them that no wave shows.
     let (coordinates, products) = fields.coordinates(&observed.stated);
     let of_effects = fields.of_effects(&observed.stated);
     let stated = observed.stated.ncols();

@@ -9,7 +9,7 @@ use super::{Dense, ModelError, Observed, Priors, Smoothness};
 /// Points whose every pair is worked with, at most: what tells an effect of the whole part is wide, and more of them tell no more.
 const MOST_TOGETHER: usize = 600;
 
-/// What is less likely than this share of the most likely counts for nothing.
+/// A field that is less likely than this share of the most likely one counts for nothing.
 const FEW: f64 = 1e-3;
 
 /// Effects with their covariance.
@@ -36,7 +36,7 @@ impl Effects {
         let chosen: Vec<usize> = (0..most).map(|k| k * n / most.max(1)).collect();
         let some = observed.only(&chosen);
         let fields = Fields::over(&some, Kind::PLAIN)?;
-        // What a smooth field says of a rough form is wrong: the rougher ones are careful.
+        // A smooth field tells a rough form wrongly: the rougher ones are careful.
         let rough = |smoothness| smoothness == Smoothness::Once;
         let mut likely = Posterior::of(&fields, &some, Some(priors), None).likely(rough);
         likely.retain(|(_, weight)| *weight > FEW);

@@ -63,7 +63,7 @@ pub(super) struct Fields {
     pub(super) kind: Kind,
     pub(super) waves: Waves,
     places: Vec<[f64; 2]>,
-    /// What of a point's row and of that of the point before makes its row beside a scatter that is independent.
+    /// The shares of a point's row and of that of the point before that make its row beside a scatter that is independent.
     whitening: Vec<[f64; 2]>,
     /// Q.
     base: DMatrix<f64>,

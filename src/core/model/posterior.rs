@@ -611,6 +611,23 @@ mod tests {
         }
     }
 
+    /// Beside a form a strong drift looks like one: where it is not found again it must be form, and never scatter that counts for nothing.
+    #[test]
+    fn a_strong_drift_is_told_or_is_form() {
+        let planted = Hyper { drift: 0.9, ..PLANTED };
+        for seed in 1..=5 {
+            let path: Vec<f64> = (0..540).map(f64::from).collect();
+            let at = |k: usize| {
+                [if (k / 30).is_multiple_of(2) { k % 30 } else { 29 - k % 30 }, k / 30].map(|at| 3.5 * at as f64)
+            };
+            let told =
+                Hyper::of(&drawn(planted, (0..540).map(at).collect(), path, seed), Some(&Priors::of_size(102.0)));
+            let told = told.unwrap();
+            println!("seed {seed}: drift {:.2}, scatter {:.2e} mm", told.drift, told.scatter_mm);
+            assert!((told.drift - 0.9).abs() < 0.2 || told.scatter_mm < 0.7 * planted.scatter_mm, "{seed}: {told:?}");
+        }
+    }
+
     #[test]
     fn the_scale_of_everything_is_the_scale_of_what_is_found() {
         let observed = drawn(PLANTED, places(120), Vec::new(), 1);
