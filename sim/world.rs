@@ -12,6 +12,7 @@ use std::sync::{Arc, Mutex};
 
 use crate::cmm::{Cmm, Led};
 use crate::executed::Wheel;
+use crate::part::{Approach, Contact};
 use crate::probe::Placement;
 use crate::process::{Grinder, systematic_mm};
 use crate::spec::{Faults, SpecError, WorldSpec};
@@ -98,6 +99,24 @@ impl World {
     pub fn deviations_mm(&self, places_mm: &[[f64; 2]]) -> Vec<f64> {
         let state = locked(&self.state);
         places_mm.iter().map(|&[x, y]| state.part.deviation_mm(x, y)).collect()
+    }
+
+    /// Truth: how far the centre of a ball stands above the offset of the nominal, at one moment, where the ball touches the real surface along
+    /// the nominal normal over each place, in millimetres.
+    ///
+    /// In a groove it stands higher or lower than [`Self::deviation_mm`] says: the ball touches beside its centre. Beyond the part it touches nothing.
+    pub fn touched_mm(&self, places_mm: &[[f64; 2]], radius_mm: f64) -> Vec<Option<f64>> {
+        const REACH_MM: f64 = 1.0;
+        let state = locked(&self.state);
+        let (part, shape) = (&state.part, &state.part.shape);
+        let height_mm = |&[x, y]: &[f64; 2]| {
+            let (point_mm, direction) = (shape.point(x, y), shape.normal(x, y));
+            let way =
+                Approach { point_mm, direction, radius_mm, from_mm: radius_mm + REACH_MM, to_mm: radius_mm - REACH_MM };
+            let Contact::Touched { centre_mm, .. } = part.touch(&way) else { return None };
+            Some((0..3).map(|i| (centre_mm[i] - point_mm[i]) * direction[i]).sum::<f64>() - radius_mm)
+        };
+        places_mm.iter().map(height_mm).collect()
     }
 
     /// Truth: the point of the nominal surface over (x, y) and its unit normal.

@@ -2,7 +2,7 @@
 //!
 //! The measurand is the pose, and the map of deviations, that best fit the *true* surface at the *measured* places: the form
 //! error itself moves a best fit, and no measurement can undo that. So the true centre of a ball on the real surface is
-//! computed at the foot of every measured centre, without noise, and the pose is the exact least-squares one, found by
+//! computed over the foot of every measured centre, without noise, and the pose is the exact least-squares one, found by
 //! Newton's method on the closed form with feet of its own. Nothing here is shared with the library but the type of a pose.
 
 use nalgebra::{Matrix6, Vector6};
@@ -36,9 +36,11 @@ impl Truth {
 
 /// Fits the true surface of a cycle at the places that took part in the registration; the map is that of all places.
 pub fn truth(world: &World, seen: &Snapshot, used: &[bool], radius_mm: f64, level_mm: f64) -> Truth {
-    let places = seen.places_mm.iter().zip(&seen.heights_mm);
-    let centres: Vec<Vec3> =
-        places.map(|(place, height)| seen.placement.apply(centre(world, *place, *height, radius_mm))).collect();
+    let above = |(place, height_mm): (&[f64; 2], &f64)| -> Vec3 {
+        let (s, n) = world.nominal(place[0], place[1]);
+        seen.placement.apply(std::array::from_fn(|i| s[i] + (radius_mm + height_mm) * n[i]))
+    };
+    let centres: Vec<Vec3> = seen.places_mm.iter().zip(&seen.heights_mm).map(above).collect();
     let mut pose = pose_of(&seen.placement);
     loop {
         let (mut gram, mut right) = (Matrix6::zeros(), Vector6::zeros());
@@ -67,20 +69,6 @@ pub fn truth(world: &World, seen: &Snapshot, used: &[bool], radius_mm: f64, leve
         }
         pose = pose * Pose::exp(&step);
     }
-}
-
-/// The centre of a ball that touches the real surface r = S + h n at a place; its normal is that of the real surface.
-fn centre(world: &World, [x, y]: [f64; 2], [h, hx, hy]: [f64; 3], radius_mm: f64) -> Vec3 {
-    const D: f64 = 1e-3;
-    let (s, n) = world.nominal(x, y);
-    let tangent = |dx: f64, dy: f64, slope: f64| -> Vec3 {
-        let ((sa, na), (sb, nb)) = (world.nominal(x + dx, y + dy), world.nominal(x - dx, y - dy));
-        std::array::from_fn(|i| (sa[i] - sb[i] + h * (na[i] - nb[i])) / (2.0 * D) + slope * n[i])
-    };
-    let (a, b) = (tangent(D, 0.0, hx), tangent(0.0, D, hy));
-    let m = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-    let norm = m.iter().map(|c| c * c).sum::<f64>().sqrt();
-    std::array::from_fn(|i| s[i] + h * n[i] + radius_mm * m[i] / norm)
 }
 
 fn pose_of(placement: &Placement) -> Pose {

@@ -97,8 +97,8 @@ pub struct Snapshot {
     pub placement: Placement,
     /// Feet of the measured centres on the nominal surface, over the plane of the true model frame.
     pub places_mm: Vec<[f64; 2]>,
-    /// How far the real surface stood over the nominal there, and its gradient.
-    pub heights_mm: Vec<[f64; 3]>,
+    /// How far the centre of the ball stood above the offset of the nominal there.
+    pub heights_mm: Vec<f64>,
 }
 
 /// What came of a run.
@@ -191,27 +191,36 @@ impl<B: Body> Body for Watched<B> {
     }
 }
 
-/// Looks at the world where the newest cycle was measured.
-fn snapshot(world: &World, folder: &std::path::Path, taken: &Mutex<Vec<Snapshot>>) {
-    let mut taken = taken.lock().unwrap();
-    let cycles = std::fs::read_dir(folder).unwrap().filter_map(|entry| {
-        let name = entry.unwrap().file_name();
-        name.to_str()?.strip_prefix("cycle-")?.parse::<u32>().ok()
-    });
-    let measured = |cycle: &u32| folder.join(format!("cycle-{cycle}/registration.json")).is_file();
-    let Some(cycle) = cycles.filter(measured).max() else { return };
-    if taken.iter().any(|t| t.cycle == cycle) {
-        return;
+/// Looks at the world where each cycle was measured.
+struct Eye {
+    world: World,
+    folder: PathBuf,
+    radius_mm: f64,
+    taken: Mutex<Vec<Snapshot>>,
+}
+
+impl Eye {
+    /// Looks where the newest cycle was measured, once.
+    fn look(&self) {
+        let Self { world, folder, radius_mm, .. } = self;
+        let mut taken = self.taken.lock().unwrap();
+        let cycles = std::fs::read_dir(folder).unwrap().filter_map(|entry| {
+            let name = entry.unwrap().file_name();
+            name.to_str()?.strip_prefix("cycle-")?.parse::<u32>().ok()
+        });
+        let measured = |cycle: &u32| folder.join(format!("cycle-{cycle}/registration.json")).is_file();
+        let Some(cycle) = cycles.filter(measured).max() else { return };
+        if taken.iter().any(|t| t.cycle == cycle) {
+            return;
+        }
+        let (placement, measured) = (world.placement(), table(&folder.join(format!("cycle-{cycle}/measured.csv"))));
+        let centres = measured.iter().map(|row| back(&placement, [row[0], row[1], row[2]]));
+        let places_mm: Vec<[f64; 2]> = centres.map(|centre| foot(world, centre).0).collect();
+        // A touch at the very edge of the part may have its foot beyond it.
+        let touched = world.touched_mm(&places_mm, *radius_mm).into_iter().zip(&places_mm);
+        let heights_mm = touched.map(|(height, &[x, y])| height.unwrap_or_else(|| world.deviation_mm(x, y))).collect();
+        taken.push(Snapshot { cycle, placement, places_mm, heights_mm });
     }
-    let (placement, measured) = (world.placement(), table(&folder.join(format!("cycle-{cycle}/measured.csv"))));
-    let centres = measured.iter().map(|row| back(&placement, [row[0], row[1], row[2]]));
-    let places_mm: Vec<[f64; 2]> = centres.map(|centre| foot(world, centre).0).collect();
-    let h = 1e-3;
-    let stencil: Vec<[f64; 2]> =
-        places_mm.iter().flat_map(|&[x, y]| [[x, y], [x + h, y], [x - h, y], [x, y + h], [x, y - h]]).collect();
-    let values = world.deviations_mm(&stencil);
-    let slopes = values.chunks(5).map(|v| [v[0], (v[1] - v[2]) / (2.0 * h), (v[3] - v[4]) / (2.0 * h)]);
-    taken.push(Snapshot { cycle, placement, places_mm, heights_mm: slopes.collect() });
 }
 
 /// Moves a point of the CMM's frame into the part's.
@@ -271,11 +280,11 @@ async fn go(setup: Setup) -> Ran {
     }
     let cell = CellConfig::read(&root().join("config/sim.toml")).unwrap();
     let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
-    let probe_radius_mm = recipe.measure.probe_radius_mm;
     let tolerance_mm = [plan.tolerance.pv_mm, plan.tolerance.rms_mm];
     let world = world(&setup, &recipe);
-    let taken = Arc::new(Mutex::new(Vec::new()));
-    let (servings, [of_cmm, of_grinder]) = serve(&setup, &world, &cell, &folder, &taken).await;
+    let radius_mm = recipe.measure.probe_radius_mm;
+    let eye = Arc::new(Eye { world: world.clone(), folder: folder.clone(), radius_mm, taken: Mutex::default() });
+    let (servings, [of_cmm, of_grinder]) = serve(&setup, &cell, &eye).await;
     let journal: Box<dyn Ledger> = Box::new(Journal::create(&folder, header("test part")).unwrap());
     let (notices, mut shown) = mpsc::unbounded_channel();
     let poll = [Duration::from_millis(10); 2];
@@ -314,9 +323,9 @@ async fn go(setup: Setup) -> Ran {
         }
     }
     let ending = driving.await.unwrap();
-    snapshot(&world, &folder, &taken);
+    eye.look();
     drop(servings);
-    let snapshots = std::mem::take(&mut *taken.lock().unwrap());
+    let (snapshots, probe_radius_mm) = (std::mem::take(&mut *eye.taken.lock().unwrap()), eye.radius_mm);
     Ran { ending, notices: seen, folder, world, snapshots, tolerance_mm, probe_radius_mm, passes_at_alarm, _home: home }
 }
 
@@ -356,13 +365,7 @@ fn world(setup: &Setup, recipe: &Recipe) -> World {
 }
 
 /// Serves both machines on ports of their own, and tells the drivers of the cell where.
-async fn serve(
-    setup: &Setup,
-    world: &World,
-    cell: &CellConfig,
-    folder: &std::path::Path,
-    taken: &Arc<Mutex<Vec<Snapshot>>>,
-) -> ([Serving; 2], [ModbusSettings; 2]) {
+async fn serve(setup: &Setup, cell: &CellConfig, eye: &Arc<Eye>) -> ([Serving; 2], [ModbusSettings; 2]) {
     let options = |seed| MachineOptions {
         speed: SPEED,
         seed,
@@ -373,8 +376,8 @@ async fn serve(
         version: setup.version,
         ..MachineOptions::default()
     };
-    let (seen, here, kept) = (world.clone(), folder.to_owned(), taken.clone());
-    let before: Box<dyn FnMut() + Send> = Box::new(move || snapshot(&seen, &here, &kept));
+    let (world, eye) = (&eye.world, eye.clone());
+    let before: Box<dyn FnMut() + Send> = Box::new(move || eye.look());
     let grinder = Watched { body: world.grinder(), before };
     let cmm = Machine::new(Box::new(world.cmm()), 0xc, options(setup.seed));
     let grinder = Machine::new(Box::new(grinder), 0x9, options(setup.seed + 1));

@@ -132,16 +132,17 @@ impl Form {
             let drawn = Drawn { chosen: chosen.clone(), ..drawn }.known_as(&seen.observed);
             drawn.without(at(&seen.of_all(&chosen)).as_ref())
         };
-        let whole = |drawn: Drawn, apart: &[usize]| {
+        let whole = |drawn: Drawn, apart: &[usize], given: &Given| {
             seen.with_those(apart, drawn.with_the_scatter(&seen.observed, &posterior, given), given).after_best_fit()
         };
         let drawn = of(posterior.draws(Which::All, SAMPLES, 1), true);
         let slope = seen.slope(given, &posterior, &drawn);
-        let drawn = whole(drawn, &seen.apart);
+        let drawn = whole(drawn, &seen.apart, given);
         let form = if seen.is_chance { &[][..] } else { &seen.agreed };
-        let least = whole(of(posterior.draws(Which::Smooth, FEWER, 2), false), form).told_by();
+        let least =
+            whole(of(posterior.draws(Which::Smooth, FEWER, 2), false), form, &least_form(&posterior, given)).told_by();
         let most = match posterior.is_rough() > MAY_BE {
-            true => whole(of(posterior.draws(Which::Rough, FEWER, 3), false), &seen.apart).told_by(),
+            true => whole(of(posterior.draws(Which::Rough, FEWER, 3), false), &seen.apart, given).told_by(),
             false => Vec::new(),
         };
         let ground_in = at(&drawn.chosen);
@@ -175,6 +176,7 @@ impl Form {
         let is_between = places.len() < 2 * seen.kept.len();
         let at = places.iter().map(plane).collect();
         let drawn = seen.drawn(posterior.draws(Which::All, SAMPLES, 1), at, effects, is_between);
+        let drawn = Drawn { untouched: (0..places.len()).collect(), ..drawn };
         let drawn = drawn.rough_where_touched(&seen.observed.places).known_as(&seen.observed);
         let ground_in = seen.ground_in.is_some().then(|| seen.stated.columns(places.iter().copied()));
         let drawn = drawn.without(ground_in.as_ref());
@@ -325,6 +327,7 @@ impl Seen {
             places: points.iter().map(|&k| self.all.places[k]).collect(),
             effects: self.all.effects.select_rows(points),
             chosen: points.to_vec(),
+            untouched: Vec::new(),
             smooth_sigma_mm: vec![mean(&drawn.scatter_mm); points.len()],
             scatter_mm: drawn.scatter_mm.clone(),
             narrow_mm: [Vec::new(), Vec::new()],
@@ -437,6 +440,20 @@ fn is_seen(posterior: &Posterior) -> bool {
     posterior.evidence > EVIDENCE
 }
 
+/// What is given where a form is told from below: that all of the scatter is the probe's, where it may be.
+///
+/// A reference sphere that was touched some twenty times tells the scatter of the probe to 15 %. What the points scatter by more need be no form.
+fn least_form(posterior: &Posterior, given: &Given) -> Given {
+    /// A probe that scatters by so many standard uncertainties more than was found is none.
+    const MAY_SCATTER: f64 = 2.0;
+    match probe(given) {
+        Some([probe_mm, u]) if posterior.middle().scatter_mm < probe_mm * (MAY_SCATTER * u).exp() => {
+            Given { probe_scatter_mm: [0.0; 2], ..*given }
+        }
+        _ => *given,
+    }
+}
+
 /// What is known of the scatter of the probe itself.
 fn probe(given: &Given) -> Probe {
     (given.probe_scatter_mm[0] > 0.0).then_some(given.probe_scatter_mm)
@@ -544,6 +561,8 @@ struct Drawn {
     effects: DMatrix<f64>,
     /// Which of the points the places are, where they are points.
     chosen: Vec<usize>,
+    /// Which of the places were not touched, where they are no points.
+    untouched: Vec<usize>,
     /// Standard uncertainty of what is told of each place, as far as it is smooth.
     smooth_sigma_mm: Vec<f64>,
     /// The scatter of each form, and what of either kind is in waves too short to be told.
@@ -610,6 +629,7 @@ impl Drawn {
             places,
             effects,
             chosen: Vec::new(),
+            untouched: Vec::new(),
             smooth_sigma_mm: Vec::new(),
             scatter_mm,
             narrow_mm,
@@ -760,6 +780,7 @@ impl Drawn {
                 self.forms[k].row_mut(nearest).copy_from(&other.forms[k].row(r));
             }
             self.effects.row_mut(nearest).copy_from(&other.effects.row(r));
+            self.untouched.retain(|row| *row != nearest);
             self.smooth_sigma_mm[nearest] = other.smooth_sigma_mm[r];
         }
         self
@@ -833,18 +854,21 @@ impl Drawn {
     /// Root mean square, peak to valley, and that of the aperture, of each form.
     fn figures_of(&self, forms: &DMatrix<f64>, between: Option<&DMatrix<f64>>) -> Vec<[f64; 3]> {
         let rows = forms.nrows();
+        let mut is_touched = vec![true; rows];
+        self.untouched.iter().for_each(|&row| is_touched[row] = false);
         let of = |(c, form): (usize, &[f64])| {
             let squares: f64 = form.iter().map(|v| v * v).sum();
             let [low, high] = ends(form.iter().copied());
-            let [mut lowest, mut highest] = [low, high];
-            if let Some(between) = between {
-                // The outermost of all places, of which those that were touched stay.
-                let mut others: Vec<f64> = between.column(c).iter().copied().collect();
-                let left_out = ((rows + others.len()) / 1000).min(others.len() - 1);
+            // The outermost of all places are left out, but none that was touched.
+            let touched = form.iter().zip(&is_touched).filter_map(|(value, is)| is.then_some(*value));
+            let mut others: Vec<f64> = self.untouched.iter().map(|&row| form[row]).collect();
+            between.iter().for_each(|between| others.extend(between.column(c).iter()));
+            let [mut lowest, mut highest] = ends(touched);
+            if let Some(last) = others.len().checked_sub(1) {
+                let left_out = ((rows - self.untouched.len() + others.len()) / 1000).min(last / 2);
                 let mut nth = |k: usize| *others.select_nth_unstable_by(k, f64::total_cmp).1;
-                lowest = low.min(nth(left_out));
-                let last = between.nrows() - 1;
-                highest = high.max(nth(last - left_out));
+                lowest = lowest.min(nth(left_out));
+                highest = highest.max(nth(last - left_out));
             }
             [(squares / rows as f64).sqrt(), high - low, highest - lowest]
         };

@@ -440,3 +440,22 @@ fn between_the_touches_there_is_no_more_form_than_at_them() {
         assert!(pv_most_points.high_mm < 1.2 * pv.high_mm && pv_most_points.low_mm >= pv.low_mm, "{pv_most_points:?}");
     }
 }
+
+/// A reference sphere is touched some twenty times and may by chance tell of a probe that scatters a fifth less: that is no form yet.
+#[test]
+fn a_scatter_that_the_sphere_may_have_missed_is_not_told_as_form() {
+    let low_mm = |part: &Part, share: f64| {
+        let given = Given { probe_scatter_mm: [share * SCATTER_MM, 0.15], ..Given::default() };
+        Form::of(&part.found, &given).unwrap().figures.rms.low_mm
+    };
+    let (parts, mut told) = (seeds(3), 0.0);
+    for seed in 0..parts {
+        let part = part(seed, 1e-3);
+        let [unstated_mm, chance_mm, form_mm] = [part.model.figures.rms.low_mm, low_mm(&part, 0.8), low_mm(&part, 0.4)];
+        println!("seed {seed}: from below {unstated_mm:.3e}, {chance_mm:.3e}, {form_mm:.3e} mm");
+        // Of a probe that is known to scatter far less the rest is form.
+        assert!(form_mm > 1.04 * unstated_mm, "{form_mm} {unstated_mm}");
+        told += (chance_mm - unstated_mm) / (form_mm - unstated_mm) / parts as f64;
+    }
+    assert!(told < 0.09, "{told}");
+}
