@@ -178,6 +178,7 @@ impl Wheel {
         (self.waiting, self.half_mm, self.reached_mm) = (None, None, None);
         state.on_table = false;
         state.passes_begun += 1;
+        state.passes_of_blank += 1;
         let spec = &state.spec.grinder;
         if spec.dressed_each_pass {
             state.worn_strokes = 0.0;

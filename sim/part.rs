@@ -50,6 +50,45 @@ pub struct PartSpec {
     pub form_error_correlation_mm: f64,
     /// A job number that the grinder has not seen last means that somebody has put in a new blank.
     pub fresh_per_job: bool,
+    /// What happens to it.
+    pub defects: Vec<DefectSpec>,
+}
+
+/// A place of the part that stands out: a piece that breaks off, a pit, a scratch, or what sticks to it.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct DefectSpec {
+    /// Its middle.
+    pub at_mm: [f64; 2],
+    /// How far it goes along x and y in all.
+    pub size_mm: [f64; 2],
+    /// How far it stands over the surface; what is missing has a negative height.
+    pub height_um: f64,
+    /// Whether it is an ellipse with a round bottom; else it is a rectangle that is flat but for its flanks.
+    pub round: bool,
+    /// After which pass it appears, before the part is measured.
+    pub after_pass: u32,
+}
+
+impl DefectSpec {
+    /// Returns its height at (x, y) in millimetres.
+    pub fn height_mm(&self, [x, y]: [f64; 2]) -> f64 {
+        /// Flanks go half of it into the rectangle and half out of it.
+        const FLANK_MM: f64 = 1.0;
+        let from_middle = [x - self.at_mm[0], y - self.at_mm[1]];
+        let share = if self.round {
+            let beyond = (0..2).map(|k| (2.0 * from_middle[k] / self.size_mm[k]).powi(2)).sum::<f64>();
+            (1.0 - beyond).max(0.0).powi(2)
+        } else {
+            let within = |k: usize| {
+                let inside = 0.5 * self.size_mm[k] - from_middle[k].abs();
+                let u = (inside / FLANK_MM + 0.5).clamp(0.0, 1.0);
+                u * u * (3.0 - 2.0 * u)
+            };
+            within(0) * within(1)
+        };
+        1e-3 * self.height_um * share
+    }
 }
 
 impl Default for PartSpec {
@@ -61,6 +100,7 @@ impl Default for PartSpec {
             form_error_um: 20.0,
             form_error_correlation_mm: 30.0,
             fresh_per_job: true,
+            defects: Vec::new(),
         }
     }
 }
@@ -673,6 +713,19 @@ mod tests {
         bend.heights_mm = bend.nodes().map(|at| Grooves::bend_at(part.shape.as_ref(), wheel_radius_mm, at)).collect();
         part.grooves = Some(Grooves { first_mm: -32.6, spacing_mm, wheel_radius_mm, bend });
         part
+    }
+
+    #[test]
+    fn a_defect_has_its_height_in_its_middle_and_none_beyond_its_edge() {
+        let chip =
+            DefectSpec { at_mm: [10.0, -5.0], size_mm: [3.0, 4.0], height_um: -50.0, round: false, after_pass: 1 };
+        let at = |defect: &DefectSpec, x: f64, y: f64| defect.height_mm([10.0 + x, -5.0 + y]);
+        assert_eq!([at(&chip, 0.0, 0.0), at(&chip, 1.0, 1.5), at(&chip, 1.5, 0.0)], [-0.05, -0.05, -0.025]);
+        assert_eq!([at(&chip, 2.0, 0.0), at(&chip, 0.0, -2.5), at(&chip, 9.0, 9.0)], [0.0; 3]);
+        let bump = DefectSpec { height_um: 16.0, round: true, ..chip };
+        assert_eq!([at(&bump, 0.0, 0.0), at(&bump, 1.5, 0.0), at(&bump, 0.0, 2.0)], [0.016, 0.0, 0.0]);
+        // Half of the square of its radius from its middle: a quarter of its height is left.
+        assert!((at(&bump, 0.75_f64.hypot(0.75), 0.0) - 0.004).abs() < 1e-12);
     }
 
     #[test]

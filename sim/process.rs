@@ -533,6 +533,7 @@ impl Body for Grinder {
         }
         state.held = Some(run.pass.nominal);
         state.passes_begun += 1;
+        state.passes_of_blank += 1;
         let error_mm = 1e-3 * state.spec.grinder.wheel_radius_error_um;
         state.true_wheel_radius_mm.get_or_insert(run.pass.wheel_radius_mm + error_mm);
         state.on_table = false;

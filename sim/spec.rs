@@ -343,6 +343,11 @@ impl WorldSpec {
         check_all("part.form_error_um", &[self.part.form_error_um], 0.0, 10_000.0, SIZE)?;
         let length = self.part.form_error_correlation_mm;
         check_all("part.form_error_correlation_mm", &[length], 0.5, 10_000.0, LENGTH)?;
+        for defect in &self.part.defects {
+            check_all("part.defects.at_mm", &defect.at_mm, -1e3, 1e3, "-1000 to 1000 mm")?;
+            check_all("part.defects.size_mm", &defect.size_mm, 0.5, 1e3, "0.5 to 1000 mm")?;
+            check_all("part.defects.height_um", &[defect.height_um], -1e3, 1e3, "-1000 to 1000 um")?;
+        }
         self.check_grinder()?;
         self.check_cmm()?;
         self.check_shape()

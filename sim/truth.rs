@@ -82,6 +82,10 @@ pub(crate) struct State {
     pub held: Option<[u8; 32]>,
     pub true_wheel_radius_mm: Option<f64>,
     pub passes_begun: u32,
+    /// After how many passes over the blank something has happened to it last.
+    pub damaged_after: Option<u32>,
+    /// Passes over the blank that is in the grinder.
+    pub passes_of_blank: u32,
     pub measurements_begun: u32,
     pub loadings: u32,
     /// The part has not left the CMM since it was measured last.
@@ -118,6 +122,8 @@ impl State {
             held: None,
             true_wheel_radius_mm: None,
             passes_begun: 0,
+            damaged_after: None,
+            passes_of_blank: 0,
             measurements_begun: 0,
             loadings: 0,
             on_table: false,
@@ -136,6 +142,7 @@ impl State {
         self.blanks += 1;
         self.part = Part::blank(&self.spec.part, blank_seed(self.spec.seed, self.blanks));
         (self.held, self.job, self.on_table) = (None, None, false);
+        (self.passes_of_blank, self.damaged_after) = (0, None);
     }
 
     /// Sees to it that the part in the grinder is that of the job.
@@ -149,11 +156,25 @@ impl State {
     /// Returns the placement for a measurement: the last one if the part has lain still, else one of a fresh loading.
     pub fn load_on_table(&mut self) -> Placement {
         if !self.on_table {
+            self.damage();
             self.on_table = true;
             self.loadings += 1;
             self.placement = placement(&self.spec, self.loadings);
         }
         self.placement
+    }
+
+    /// Lets happen to the part, once, what happens to it after so many passes.
+    fn damage(&mut self) {
+        if self.damaged_after.replace(self.passes_of_blank) == Some(self.passes_of_blank) {
+            return;
+        }
+        let due = self.spec.part.defects.iter().filter(|defect| defect.after_pass == self.passes_of_blank);
+        for defect in due {
+            let nodes: Vec<[f64; 2]> = self.part.height.nodes().collect();
+            let heights = self.part.height.heights_mm.iter_mut().zip(nodes);
+            heights.for_each(|(height_mm, place)| *height_mm += defect.height_mm(place));
+        }
     }
 
     pub fn taken_by_other(&self, kind: Kind) -> bool {

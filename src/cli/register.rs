@@ -227,8 +227,16 @@ fn form_in_words(form: &Form) -> String {
     });
     let sigma = [0, 1, 2].map(|k| um(frame_covariance[(k, k)].sqrt())).join(", ");
     let areas = area_in_words(form);
+    let few = match form.is_of_few {
+        true => format!(
+            "warning     {} degrees of freedom are too few to tell the form from the scatter, 20 do: the upper ends are those of a form that is all \
+             of what was found; touch more points\n",
+            form.degrees_of_freedom
+        ),
+        false => String::new(),
+    };
     format!(
-        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\n{areas}model       the form is {} um strong and {} mm wide{lay}, a point scatters by {} um{drift}\n\
+        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\n{few}{areas}model       the form is {} um strong and {} mm wide{lay}, a point scatters by {} um{drift}\n\
          frame       known to {sigma} um along x, y, z beside that form\n",
         within(&figures.rms),
         within(&figures.pv),

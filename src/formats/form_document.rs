@@ -33,6 +33,8 @@ struct FormDocument<'a> {
     scatter_drift: f64,
     /// Whether a form shows at all; where it does not, the figures are known from above alone.
     form_is_seen: bool,
+    /// How many degrees of freedom the fit leaves; below 20 nothing but a reference sphere tells the form from the scatter.
+    degrees_of_freedom: f64,
     /// Figures of the form after its own best fit: median, and the interval that holds it with 95 %.
     rms: Interval,
     pv: Interval,
@@ -74,6 +76,7 @@ pub fn save_form(
         scatter_mm: form.hyper.scatter_mm,
         scatter_drift: form.hyper.drift,
         form_is_seen: form.is_seen,
+        degrees_of_freedom: form.degrees_of_freedom,
         rms: form.figures.rms,
         pv: form.figures.pv,
         pv_99_8: form.figures.pv_most_points,

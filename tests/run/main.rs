@@ -12,6 +12,7 @@ mod convergence;
 mod cycles;
 #[path = "../common/data.rs"]
 mod data;
+mod defects;
 mod dialects;
 mod faults;
 mod files;

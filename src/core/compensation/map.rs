@@ -10,7 +10,7 @@ use super::MapError;
 use super::filter::{Filtered, Gaussian, MOST_WORKED, Order};
 use super::kept::Kept;
 use super::level::{Levelled, level_off};
-use super::robust::{Residuals, Robust, residuals, robust};
+use super::robust::{Far, Residuals, Robust, residuals, robust};
 use super::sampling::{check_cutoff, point_spacings_mm};
 use super::spline::{Roughness, spline};
 use crate::geometry::{Grid, Sample};
@@ -97,7 +97,8 @@ pub struct ErrorMap {
 /// Takes outliers out of deviations, filters the rest and lays it on a grid.
 ///
 /// Shapes: readings in any order. Frames: x and y of the model frame. Units: millimetres. Equation: weighted least squares of a
-/// polynomial at every node with weights exp(-pi (r / (alpha cutoff))^2), see [`Order::alpha`]; or the smoothing spline. A cut-off that is
+/// polynomial at every node with weights exp(-pi (r / (alpha cutoff))^2), see [`Order::alpha`]; or the smoothing spline. Of what two neighbouring
+/// readings found far from the surface around the Gaussian filter leaves half at least, however narrow it is. A cut-off that is
 /// short for the wheel or the distance of the points is no error but is said in [`ErrorMap::advice`].
 ///
 /// # Errors
@@ -111,17 +112,20 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
     let wide = Gaussian { cutoff_mm: options.cutoff_mm.max(WIDE * apart_mm[0].max(apart_mm[1])), ..gaussian };
     let wide = Wide { gaussian: wide, grid: worked_grid(&grid, &wide)?, same: wide == gaussian };
     let mut kept = Kept::all(readings);
-    let (mut outliers, mut found, mut advice) = (Vec::new(), None, Vec::new());
+    let (mut outliers, mut features, mut found, mut advice) = (Vec::new(), Vec::new(), None, Vec::new());
     if let Some(limit) = options.outlier_limit {
         let all = wide.robust(&kept);
-        outliers = all.outliers(&kept.places, limit, apart_mm).unwrap_or_else(|| {
+        let far = all.far(&kept.places, limit, apart_mm).unwrap_or_else(|| {
             advice.push(
                 "more than a tenth of the points stand out, so none was left out; clean the part and the probe"
                     .to_owned(),
             );
-            Vec::new()
+            Far::default()
         });
+        outliers = far.outliers;
         kept = Kept::without(readings, &outliers);
+        let before = |k: usize| outliers.partition_point(|outlier| *outlier < k);
+        features = far.features.into_iter().map(|k| (k - before(k), all.plain[k])).collect();
         found = Some(all).filter(|_| outliers.is_empty());
     }
     let (filtered, point_sigma) = if options.smoothing == Smoothing::RobustGaussian {
@@ -129,8 +133,9 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
         let with_weights = || gaussian.scattered(&kept.places, &kept.values, Some(&found.weights), &worked);
         (if wide.same { found.filtered.clone() } else { with_weights() }, found.sigma)
     } else {
-        let filtered = gaussian.scattered(&kept.places, &kept.values, None, &worked);
+        let mut filtered = gaussian.scattered(&kept.places, &kept.values, None, &worked);
         let point_sigma = wide.point_sigma(&kept, &filtered);
+        hold_features(&mut filtered, &gaussian, &kept, &features);
         (filtered, point_sigma)
     };
     let smooth = Smooth::from_filtered(&filtered, &grid, point_sigma);
@@ -144,6 +149,27 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
     };
     let map = smooth.into_map(grid, &kept, outliers, options.level_off_mm);
     Ok(ErrorMap { advice, ..map }.advised(options, readings.len(), apart_mm))
+}
+
+/// Lets what the filter leaves of features go through it again, until half of each is in what was filtered.
+///
+/// `features` are numbers of readings, with their heights over the surface around. A chip that two targets lie on is narrower than the filter.
+fn hold_features(filtered: &mut Filtered, gaussian: &Gaussian, kept: &Kept, features: &[(usize, f64)]) {
+    /// Of readings so dense that a feature passes by a twelfth only, it takes so many.
+    const MOST_TIMES: usize = 8;
+    const HELD: f64 = 0.5;
+    for _ in 0..MOST_TIMES {
+        let mut left = vec![0.0; kept.values.len()];
+        for &(k, _) in features {
+            left[k] = kept.values[k] - filtered.at(kept.places[k]).map_or(kept.values[k], |[value, ..]| value);
+        }
+        if features.iter().all(|&(k, height)| left[k].abs() <= (1.0 - HELD) * height.abs()) {
+            return;
+        }
+        let more = gaussian.scattered(&kept.places, &left, None, &filtered.grid);
+        filtered.values.iter_mut().zip(more.values).for_each(|(value, more)| *value += more);
+        filtered.slopes.iter_mut().zip(more.slopes).for_each(|(slope, more)| (0..2).for_each(|k| slope[k] += more[k]));
+    }
 }
 
 /// Lays the form that a model tells at many places on a grid, through the filter of the map.

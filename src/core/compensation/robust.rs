@@ -6,8 +6,8 @@
 //! **Outliers.** Near a reading the surface leans towards it, the more the fewer others are about. With the share l of the
 //! reading in the value at its place, and the variance v of that value, a residual r has the variance sigma^2 (1 - 2 l + v);
 //! z = r / sqrt(1 - 2 l + v) scatters alike everywhere. Sigma is 1.4826 median |z|. What has |z| above the limit is an outlier
-//! unless three or more of its eight neighbours are as far off to the same side: that is a feature of the part, or dirt as large as one, and
-//! no point rule can tell which.
+//! unless one of its eight neighbours is off to the same side too, by half the limit and a quarter of the height at least: that is a feature of
+//! the part, or dirt as large as one, and no point rule can tell which.
 
 use super::filter::{Filtered, Gaussian};
 use crate::geometry::Grid;
@@ -26,8 +26,9 @@ const LEAST_FREEDOM: f64 = 0.02;
 const LEAST_READINGS: usize = 20;
 /// Residuals below this are rounding of the files, not outliers, in millimetres.
 const LEAST_SCALE_MM: f64 = 1e-6;
-/// So many neighbours on the same side make a feature.
-const FEATURE: usize = 3;
+/// A neighbour that is off by these shares of the limit and of the height of a reading found the same as it.
+const SHARE_OF_LIMIT: f64 = 0.5;
+const SHARE_OF_HEIGHT: f64 = 0.25;
 /// What is within so many distances of neighbours along both axes is a neighbour: eight are, on a grid.
 const NEIGHBOUR: f64 = 1.5;
 
@@ -37,7 +38,9 @@ pub(super) struct Robust {
     pub filtered: Filtered,
     /// Weight of every reading.
     pub weights: Vec<f64>,
-    /// Residual of every reading over the square root of its freedom; `NaN` where it tells nothing.
+    /// Residual of every reading; `NaN` where the surface is not known.
+    pub plain: Vec<f64>,
+    /// The same over the square root of its freedom; `NaN` where it tells nothing.
     pub scaled: Vec<f64>,
     /// Standard deviation of one reading.
     pub sigma: f64,
@@ -121,36 +124,53 @@ pub(super) fn iterate(
     }
     let scaled = found.scaled();
     let sigma = SIGMA_OVER_MEDIAN * median_size(&scaled);
-    Robust { filtered, weights, scaled, sigma, rounds }
+    Robust { filtered, weights, plain: found.plain, scaled, sigma, rounds }
+}
+
+/// Readings that are far from the filtered surface, by their indices, ascending.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Far {
+    /// Those that are alone, and do not belong to the surface.
+    pub outliers: Vec<usize>,
+    /// Those that a neighbour agrees with.
+    pub features: Vec<usize>,
 }
 
 impl Robust {
-    /// Returns the indices of the readings that do not belong to the surface, ascending.
+    /// Returns the readings that are far from the surface.
     ///
     /// `apart` is the distance of neighbouring readings along x and y. `None` where more than a tenth would be outliers: such readings are
     /// no exception, and the surface has no other rule.
-    pub fn outliers(&self, places: &[[f64; 2]], limit: f64, apart: [f64; 2]) -> Option<Vec<usize>> {
+    pub fn far(&self, places: &[[f64; 2]], limit: f64, apart: [f64; 2]) -> Option<Far> {
         if places.len() < LEAST_READINGS {
-            return Some(Vec::new());
+            return Some(Far::default());
         }
         let limit = limit * self.sigma.max(LEAST_SCALE_MM);
-        let mut far: Vec<usize> = (0..places.len()).filter(|&k| self.scaled[k].abs() > limit).collect();
-        far.sort_by(|&a, &b| places[a][0].total_cmp(&places[b][0]));
-        let mut outliers: Vec<usize> =
-            (0..far.len()).filter(|&n| !self.is_feature(n, &far, places, apart)).map(|n| far[n]).collect();
+        let size = |k: usize| self.scaled[k].abs();
+        let mut off: Vec<usize> = (0..places.len()).filter(|&k| size(k) > SHARE_OF_LIMIT * limit).collect();
+        off.sort_by(|&a, &b| places[a][0].total_cmp(&places[b][0]));
+        let far = (0..off.len()).filter(|&n| size(off[n]) > limit);
+        let (mut features, mut outliers): (Vec<usize>, Vec<usize>) = (Vec::new(), Vec::new());
+        far.for_each(|n| {
+            if self.is_feature(n, &off, places, apart) { features.push(off[n]) } else { outliers.push(off[n]) }
+        });
+        features.sort_unstable();
         outliers.sort_unstable();
-        (outliers.len() * 10 <= places.len()).then_some(outliers)
+        (outliers.len() * 10 <= places.len()).then_some(Far { outliers, features })
     }
 
-    /// Whether enough of the eight neighbours are as far off, to the same side; `far` is sorted along x.
-    fn is_feature(&self, n: usize, far: &[usize], places: &[[f64; 2]], apart: [f64; 2]) -> bool {
-        let k = far[n];
+    /// Whether one of the eight neighbours is off too, to the same side; `off` is sorted along x.
+    fn is_feature(&self, n: usize, off: &[usize], places: &[[f64; 2]], apart: [f64; 2]) -> bool {
+        let k = off[n];
         let reach = apart.map(|a| NEIGHBOUR * a);
-        let off = |j: usize, axis: usize| (places[j][axis] - places[k][axis]).abs();
-        let alike = |j: &&usize| off(**j, 1) <= reach[1] && self.scaled[**j].signum() == self.scaled[k].signum();
-        let before = far[..n].iter().rev().take_while(|j| off(**j, 0) <= reach[0]).filter(alike);
-        let after = far[n + 1..].iter().take_while(|j| off(**j, 0) <= reach[0]).filter(alike);
-        before.chain(after).take(FEATURE).count() == FEATURE
+        let away = |j: usize, axis: usize| (places[j][axis] - places[k][axis]).abs();
+        let agrees = |j: &usize| {
+            away(*j, 1) <= reach[1]
+                && self.scaled[*j] * self.scaled[k].signum() >= SHARE_OF_HEIGHT * self.scaled[k].abs()
+        };
+        let mut before = off[..n].iter().rev().take_while(|j| away(**j, 0) <= reach[0]);
+        let mut after = off[n + 1..].iter().take_while(|j| away(**j, 0) <= reach[0]);
+        before.any(agrees) || after.any(agrees)
     }
 }
 

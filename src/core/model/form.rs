@@ -48,6 +48,10 @@ pub struct Form {
     pub alone: Option<Hyper>,
     /// Whether the points show a form at all. Where they do not, the figures are known from above alone, and their intervals begin at 0.
     pub is_seen: bool,
+    /// How many degrees of freedom the fit leaves the points that the fields are told by.
+    pub degrees_of_freedom: f64,
+    /// Whether these are too few to tell the form from the scatter: the upper ends are those of a form that is all of what was found then.
+    pub is_of_few: bool,
 }
 
 /// The form at a measured point.
@@ -410,6 +414,8 @@ impl Seen {
             slope: None,
             known_mm: drawn.known_mm(),
             is_seen,
+            degrees_of_freedom: posterior.free(),
+            is_of_few: is_of_few(posterior, given),
         }
     }
 }
@@ -452,6 +458,11 @@ fn least_form(posterior: &Posterior, given: &Given) -> Given {
         }
         _ => *given,
     }
+}
+
+/// Whether the points are too few to tell the form from a scatter that nothing else tells.
+fn is_of_few(posterior: &Posterior, given: &Given) -> bool {
+    posterior.free() < FEW_FREE && probe(given).is_none()
 }
 
 /// What is known of the scatter of the probe itself.
@@ -672,11 +683,16 @@ impl Drawn {
         let base = if effects.ncols() > 0 { effects.qr().q() } else { effects };
         let fitted = |column: DMatrix<f64>| &column - &base * base.tr_mul(&column);
         let found = &seen.deviations_mm;
-        if posterior.free() < FEW_FREE && probe(given).is_none() {
+        if is_of_few(posterior, given) {
             let mut all = DMatrix::zeros(found.len(), self.scatter_mm.len());
+            let free = posterior.free().max(1.0);
             for (c, mut form) in all.column_iter_mut().enumerate() {
                 let mut normals = Normals::new(7, c as u64);
-                form.iter_mut().zip(found).for_each(|(value, of)| *value = of + self.scatter_mm[c] * normals.next());
+                // So few points may by chance have found less than the form has elsewhere: its variance is told like that of a sample.
+                let chi2: f64 = (0..free as usize).map(|_| normals.next().powi(2)).sum();
+                let larger = (found.len() as f64 / chi2.max(f64::MIN_POSITIVE)).sqrt().max(1.0);
+                let scatter_mm = self.scatter_mm[c];
+                form.iter_mut().zip(found).for_each(|(value, of)| *value = larger * of + scatter_mm * normals.next());
             }
             self.all = Some(all);
         }

@@ -192,10 +192,18 @@ fn form(x: f64, y: f64) -> f64 {
     2e-3 * ((0.11 * x + 0.05 * y).sin() + (0.14 * y - 0.06 * x + 1.0).cos() + 2e-4 * x * y)
 }
 
-/// Puts a spike of 20 standard deviations on one point in a hundred; returns which.
+/// Puts a spike of 20 standard deviations on one point in a hundred, none beside another; returns which.
 fn spiked(readings: &mut [Sample], height_mm: f64, seed: u64) -> Vec<usize> {
+    const APART_MM: f64 = 4.0;
     let mut rng = StdRng::seed_from_u64(seed);
-    let spikes: Vec<usize> = (0..readings.len()).filter(|_| rng.random::<f64>() < 0.01).collect();
+    let mut spikes: Vec<usize> = Vec::new();
+    for k in (0..readings.len()).filter(|_| rng.random::<f64>() < 0.01) {
+        let [x, y] = readings[k].at_mm;
+        let is_near = |other: &usize| (readings[*other].at_mm[0] - x).hypot(readings[*other].at_mm[1] - y) < APART_MM;
+        if !spikes.iter().any(is_near) {
+            spikes.push(k);
+        }
+    }
     for &k in &spikes {
         readings[k].deviation_mm += if rng.random::<bool>() { height_mm } else { -height_mm };
     }
@@ -258,6 +266,32 @@ fn a_feature_of_the_part_is_kept() {
     let map = made(&with_noise(&trial(mound), 3e-4, 5), &MapOptions::new(5.0, 1.0));
     assert!(map.outliers.len() <= 1, "{:?}", map.outliers);
     assert!(map.at([10.0, -5.0]) > 5e-3);
+}
+
+#[test]
+fn two_neighbours_that_agree_are_kept_and_one_alone_is_left_out() {
+    let quiet = with_noise(&trial(|_, _| 0.0), 3e-4, 5);
+    let nearest = |[x, y]: [f64; 2], but: Option<usize>| {
+        let away = |k: usize| (quiet[k].at_mm[0] - x).hypot(quiet[k].at_mm[1] - y);
+        (0..quiet.len()).filter(|k| Some(*k) != but).min_by(|a, b| away(*a).total_cmp(&away(*b))).unwrap()
+    };
+    let first = nearest([10.0, -5.0], None);
+    let second = nearest(quiet[first].at_mm, Some(first));
+    for (depth_mm, cutoff_mm) in [(3e-3, 5.0), (1e-2, 5.0), (5e-2, 5.0), (3e-3, 10.0), (5e-2, 10.0)] {
+        let chipped = |depths_mm: &[(usize, f64)]| {
+            let mut readings = quiet.clone();
+            depths_mm.iter().for_each(|&(k, depth_mm)| readings[k].deviation_mm -= depth_mm);
+            made(&readings, &MapOptions::new(cutoff_mm, 1.0))
+        };
+        // A flat bottom, and a round one.
+        for shallow_mm in [depth_mm, 0.5 * depth_mm] {
+            let map = chipped(&[(first, depth_mm), (second, shallow_mm)]);
+            assert!(!map.outliers.contains(&first) && !map.outliers.contains(&second), "{:?}", map.outliers);
+            let held_mm = -map.at(quiet[first].at_mm);
+            assert!(held_mm > 0.45 * depth_mm && held_mm < 1.1 * depth_mm, "{held_mm} of {depth_mm}");
+        }
+        assert_eq!(chipped(&[(first, depth_mm)]).outliers, [first]);
+    }
 }
 
 /// Scatter of the map over draws, over the uncertainty it states, at valid nodes.

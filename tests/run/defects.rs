@@ -1,0 +1,196 @@
+//! A chip, a broken corner, a pit, a bump or a scratch comes onto a part between a pass and its measurement: no part is accepted that is
+//! beyond its limits where it was touched, and what two targets lie on is in the map.
+
+use std::fmt::Write;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use nalgebra::{DMatrix, DVector};
+use rand::RngExt;
+use regrind_sim::part::{Aperture, DefectSpec, PartSpec};
+
+use crate::sample::{all, seeds};
+use crate::worlds::{Ran, Setup, Snapshot, run, table};
+
+const RECIPES: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "biconic", "shallow-wave"];
+const HEIGHTS_UM: [f64; 3] = [3.0, 10.0, 50.0];
+/// Standard deviation of the scatter of the simulated probe.
+const SCATTER_UM: f64 = 0.3;
+
+#[derive(Clone, Copy, Debug)]
+enum Kind {
+    Chip,
+    Corner,
+    Pit,
+    Bump,
+    Scratch,
+}
+
+/// A part with a defect, by its number.
+#[derive(Clone, Copy, Debug)]
+struct Case {
+    recipe: &'static str,
+    seed: u64,
+    adaptive: bool,
+    kind: Kind,
+    height_um: f64,
+}
+
+impl Case {
+    fn of(number: u64) -> Self {
+        let kinds = [Kind::Chip, Kind::Corner, Kind::Pit, Kind::Bump, Kind::Scratch];
+        let seed = number / 8 + 1;
+        Self {
+            recipe: RECIPES[(number / 2 % 4) as usize],
+            seed,
+            adaptive: number % 2 == 1,
+            kind: kinds[(number % 5) as usize],
+            height_um: HEIGHTS_UM[((number / 5 + 1) % 3) as usize],
+        }
+    }
+
+    fn defect(self, part: &PartSpec) -> DefectSpec {
+        let mut rng = regrind_sim::rng(self.seed);
+        let [half_x, half_y] = part.aperture.half_mm();
+        let mut along = |half: f64| 0.8 * half * (2.0 * rng.random::<f64>() - 1.0);
+        let anywhere = match part.aperture {
+            Aperture::Rectangle { .. } => [along(half_x), along(half_y)],
+            Aperture::Circle { .. } => [along(0.7 * half_x), along(0.7 * half_y)],
+        };
+        let corner = match part.aperture {
+            Aperture::Rectangle { .. } => [half_x - 2.0, half_y - 2.0],
+            Aperture::Circle { radius_mm } => [0.7 * radius_mm, 0.7 * radius_mm],
+        };
+        let (at_mm, size_mm, sign, round) = match self.kind {
+            Kind::Chip => (anywhere, [3.0, 3.0], -1.0, false),
+            Kind::Corner => (corner, [4.0, 4.0], -1.0, false),
+            Kind::Pit => (anywhere, [5.0, 4.0], -1.0, true),
+            Kind::Bump => (anywhere, [8.0, 8.0], 1.0, true),
+            Kind::Scratch => (anywhere, [30.0, 1.2], -1.0, true),
+        };
+        // In the second pass most parts would be accepted.
+        DefectSpec {
+            at_mm,
+            size_mm,
+            height_um: sign * self.height_um,
+            round,
+            after_pass: 1 + u32::from(!self.seed.is_multiple_of(4)),
+        }
+    }
+
+    fn ran(self) -> (DefectSpec, Ran) {
+        let setup = Setup { adaptive: self.adaptive, ..Setup::new(self.recipe, self.seed) };
+        let ran = run(setup.with(move |spec| spec.part.defects = vec![self.defect(&spec.part)]));
+        (ran.world.spec().part.defects[0].clone(), ran)
+    }
+}
+
+/// How a part ended.
+struct Told {
+    case: Case,
+    ending: String,
+    accepted: bool,
+    /// PV and RMS of the truth at every place that was touched last.
+    truth_um: [f64; 2],
+    /// What is wrong with it.
+    faults: String,
+}
+
+/// The true deviations at the places that were touched, but for what a motion of the part would do and for the depth of the pass.
+fn best_fitted(ran: &Ran, seen: &Snapshot) -> DVector<f64> {
+    let rows: Vec<[f64; 6]> = seen
+        .places_mm
+        .iter()
+        .map(|&[x, y]| {
+            let (p, n) = ran.world.nominal(x, y);
+            let turn = |i: usize, j: usize| (p[i] * n[j] - p[j] * n[i]) / 30.0;
+            [n[0], n[1], n[2], turn(1, 2), turn(2, 0), turn(0, 1)]
+        })
+        .collect();
+    // Motions along the surface itself change nothing. A height that all have is one of the pass.
+    let motions = DMatrix::from_fn(rows.len(), 7, |r, c| if c < 6 { rows[r][c] } else { 1.0 });
+    let found = DVector::from_column_slice(&seen.heights_mm);
+    let by = motions.clone().svd(true, true).solve(&found, 1e-7).unwrap();
+    found - motions * by
+}
+
+fn told(case: Case) -> Told {
+    let (defect, ran) = case.ran();
+    let mut faults = String::new();
+    let mut truth_um = [f64::NAN; 2];
+    for seen in &ran.snapshots {
+        let folder = ran.folder.join(format!("cycle-{}", seen.cycle));
+        let used: Vec<bool> = table(&folder.join("deviations.csv")).iter().map(|row| row[7] == 1.0).collect();
+        let best_mm = best_fitted(&ran, seen);
+        let rms_mm = (best_mm.norm_squared() / best_mm.len() as f64).sqrt();
+        truth_um = [1e3 * (best_mm.max() - best_mm.min()), 1e3 * rms_mm];
+        if seen.cycle != defect.after_pass || case.adaptive {
+            continue;
+        }
+        let height_mm = 1e-3 * defect.height_um;
+        let on: Vec<usize> =
+            (0..used.len()).filter(|&k| defect.height_mm(seen.places_mm[k]) / height_mm >= 0.5).collect();
+        if on.len() < 2 || defect.height_um.abs() < 6.0 * SCATTER_UM {
+            continue;
+        }
+        let tallest = |a: &&usize, b: &&usize| {
+            let of = |k: usize| defect.height_mm(seen.places_mm[k]).abs();
+            of(**a).total_cmp(&of(**b))
+        };
+        let k = *on.iter().max_by(tallest).unwrap();
+        let own_mm = defect.height_mm(seen.places_mm[k]);
+        let beside_mm = best_mm[k] - own_mm;
+        // At the four nodes about that target.
+        let mut map = table(&folder.join("error_map.csv"));
+        let away = |row: &[f64]| (row[0] - seen.places_mm[k][0]).hypot(row[1] - seen.places_mm[k][1]);
+        map.sort_by(|a, b| away(a).total_cmp(&away(b)));
+        let share = map[..4].iter().map(|row| (row[2] - beside_mm) / own_mm).fold(0.0, f64::max);
+        if share < 0.5 {
+            write!(faults, " {:.0} % of its height in the map, {} targets on it;", 100.0 * share, on.len()).unwrap();
+        }
+        let result: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(folder.join("result.json")).unwrap()).unwrap();
+        let high_um = 1e3 * result["figures"]["form"]["pv"]["high_mm"].as_f64().unwrap();
+        if high_um < 0.9 * truth_um[0] && used.iter().all(|used| *used) {
+            write!(faults, " PV up to {high_um:.2} of {:.2} um;", truth_um[0]).unwrap();
+        }
+    }
+    let limits_um = ran.tolerance_mm.map(|mm| 1e3 * mm);
+    let accepted = ran.accepted();
+    if accepted && (0..2).any(|k| truth_um[k] > limits_um[k]) {
+        write!(faults, " accepted with PV {:.2} and RMS {:.3} um where it was touched;", truth_um[0], truth_um[1])
+            .unwrap();
+    }
+    Told { case, ending: format!("{:?}", ran.ending).chars().take(60).collect(), accepted, truth_um, faults }
+}
+
+#[test]
+fn no_part_is_accepted_that_is_beyond_its_limits_where_it_was_touched() {
+    let count = 8 * seeds(1);
+    // Of each recipe by turns the whole pattern and touches that are chosen, where few are drawn.
+    let drawn: Vec<u64> = (0..count).filter(|number| all() || (number / 2 + number) % 2 == 0).collect();
+    let next = AtomicU64::new(0);
+    let take = || {
+        let mut done = Vec::new();
+        while let Some(number) = drawn.get(next.fetch_add(1, Ordering::Relaxed) as usize) {
+            let told = told(Case::of(*number));
+            println!(
+                "{:?} PV {:.2} RMS {:.3} um {}{}",
+                told.case, told.truth_um[0], told.truth_um[1], told.ending, told.faults
+            );
+            done.push(told);
+        }
+        done
+    };
+    let parts: Vec<Told> = std::thread::scope(|scope| {
+        let threads = [scope.spawn(take), scope.spawn(take)];
+        threads.into_iter().flat_map(|thread| thread.join().expect("a run panicked")).collect()
+    });
+    for height_um in HEIGHTS_UM {
+        let of: Vec<&Told> = parts.iter().filter(|part| part.case.height_um == height_um).collect();
+        println!("{height_um} um: {} of {} accepted", of.iter().filter(|part| part.accepted).count(), of.len());
+    }
+    let wrong: Vec<_> = parts.iter().filter(|part| !part.faults.is_empty()).collect();
+    assert!(wrong.is_empty(), "{} of {}", wrong.len(), parts.len());
+    // No defect of 3 um brings a part beyond 7 um by itself.
+    assert!(parts.iter().any(|part| part.accepted), "no part was accepted");
+}
