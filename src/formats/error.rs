@@ -89,6 +89,12 @@ pub enum FormatError {
     /// A header from which the three coordinates cannot be told.
     #[error("{path}, line {line}: the header {reason}; name exactly one column each x, y and z")]
     HeaderNames { path: PathBuf, line: u64, reason: String },
+    /// A table of more columns than three, and nothing says which hold what.
+    #[error(
+        "{path}, line {line}: {columns} columns without names, and x, y and z may be any of them; put a line above them that names the columns x, y \
+         and z"
+    )]
+    UnnamedColumns { path: PathBuf, line: u64, columns: usize },
     /// A unit other than the millimetre.
     #[error(
         "{path}, line {line}: expected coordinates in mm, found the unit {}; convert the file to mm",

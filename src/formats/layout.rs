@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::path::Path;
 
+use super::columns::{Axes, is_millimetre, is_other_unit, split_unit};
 use super::error::{FormatError, excerpt};
 use super::number::{Decimal, Evidence, evidence, looks_numeric, without_blanks};
 
@@ -157,19 +158,18 @@ pub(super) fn is_comment(line: &[u8]) -> bool {
 #[derive(Debug)]
 pub(super) struct Preamble<'p> {
     path: &'p Path,
+    /// Whether the nominal points are looked for.
+    of_nominal: bool,
     /// The last comment that names x, y and z: many programs comment their header out.
     comment: Option<(u64, Vec<u8>)>,
     header: Option<(u64, Vec<u8>)>,
+    /// A line of words and numbers that is a title, if a header follows it.
+    title: Option<FormatError>,
 }
 
 impl<'p> Preamble<'p> {
-    pub(super) fn new(path: &'p Path) -> Self {
-        Self { path, comment: None, header: None }
-    }
-
-    /// Returns whether there was a header.
-    pub(super) fn has_header(&self) -> bool {
-        self.header.is_some()
+    pub(super) fn new(path: &'p Path, of_nominal: bool) -> Self {
+        Self { path, of_nominal, comment: None, header: None, title: None }
     }
 
     /// Returns the names of the columns in lower case, if a header gives each of them one.
@@ -191,26 +191,71 @@ impl<'p> Preamble<'p> {
         let Some(separator) = data_separator(line) else {
             return self.take_words(line, number).map(|()| None);
         };
+        if let Some(title) = self.title.take() {
+            return Err(title);
+        }
         let count = Fields::of(line, separator).count();
-        let columns = self.columns(separator, count, number)?;
+        let columns = self.columns(separator, (line, count), number)?;
         Ok(Some(Layout { separator, columns, count, decimal: Decimal::Point, first_line: number }))
     }
 
-    /// Takes a line without a point in it: the header, or an error.
+    /// Takes a line without a point in it: the header, a title or the units above or below it, or an error.
     fn take_words(&mut self, line: &[u8], number: u64) -> Result<(), FormatError> {
         let likely = likely_separator(line);
         let fields: Vec<&[u8]> = Fields::of(line, likely).collect();
-        let is_header = self.header.is_none() && !fields.iter().any(|field| looks_numeric(field));
-        if is_header {
-            self.header = Some((number, line.to_vec()));
+        let has_header = self.header.as_ref().is_some_and(|(_, header)| is_understood(header));
+        if has_header && self.take_units(&fields, number)? {
             return Ok(());
         }
-        let path = self.path.to_owned();
-        if fields.len() < 3 {
-            return Err(FormatError::TooFewColumns { path, line: number, columns: fields.len(), found: excerpt(line) });
+        if !has_header && !fields.iter().any(|field| looks_numeric(field)) {
+            // Lines above the header are titles.
+            self.header = Some((number, line.to_vec()));
+            if is_understood(line) {
+                self.title = None;
+            }
+            return Ok(());
         }
+        let error = self.no_point(line, number);
+        if has_header {
+            return Err(error);
+        }
+        self.title = self.title.take().or(Some(error));
+        Ok(())
+    }
+
+    /// The error of a line that is no point.
+    fn no_point(&self, line: &[u8], number: u64) -> FormatError {
+        let path = self.path.to_owned();
+        let fields: Vec<&[u8]> = Fields::of(line, likely_separator(line)).collect();
         let wrong = fields.iter().position(|field| !looks_numeric(field)).unwrap_or(0);
-        Err(FormatError::NotANumber { path, line: number, column: wrong + 1, found: excerpt(fields[wrong]) })
+        match fields.len() < 3 {
+            true => FormatError::TooFewColumns { path, line: number, columns: fields.len(), found: excerpt(line) },
+            false => FormatError::NotANumber { path, line: number, column: wrong + 1, found: excerpt(fields[wrong]) },
+        }
+    }
+
+    /// Says why no point was found under what was read.
+    pub(super) fn without_points(mut self) -> FormatError {
+        let path = self.path.to_owned();
+        match (self.title.take(), &self.header) {
+            (Some(title), _) => title,
+            (None, Some((number, header))) if !is_understood(header) => self.no_point(header, *number),
+            (None, Some(_)) => FormatError::NoData { path, expected: "points" },
+            (None, None) => FormatError::Empty { path, expected: "points" },
+        }
+    }
+
+    /// Takes a line of units below a header; false where it is none.
+    fn take_units(&self, fields: &[&[u8]], number: u64) -> Result<bool, FormatError> {
+        let unit = |field: &[u8]| String::from_utf8_lossy(field).trim_matches(['[', ']', '(', ')', ' ']).to_lowercase();
+        let units: Vec<String> = fields.iter().map(|field| unit(field)).filter(|unit| !unit.is_empty()).collect();
+        if units.is_empty() || !units.iter().all(|unit| is_millimetre(unit) || is_other_unit(unit)) {
+            return Ok(false);
+        }
+        match units.into_iter().find(|unit| !is_millimetre(unit)) {
+            Some(found) => Err(FormatError::Unit { path: self.path.to_owned(), line: number, found }),
+            None => Ok(true),
+        }
     }
 
     fn take_comment(&mut self, comment: &[u8], number: u64) -> Result<(), FormatError> {
@@ -221,24 +266,39 @@ impl<'p> Preamble<'p> {
         if let Some(unit) = unit_statement(text) {
             return Err(FormatError::Unit { path: self.path.to_owned(), line: number, found: unit });
         }
-        if named_axes(&names(text, likely_separator(text))).iter().all(|found| found.len() == 1) {
+        if is_understood(text) {
             self.comment = Some((number, text.to_vec()));
         }
         Ok(())
     }
 
-    /// Returns which columns hold x, y and z: those the header names, else the first three.
-    fn columns(&self, separator: Separator, count: usize, data_line: u64) -> Result<[usize; 3], FormatError> {
+    /// Returns which columns hold x, y and z: those that the header names, or of a table without names the only three, or those before unit normals.
+    fn columns(
+        &self,
+        separator: Separator,
+        (data, count): (&[u8], usize),
+        data_line: u64,
+    ) -> Result<[usize; 3], FormatError> {
         let path = || self.path.to_owned();
         let (line, names) = match (&self.header, &self.comment) {
             (Some((line, header)), _) => (*line, names(header, separator)),
             (None, Some((line, comment))) => {
                 let own = if comment.contains(&separator.byte()) { separator } else { Separator::Blank };
-                (*line, Some(names(comment, own)).filter(|names| names.len() == count).unwrap_or_default())
+                (*line, names(comment, own))
             }
-            (None, None) => (data_line, Vec::new()),
+            (None, None) => {
+                let is_clear = count == 3 || (count == 6 && has_normal(data, separator));
+                let refused = FormatError::UnnamedColumns { path: path(), line: data_line, columns: count };
+                return if is_clear { Ok([0, 1, 2]) } else { Err(refused) };
+            }
         };
-        if self.header.is_some() && names.len() != count {
+        let columns = Axes::of(&names).chosen(self.of_nominal);
+        if names.len() != count {
+            // A comment may be a sentence that names the three columns of a table in their order.
+            let is_sentence = self.header.is_none() && count == 3 && names.len() > count;
+            if is_sentence && columns.as_ref().is_ok_and(|columns| columns.is_sorted()) {
+                return Ok([0, 1, 2]);
+            }
             let separator = separator.name();
             return Err(FormatError::HeaderColumns {
                 path: path(),
@@ -248,9 +308,7 @@ impl<'p> Preamble<'p> {
                 separator,
             });
         }
-        let axes = named_axes(&names);
-        let columns =
-            chosen_columns(&axes).map_err(|reason| FormatError::HeaderNames { path: path(), line, reason })?;
+        let columns = columns.map_err(|reason| FormatError::HeaderNames { path: path(), line, reason })?;
         for name in columns.iter().filter_map(|&column| names.get(column)) {
             if let (_, Some(unit)) = split_unit(name)
                 && !is_millimetre(&unit)
@@ -260,6 +318,20 @@ impl<'p> Preamble<'p> {
         }
         Ok(columns)
     }
+}
+
+/// Whether a line names coordinates.
+fn is_understood(header: &[u8]) -> bool {
+    Axes::of(&names(header, likely_separator(header))).are_named()
+}
+
+/// Whether the last three of six columns are a direction.
+fn has_normal(line: &[u8], separator: Separator) -> bool {
+    const OFF: f64 = 1e-3;
+    let last = Fields::of(line, separator).skip(3);
+    let squares: Option<Vec<f64>> =
+        last.map(|field| std::str::from_utf8(field).ok()?.parse().ok().map(|value: f64| value * value)).collect();
+    squares.is_some_and(|squares| (squares.iter().sum::<f64>() - 1.0).abs() < OFF)
 }
 
 /// Returns the separator under which a line is a point: three numbers first, or else three numbers anywhere.
@@ -291,81 +363,14 @@ fn names(header: &[u8], separator: Separator) -> Vec<String> {
     names
 }
 
-/// Returns, for x, y and z, the columns that bear the name.
-fn named_axes(names: &[String]) -> [Vec<usize>; 3] {
-    ["x", "y", "z"].map(|axis| {
-        let is_axis = |name: &String| {
-            let (base, _) = split_unit(name);
-            base.strip_prefix(axis).is_some_and(|rest| {
-                let rest = rest.trim_start_matches([' ', '_', '-', '.']);
-                ["", "coord", "coordinate", "pos", "position"].contains(&rest)
-            })
-        };
-        (0..names.len()).filter(|&column| is_axis(&names[column])).collect()
-    })
-}
-
-/// Chooses one column for each axis, or says what is wrong with the names.
-fn chosen_columns(axes: &[Vec<usize>; 3]) -> Result<[usize; 3], String> {
-    for (axis, found) in ["x", "y", "z"].iter().zip(axes) {
-        if found.len() > 1 {
-            return Err(format!("names {} columns {axis}", found.len()));
-        }
-    }
-    if let [[x], [y], [z]] = [&axes[0][..], &axes[1], &axes[2]] {
-        return Ok([*x, *y, *z]);
-    }
-    // Some are named: the first three columns are right only if the named ones stand where they belong.
-    for (place, (axis, found)) in ["x", "y", "z"].iter().zip(axes).enumerate() {
-        if found.first().is_some_and(|&column| column != place) {
-            return Err(format!("names column {} {axis} but not all of x, y and z", found[0] + 1));
-        }
-    }
-    Ok([0, 1, 2])
-}
-
-/// Splits a column's name in lower case into the name proper and the unit it states.
-fn split_unit(name: &str) -> (&str, Option<String>) {
-    let name = name.trim();
-    for (open, close) in [('[', ']'), ('(', ')')] {
-        if let (Some(at), true) = (name.rfind(open), name.ends_with(close)) {
-            let unit = name[at + 1..name.len() - 1].trim();
-            // Square brackets hold units by custom, round ones hold anything.
-            let states = open == '[' || is_millimetre(unit) || OTHER_UNITS.contains(&unit);
-            return if states { (base_of(&name[..at]), Some(unit.to_owned())) } else { (name, None) };
-        }
-    }
-    match name.rfind(['_', '/', ' ']) {
-        Some(at) if is_millimetre(&name[at + 1..]) || OTHER_UNITS.contains(&&name[at + 1..]) => {
-            (base_of(&name[..at]), Some(name[at + 1..].to_owned()))
-        }
-        _ => (name, None),
-    }
-}
-
-fn base_of(name: &str) -> &str {
-    name.trim_end_matches([' ', '_', '-', '.', '/'])
-}
-
 /// Returns the unit a comment such as "units: inch" states, if it is not the millimetre.
 fn unit_statement(comment: &[u8]) -> Option<String> {
     let text = String::from_utf8_lossy(comment).to_lowercase();
     let after = &text[text.find("unit")? + 4..];
     let after = after.strip_prefix('s').unwrap_or(after).trim_start().strip_prefix([':', '='])?.trim_start();
     let end = after.find(|c: char| !c.is_alphabetic()).unwrap_or(after.len());
-    OTHER_UNITS.contains(&&after[..end]).then(|| after[..end].to_owned())
+    is_other_unit(&after[..end]).then(|| after[..end].to_owned())
 }
-
-fn is_millimetre(unit: &str) -> bool {
-    ["mm", "millimetre", "millimetres", "millimeter", "millimeters"].contains(&unit)
-}
-
-/// Units of length that are not the millimetre, in lower case.
-#[rustfmt::skip]
-const OTHER_UNITS: [&str; 34] = [
-    "m", "metre", "metres", "meter", "meters", "dm", "cm", "centimetre", "centimetres", "centimeter", "centimeters", "km", "um", "\u{b5}m", "\u{3bc}m", "micron", "microns",
-    "micrometre", "micrometres", "micrometer", "micrometers", "nm", "nanometre", "nanometres", "nanometer", "nanometers", "in", "inch", "inches", "ft", "feet", "mil", "mils", "thou",
-];
 
 #[cfg(test)]
 mod tests {
@@ -404,16 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_columns_are_understood_with_their_units() {
-        let axes = |header: &str| named_axes(&names(header.as_bytes(), likely_separator(header.as_bytes())));
-        let here = |columns: [usize; 3]| columns.map(|c| vec![c]);
-        assert_eq!(axes("x,y,z"), here([0, 1, 2]));
-        assert_eq!(axes("id;Z_mm;Y [mm];X(mm);x_res"), here([3, 2, 1]));
-        assert_eq!(axes("n x [mm] y [mm] z [mm]"), here([1, 2, 3]));
-        assert_eq!(axes("X coordinate,Y coordinate,Z coordinate"), here([0, 1, 2]));
-        assert_eq!(axes("nx,ny,nz"), here([0; 3]).map(|_| Vec::<usize>::new()));
-        assert_eq!(split_unit("x_inch"), ("x", Some("inch".to_owned())));
-        assert_eq!(split_unit("x (nominal)"), ("x (nominal)", None));
+    fn a_comment_states_a_unit() {
         assert_eq!(unit_statement(b"Units : Inch, made by hand"), Some("inch".to_owned()));
         assert_eq!(unit_statement(b"unit = mm"), None);
         assert_eq!(unit_statement(b"unity"), None);

@@ -3,6 +3,7 @@
 //! No file is trusted. Whatever is wrong with one comes back as a [`FormatError`] that names the file, the place, what was
 //! found, what was expected and what to do; nothing here panics, and time and memory are bounded by the size of the file.
 
+mod columns;
 mod dmis;
 mod document;
 mod error;
@@ -54,7 +55,7 @@ pub use metropro::{parse_metropro, read_metropro};
 pub use note::{NotedPoints, PointNote};
 pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};
-pub use points::{parse_points, read_points, read_points_with_notes};
+pub use points::{parse_points, read_nominal_points, read_points, read_points_with_notes};
 pub use registration::{
     DeviationRow, read_deviations, sync_folder, try_writing, write_atomic, write_column, write_deviations,
     write_json_atomic, write_points, write_private,
@@ -125,7 +126,7 @@ pub fn read_nominal_with_identity(path: impl AsRef<Path>) -> Result<(NominalFile
 pub fn read_nominal(path: impl AsRef<Path>) -> Result<NominalFile, FormatError> {
     let path = path.as_ref();
     Ok(match kind(path)? {
-        Kind::Text => NominalFile::Points(read_points(path)?),
+        Kind::Text => NominalFile::Points(read_nominal_points(path)?),
         Kind::Toml => NominalFile::Definition(read_definition(path)?),
         Kind::Stl => {
             let StlFile { points, triangles, .. } = read_stl(path)?;

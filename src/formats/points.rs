@@ -31,8 +31,9 @@ const SHARE: usize = 256 << 10;
 /// Reads a point cloud from a text file, in millimetres and in the order of the file.
 ///
 /// One point a line; columns separated by comma, semicolon, tab or blanks, which is found in the first point and required of
-/// all. Blank lines and lines that begin with `#` or `//` are skipped. If a header, or a comment that stands for one, names
-/// x, y and z, those columns are taken, else the first three; further columns may hold anything. Decimal commas are understood
+/// all. Blank lines and lines that begin with `#` or `//` are skipped. A header, or a comment that stands for one, names x, y and z once; columns of
+/// nominal points beside measured ones are a question that only a person answers. A table without a header has three columns, or six with unit
+/// normals behind the points. Lines above a header are titles. Decimal commas are understood
 /// where the comma does not separate columns, thousands separators where the number also has its decimal mark, and blanks between
 /// thousands where a tab or a semicolon separates columns.
 ///
@@ -44,15 +45,30 @@ pub fn read_points(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
     read_points_with_notes(path).map(|read| read.points)
 }
 
+/// Reads the points of a nominal surface as [`read_points`] does; their columns may be called nominal.
+///
+/// # Errors
+/// Those of [`read_points`].
+pub fn read_nominal_points(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
+    let path = path.as_ref();
+    let (file, length) = opened(path)?;
+    Cloud { preamble: Preamble::new(path, true), ..Cloud::new(path, length) }.read(file).map(|read| read.points)
+}
+
+fn opened(path: &Path) -> Result<(File, u64), FormatError> {
+    let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
+    let file = File::open(path).map_err(unreadable)?;
+    let length = file.metadata().map_err(unreadable)?.len();
+    Ok((file, length))
+}
+
 /// Reads a point cloud as [`read_points`] does, with what the file leaves open.
 ///
 /// # Errors
 /// Those of [`read_points`].
 pub fn read_points_with_notes(path: impl AsRef<Path>) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
-    let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
-    let file = File::open(path).map_err(unreadable)?;
-    let length = file.metadata().map_err(unreadable)?.len();
+    let (file, length) = opened(path)?;
     Cloud::new(path, length).read(file)
 }
 
@@ -145,7 +161,7 @@ struct Share {
 
 impl<'p> Cloud<'p> {
     fn new(path: &'p Path, length: u64) -> Self {
-        let (preamble, points, grouped) = (Preamble::new(path), Vec::new(), Grouped::default());
+        let (preamble, points, grouped) = (Preamble::new(path, false), Vec::new(), Grouped::default());
         Self { path, decimal: None, length, preamble, layout: None, lines: 0, points, grouped }
     }
 
@@ -274,12 +290,7 @@ impl<'p> Cloud<'p> {
         if !self.points.is_empty() {
             return Ok(self.points);
         }
-        let path = self.path.to_owned();
-        Err(if self.preamble.has_header() {
-            FormatError::NoData { path, expected: "points" }
-        } else {
-            FormatError::Empty { path, expected: "points" }
-        })
+        Err(self.preamble.without_points())
     }
 
     /// Gives up on a file that begins with nothing but comments.

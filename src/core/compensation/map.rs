@@ -115,7 +115,7 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
     let (mut outliers, mut features, mut found, mut advice) = (Vec::new(), Vec::new(), None, Vec::new());
     if let Some(limit) = options.outlier_limit {
         let all = wide.robust(&kept);
-        let far = all.far(&kept.places, limit, apart_mm).unwrap_or_else(|| {
+        let far = all.far((&kept.places, &kept.values), limit, apart_mm).unwrap_or_else(|| {
             advice.push(
                 "more than a tenth of the points stand out, so none was left out; clean the part and the probe"
                     .to_owned(),
@@ -155,9 +155,10 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
 ///
 /// `features` are numbers of readings, with their heights over the surface around. A chip that two targets lie on is narrower than the filter.
 fn hold_features(filtered: &mut Filtered, gaussian: &Gaussian, kept: &Kept, features: &[(usize, f64)]) {
-    /// Of readings so dense that a feature passes by a twelfth only, it takes so many.
+    /// Of readings so dense that a feature passes by an eighth only, it takes so many.
     const MOST_TIMES: usize = 8;
-    const HELD: f64 = 0.5;
+    /// More than half, for between the nodes of the map there is less than at the readings.
+    const HELD: f64 = 0.65;
     for _ in 0..MOST_TIMES {
         let mut left = vec![0.0; kept.values.len()];
         for &(k, _) in features {

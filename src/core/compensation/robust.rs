@@ -7,10 +7,13 @@
 //! reading in the value at its place, and the variance v of that value, a residual r has the variance sigma^2 (1 - 2 l + v);
 //! z = r / sqrt(1 - 2 l + v) scatters alike everywhere. Sigma is 1.4826 median |z|. What has |z| above the limit is an outlier
 //! unless one of its eight neighbours is off to the same side too, by half the limit and a quarter of the height at least: that is a feature of
-//! the part, or dirt as large as one, and no point rule can tell which.
+//! the part, or dirt as large as one, and no point rule can tell which. As the surface leans towards a wide feature, heights are also told from
+//! the plane through what was read around.
+
+use nalgebra::{Matrix3, Vector3};
 
 use super::filter::{Filtered, Gaussian};
-use crate::geometry::Grid;
+use crate::geometry::{Grid, Nearest, Point};
 
 /// Most rounds of the robust filter.
 const ROUNDS: usize = 15;
@@ -29,6 +32,8 @@ const LEAST_SCALE_MM: f64 = 1e-6;
 /// A neighbour that is off by these shares of the limit and of the height of a reading found the same as it.
 const SHARE_OF_LIMIT: f64 = 0.5;
 const SHARE_OF_HEIGHT: f64 = 0.25;
+/// Readings about one, of which those that are no neighbours tell what is usual there.
+const AROUND: usize = 48;
 /// What is within so many distances of neighbours along both axes is a neighbour: eight are, on a grid.
 const NEIGHBOUR: f64 = 1.5;
 
@@ -141,7 +146,7 @@ impl Robust {
     ///
     /// `apart` is the distance of neighbouring readings along x and y. `None` where more than a tenth would be outliers: such readings are
     /// no exception, and the surface has no other rule.
-    pub fn far(&self, places: &[[f64; 2]], limit: f64, apart: [f64; 2]) -> Option<Far> {
+    pub fn far(&self, (places, values): (&[[f64; 2]], &[f64]), limit: f64, apart: [f64; 2]) -> Option<Far> {
         if places.len() < LEAST_READINGS {
             return Some(Far::default());
         }
@@ -150,10 +155,17 @@ impl Robust {
         let mut off: Vec<usize> = (0..places.len()).filter(|&k| size(k) > SHARE_OF_LIMIT * limit).collect();
         off.sort_by(|&a, &b| places[a][0].total_cmp(&places[b][0]));
         let far = (0..off.len()).filter(|&n| size(off[n]) > limit);
-        let (mut features, mut outliers): (Vec<usize>, Vec<usize>) = (Vec::new(), Vec::new());
-        far.for_each(|n| {
-            if self.is_feature(n, &off, places, apart) { features.push(off[n]) } else { outliers.push(off[n]) }
-        });
+        let (mut features, alone): (Vec<usize>, Vec<usize>) =
+            far.partition(|&n| self.is_feature(n, &off, places, apart));
+        features.iter_mut().for_each(|n| *n = off[*n]);
+        let mut outliers = Vec::new();
+        if !alone.is_empty() {
+            let around = Around { places, values, tree: Nearest::of(places.iter().map(on_plane)), apart };
+            let least = SHARE_OF_LIMIT * limit;
+            for k in alone.into_iter().map(|n| off[n]) {
+                if around.agrees(k, self.scaled[k].signum(), least) { features.push(k) } else { outliers.push(k) }
+            }
+        }
         features.sort_unstable();
         outliers.sort_unstable();
         (outliers.len() * 10 <= places.len()).then_some(Far { outliers, features })
@@ -172,6 +184,41 @@ impl Robust {
         let mut after = off[n + 1..].iter().take_while(|j| away(**j, 0) <= reach[0]);
         before.any(agrees) || after.any(agrees)
     }
+}
+
+/// Readings by their places.
+struct Around<'r> {
+    places: &'r [[f64; 2]],
+    values: &'r [f64],
+    tree: Nearest,
+    apart: [f64; 2],
+}
+
+impl Around<'_> {
+    /// Whether a neighbour of a reading stands over the plane through what is around both too, by `least` and by a quarter of the reading's height.
+    fn agrees(&self, k: usize, side: f64, least: f64) -> bool {
+        let own = on_plane(&self.places[k]);
+        let near = self.tree.to(&own, AROUND as u32 + 1).map(|(other, _)| other).filter(|other| *other != k);
+        let away = |other: usize| [0, 1].map(|a| self.places[other][a] - self.places[k][a]);
+        let is_beside = |other: &usize| (0..2).all(|a| away(*other)[a].abs() <= NEIGHBOUR * self.apart[a]);
+        let (beside, around): (Vec<usize>, Vec<usize>) = near.partition(is_beside);
+        let row = |other: usize| {
+            let [x, y] = away(other);
+            Vector3::new(1.0, x, y)
+        };
+        let (mut gram, mut right) = (Matrix3::zeros(), Vector3::zeros());
+        for &other in &around {
+            gram += row(other) * row(other).transpose();
+            right += row(other) * self.values[other];
+        }
+        let Some(plane) = gram.cholesky().map(|gram| gram.solve(&right)) else { return false };
+        let height = |of: usize| side * (self.values[of] - row(of).dot(&plane));
+        beside.iter().any(|&other| height(other) >= least.max(SHARE_OF_HEIGHT * height(k)))
+    }
+}
+
+fn on_plane(&[x, y]: &[f64; 2]) -> Point {
+    Point::new(x, y, 0.0)
 }
 
 /// Returns the median of the absolute values, of those that are numbers; 0 of none.

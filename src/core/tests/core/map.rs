@@ -288,9 +288,19 @@ fn two_neighbours_that_agree_are_kept_and_one_alone_is_left_out() {
             let map = chipped(&[(first, depth_mm), (second, shallow_mm)]);
             assert!(!map.outliers.contains(&first) && !map.outliers.contains(&second), "{:?}", map.outliers);
             let held_mm = -map.at(quiet[first].at_mm);
-            assert!(held_mm > 0.45 * depth_mm && held_mm < 1.1 * depth_mm, "{held_mm} of {depth_mm}");
+            assert!(held_mm > 0.5 * depth_mm && held_mm < 1.1 * depth_mm, "{held_mm} of {depth_mm}");
         }
         assert_eq!(chipped(&[(first, depth_mm)]).outliers, [first]);
+    }
+}
+
+#[test]
+fn the_top_of_a_low_bump_is_kept() {
+    // Ten times the noise: the surface that readings are judged by leans to it.
+    for seed in 0..20 {
+        let bump = |x: f64, y: f64| 3e-3 * (1.0 - ((x - 10.0).powi(2) + (y + 5.0).powi(2)) / 16.0).max(0.0).powi(2);
+        let map = made(&with_noise(&trial(bump), 3e-4, seed), &MapOptions::new(5.0, 1.0));
+        assert!(map.at([10.0, -5.0]) > 1.5e-3, "{seed}: {}", map.at([10.0, -5.0]));
     }
 }
 

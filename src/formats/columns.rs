@@ -1,0 +1,254 @@
+//! Which columns of a table are coordinates, by the names that its header gives them: understood whole, or refused.
+//!
+//! A name is an axis with words beside it that say which of its points it is: "X_act", "Measured X", "x (nominal) [mm]". Points that were
+//! measured stand beside nominal ones in what most machines give out, and reading those for these would make every part a good one. So a header
+//! of two groups of coordinates is a question, and a header that names no group at all is not taken for one in the usual order.
+
+use std::fmt;
+
+/// Points that a column belongs to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Group {
+    /// Nothing says which.
+    Plain,
+    Measured,
+    Nominal,
+}
+
+impl Group {
+    const ALL: [Self; 3] = [Self::Plain, Self::Measured, Self::Nominal];
+
+    /// The words that say so, in the languages that machines print.
+    fn words(self) -> &'static [&'static str] {
+        match self {
+            Self::Plain => &["coord", "coordinate", "coordinates", "pos", "position", "koordinate", "koord"],
+            Self::Measured => &[
+                "act",
+                "actual",
+                "actuals",
+                "meas",
+                "measured",
+                "measurement",
+                "ist",
+                "istwert",
+                "gemessen",
+                "mes",
+                "mesure",
+                "mesuré",
+                "mesurée",
+                "mis",
+                "misurato",
+                "med",
+                "medido",
+                "real",
+                "reel",
+                "réel",
+            ],
+            Self::Nominal => &[
+                "nom",
+                "nominal",
+                "nominals",
+                "soll",
+                "sollwert",
+                "theo",
+                "theor",
+                "theoretical",
+                "theorique",
+                "théorique",
+                "target",
+                "ref",
+                "reference",
+                "design",
+                "cad",
+                "nominale",
+                "teorico",
+            ],
+        }
+    }
+}
+
+impl fmt::Display for Group {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Plain => "plain",
+            Self::Measured => "measured",
+            Self::Nominal => "nominal",
+        })
+    }
+}
+
+/// Returns the axis, 0 to 2, and the group that a column's name in lower case states, without its unit; none of any other column.
+fn axis_of(name: &str) -> Option<(usize, Group)> {
+    let mut axis = None;
+    let mut group = Group::Plain;
+    let mut take = |word: &str| -> bool {
+        if let Some(found) = ["x", "y", "z"].iter().position(|of| *of == word) {
+            return axis.replace(found).is_none();
+        }
+        let Some(of) = Group::ALL.into_iter().find(|of| of.words().contains(&word)) else { return false };
+        let is_new = of == Group::Plain || group == Group::Plain || of == group;
+        group = if of == Group::Plain { group } else { of };
+        is_new
+    };
+    for word in name.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()) {
+        let is_known = take(word) || {
+            // Without anything between: xact, actx.
+            let after = word.strip_prefix(['x', 'y', 'z']).map(|rest| (&word[..1], rest));
+            let before = word.strip_suffix(['x', 'y', 'z']).map(|rest| (&word[rest.len()..], rest));
+            let is_group = |rest: &str| Group::ALL.iter().any(|of| of.words().contains(&rest));
+            let split = [after, before].into_iter().flatten().find(|(_, rest)| is_group(rest));
+            split.is_some_and(|(axis, rest)| take(axis) && take(rest))
+        };
+        if !is_known {
+            return None;
+        }
+    }
+    axis.map(|axis| (axis, group))
+}
+
+/// The columns of each group and axis, from 0.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Axes([[Vec<usize>; 3]; 3]);
+
+impl Axes {
+    pub(super) fn of(names: &[String]) -> Self {
+        let mut axes = Self::default();
+        for (column, name) in names.iter().enumerate() {
+            if let Some((axis, group)) = axis_of(split_unit(name).0) {
+                axes.0[group as usize][axis].push(column);
+            }
+        }
+        axes
+    }
+
+    fn group(&self, group: Group) -> &[Vec<usize>; 3] {
+        &self.0[group as usize]
+    }
+
+    /// Whether all three axes of any points are named.
+    pub(super) fn are_named(&self) -> bool {
+        self.0.iter().any(|group| group.iter().all(|columns| !columns.is_empty()))
+    }
+
+    /// Chooses the columns x, y and z, or says what of the names is not clear; `of_nominal` where the nominal points are looked for.
+    pub(super) fn chosen(&self, of_nominal: bool) -> Result<[usize; 3], String> {
+        let there: Vec<Group> = Group::ALL
+            .into_iter()
+            .filter(|group| self.group(*group).iter().any(|columns| !columns.is_empty()))
+            .collect();
+        let group = match there[..] {
+            [] => return Err("names none of x, y and z".to_owned()),
+            [group] => group,
+            [first, second, ..] => {
+                return Err(format!("names {first} and {second} columns, and which are to be read is not said"));
+            }
+        };
+        for (axis, columns) in ["x", "y", "z"].iter().zip(self.group(group)) {
+            if columns.len() != 1 {
+                return Err(format!("names {} columns {axis}", columns.len()));
+            }
+        }
+        if group == Group::Nominal && !of_nominal {
+            return Err("names nominal columns alone, which nobody measured".to_owned());
+        }
+        Ok(self.group(group).each_ref().map(|columns| columns[0]))
+    }
+}
+
+/// Splits a column's name in lower case into the name proper and the unit it states.
+pub(super) fn split_unit(name: &str) -> (&str, Option<String>) {
+    let name = name.trim();
+    for (open, close) in [('[', ']'), ('(', ')')] {
+        if let (Some(at), true) = (name.rfind(open), name.ends_with(close)) {
+            let unit = name[at + 1..name.len() - 1].trim();
+            // Square brackets hold units by custom, round ones hold anything.
+            let states = open == '[' || is_millimetre(unit) || OTHER_UNITS.contains(&unit);
+            return if states { (base_of(&name[..at]), Some(unit.to_owned())) } else { (name, None) };
+        }
+    }
+    match name.rfind(['_', '/', ' ']) {
+        Some(at) if is_millimetre(&name[at + 1..]) || OTHER_UNITS.contains(&&name[at + 1..]) => {
+            (base_of(&name[..at]), Some(name[at + 1..].to_owned()))
+        }
+        _ => (name, None),
+    }
+}
+
+fn base_of(name: &str) -> &str {
+    name.trim_end_matches([' ', '_', '-', '.', '/'])
+}
+
+pub(super) fn is_millimetre(unit: &str) -> bool {
+    ["mm", "millimetre", "millimetres", "millimeter", "millimeters"].contains(&unit)
+}
+
+/// Returns whether a word in lower case is a unit of length that is not the millimetre.
+pub(super) fn is_other_unit(word: &str) -> bool {
+    OTHER_UNITS.contains(&word)
+}
+
+/// Units of length that are not the millimetre, in lower case.
+#[rustfmt::skip]
+const OTHER_UNITS: [&str; 36] = [
+    "m", "metre", "metres", "meter", "meters", "dm", "cm", "centimetre", "centimetres", "centimeter", "centimeters", "km", "um", "\u{b5}m", "\u{3bc}m", "micron", "microns",
+    "micrometre", "micrometres", "micrometer", "micrometers", "nm", "nanometre", "nanometres", "nanometer", "nanometers", "in", "inch", "inches", "ft", "feet", "mil", "mils", "thou",
+    "zoll", "pouce",
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn axes(header: &str) -> Axes {
+        let names: Vec<String> = header.split(',').map(str::to_lowercase).collect();
+        Axes::of(&names)
+    }
+
+    #[test]
+    fn an_axis_is_named_with_the_points_it_belongs_to() {
+        for (name, axis, group) in [
+            ("x", 0, Group::Plain),
+            ("z coordinate", 2, Group::Plain),
+            ("y_act", 1, Group::Measured),
+            ("measured x", 0, Group::Measured),
+            ("xact", 0, Group::Measured),
+            ("actz", 2, Group::Measured),
+            ("x (actual)", 0, Group::Measured),
+            ("y ist", 1, Group::Measured),
+            ("x_nom", 0, Group::Nominal),
+            ("z.soll", 2, Group::Nominal),
+            ("nominal y", 1, Group::Nominal),
+        ] {
+            assert_eq!(axis_of(name), Some((axis, group)), "{name}");
+        }
+        for name in ["nx", "dx", "x_res", "xy", "x y", "index", "", "x_nom_act", "deviation z", "ix", "max"] {
+            assert_eq!(axis_of(name), None, "{name}");
+        }
+    }
+
+    #[test]
+    fn one_group_of_columns_is_read_and_two_are_a_question() {
+        assert_eq!(axes("x,y,z").chosen(false), Ok([0, 1, 2]));
+        assert_eq!(axes("Y_act,X_act,Z_act").chosen(false), Ok([1, 0, 2]));
+        assert_eq!(axes("Nr,X_nom,Y_nom,Z_nom").chosen(true), Ok([1, 2, 3]));
+        assert_eq!(axes("id,Z_mm,Y [mm],X(mm),x_res").chosen(false), Ok([3, 2, 1]));
+        for header in [
+            "X_nom,Y_nom,Z_nom",
+            "X_nom,Y_nom,Z_nom,X_act,Y_act,Z_act",
+            "x,y,z,x_act,y_act,z_act",
+            "a,b,c",
+            "x,y",
+            "x,y,height",
+            "x,y,z,z",
+            "x,y,z,z_act",
+        ] {
+            assert!(axes(header).chosen(false).is_err(), "{header}");
+        }
+    }
+
+    #[test]
+    fn a_unit_is_split_off_the_name() {
+        assert_eq!(split_unit("x_inch"), ("x", Some("inch".to_owned())));
+        assert_eq!(split_unit("x (nominal)"), ("x (nominal)", None));
+    }
+}
