@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use regrind::formats::{NominalFile, read_nominal};
+use regrind::formats::{NominalFile, Table, read_nominal_as};
 use regrind::setup;
 use regrind::surface::{DefinedSurface, Nominal, NominalKind, Projection, SampledSurface};
 
@@ -14,7 +14,11 @@ use super::words::count;
 /// # Errors
 /// A file that cannot be read, and a projection for what is no cloud of points.
 pub(super) fn read(path: &Path, projection: Projection) -> Result<NominalFile, Failure> {
-    let file = read_nominal(path)?;
+    read_as(path, projection, &Table::default())
+}
+
+fn read_as(path: &Path, projection: Projection, table: &Table) -> Result<NominalFile, Failure> {
+    let file = read_nominal_as(path, table)?;
     let what = match file {
         NominalFile::Points(_) => return Ok(file),
         NominalFile::Mesh { .. } => "a mesh",
@@ -31,7 +35,15 @@ pub(super) fn read(path: &Path, projection: Projection) -> Result<NominalFile, F
 /// # Errors
 /// Those of [`read`], and what makes no surface, by file name.
 pub(super) fn surface(path: &Path, projection: Projection) -> Result<Nominal, Failure> {
-    setup::surface(path, read(path, projection)?, projection).map_err(Failure::Setup)
+    surface_as(path, projection, &Table::default())
+}
+
+/// The same; of a table of points `table` says what it does not say of itself.
+///
+/// # Errors
+/// Those of [`surface`], and columns that are not there.
+pub(super) fn surface_as(path: &Path, projection: Projection, table: &Table) -> Result<Nominal, Failure> {
+    setup::surface(path, read_as(path, projection, table)?, projection).map_err(Failure::Setup)
 }
 
 /// Samples a defined surface at its spacing.

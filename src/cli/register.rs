@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use regrind::formats::{
-    Alternative, NominalInput, NotedPoints, RegistrationDocument, ResultFolder, is_map, read_measured_with_notes,
-    save_form, save_registration,
+    Alternative, Columns, NominalInput, NotedPoints, RegistrationDocument, ResultFolder, Table, Unit, is_map,
+    read_measured_with_notes, save_form, save_registration,
 };
 use regrind::geometry::Pose;
 use regrind::model::{AngleInterval, Form, Given, Interval, IsoFigures, SlopeFigures};
@@ -31,6 +31,18 @@ pub(super) struct Arguments {
     /// Measured points as text or PLY, in mm, or an interferometer's or profilometer's map as X3P, SDF or MetroPro
     #[arg(long, value_name = "FILE")]
     measured: PathBuf,
+    /// Columns of the measured table, by name or by number from 1, where its header does not tell
+    #[arg(long, value_name = "x=X_act,y=Y_act,z=Z_act")]
+    columns: Option<Columns>,
+    /// Unit of the measured table: mm, um, nm, cm, m or inch
+    #[arg(long)]
+    unit: Option<Unit>,
+    /// Columns of the nominal table
+    #[arg(long, value_name = "x=X_nom,y=Y_nom,z=Z_nom")]
+    nominal_columns: Option<Columns>,
+    /// Unit of the nominal table
+    #[arg(long, value_name = "UNIT")]
+    nominal_unit: Option<Unit>,
     /// Radius of the probe in mm; 0 for one without a ball, such as an optical one. Not needed with --method contact
     #[arg(long, alias = "probe-radius-mm", value_name = "MM", allow_negative_numbers = true, value_parser = finite_from_zero)]
     probe_radius: Option<f64>,
@@ -159,9 +171,11 @@ fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure>
     if is_map(&arguments.measured)? && method(arguments) != Method::Contact {
         return Err(Failure::MapOfContacts { path: arguments.measured.clone() });
     }
+    let of_nominal = Table { columns: arguments.nominal_columns.clone(), unit: arguments.nominal_unit };
+    let of_measured = Table { columns: arguments.columns.clone(), unit: arguments.unit };
     std::thread::scope(|scope| {
-        let nominal = scope.spawn(move || nominal::surface(path, projection));
-        let measured = read_measured_with_notes(&arguments.measured);
+        let nominal = scope.spawn(|| nominal::surface_as(path, projection, &of_nominal));
+        let measured = read_measured_with_notes(&arguments.measured, &of_measured);
         let nominal = nominal.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
         Ok((nominal, measured?))
     })

@@ -5,6 +5,176 @@
 //! of two groups of coordinates is a question, and a header that names no group at all is not taken for one in the usual order.
 
 use std::fmt;
+use std::str::FromStr;
+
+/// How a table is read where it does not say so itself, or says more than one thing.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Table {
+    /// Which columns are x, y and z; without it those that the header names.
+    pub columns: Option<Columns>,
+    /// The unit of the coordinates; without it the millimetre, and a table that states another one is refused.
+    pub unit: Option<Unit>,
+}
+
+/// Which columns of a table are x, y and z: `x=X_act,y=Y_act,z=Z_act` by their names, or `x=4,y=5,z=6` by their numbers from 1.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Columns([Column; 3]);
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum Column {
+    /// In lower case.
+    Named(String),
+    /// From 0.
+    Numbered(usize),
+}
+
+impl FromStr for Columns {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let expected = || format!("expected x=NAME,y=NAME,z=NAME, each a name or a number from 1, found `{text}`");
+        let mut found: [Option<Column>; 3] = [None, None, None];
+        for part in text.split(',') {
+            let (axis, column) = part.split_once('=').ok_or_else(expected)?;
+            let axis =
+                ["x", "y", "z"].iter().position(|of| axis.trim().eq_ignore_ascii_case(of)).ok_or_else(expected)?;
+            let column = match (column.trim(), column.trim().parse::<usize>()) {
+                ("", _) | (_, Ok(0)) => return Err(expected()),
+                (_, Ok(number)) => Column::Numbered(number - 1),
+                (name, Err(_)) => Column::Named(name.to_lowercase()),
+            };
+            if found[axis].replace(column).is_some() {
+                return Err(expected());
+            }
+        }
+        let [Some(x), Some(y), Some(z)] = found else { return Err(expected()) };
+        if x == y || y == z || x == z {
+            return Err(format!("`{text}` gives one column to two axes"));
+        }
+        Ok(Self([x, y, z]))
+    }
+}
+
+impl Columns {
+    /// Whether a header has all columns that are given by name, each once.
+    pub(super) fn are_in(&self, names: &[String]) -> bool {
+        self.0.iter().all(|column| match column {
+            Column::Named(_) => column.among(names).len() == 1,
+            Column::Numbered(_) => true,
+        })
+    }
+
+    /// Whether none is given by its name: no header is needed then.
+    pub(super) fn are_numbers(&self) -> bool {
+        self.0.iter().all(|column| matches!(column, Column::Numbered(_)))
+    }
+
+    /// Returns where they stand among so many columns, or says what is wrong with them.
+    pub(super) fn places(&self, names: &[String], count: usize) -> Result<[usize; 3], String> {
+        let mut places = [0; 3];
+        for (place, column) in places.iter_mut().zip(&self.0) {
+            *place = match (column, &column.among(names)[..]) {
+                (Column::Numbered(number), _) if *number < count => *number,
+                (Column::Numbered(number), _) => return Err(format!("has {count} columns, and none {}", number + 1)),
+                (Column::Named(_), [place]) => *place,
+                (Column::Named(name), found) => return Err(format!("names {} columns `{name}`", found.len())),
+            };
+        }
+        if places[0] == places[1] || places[1] == places[2] || places[0] == places[2] {
+            return Err("gives one column to two axes".to_owned());
+        }
+        Ok(places)
+    }
+}
+
+impl Column {
+    /// The columns of that name, with or without its unit.
+    fn among(&self, names: &[String]) -> Vec<usize> {
+        let Self::Named(wanted) = self else { return Vec::new() };
+        let is = |name: &String| name.trim() == wanted || split_unit(name).0 == wanted;
+        (0..names.len()).filter(|&column| is(&names[column])).collect()
+    }
+}
+
+/// A unit of length that tables are in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Unit {
+    /// 1e-6 mm.
+    Nanometre,
+    /// 1e-3 mm.
+    Micrometre,
+    /// The unit of everything here.
+    Millimetre,
+    /// 10 mm.
+    Centimetre,
+    /// 1000 mm.
+    Metre,
+    /// 25.4 mm.
+    Inch,
+}
+
+impl Unit {
+    const ALL: [Self; 6] =
+        [Self::Nanometre, Self::Micrometre, Self::Millimetre, Self::Centimetre, Self::Metre, Self::Inch];
+
+    /// Millimetres in one of them.
+    pub fn in_mm(self) -> f64 {
+        match self {
+            Self::Nanometre => 1e-6,
+            Self::Micrometre => 1e-3,
+            Self::Millimetre => 1.0,
+            Self::Centimetre => 10.0,
+            Self::Metre => 1000.0,
+            Self::Inch => 25.4,
+        }
+    }
+
+    /// The words for it, in lower case; the first is the one that it is asked for by.
+    fn words(self) -> &'static [&'static str] {
+        match self {
+            Self::Nanometre => &["nm", "nanometre", "nanometres", "nanometer", "nanometers"],
+            Self::Micrometre => &[
+                "um",
+                "\u{b5}m",
+                "\u{3bc}m",
+                "micron",
+                "microns",
+                "micrometre",
+                "micrometres",
+                "micrometer",
+                "micrometers",
+            ],
+            Self::Millimetre => &["mm", "millimetre", "millimetres", "millimeter", "millimeters"],
+            Self::Centimetre => &["cm", "centimetre", "centimetres", "centimeter", "centimeters"],
+            Self::Metre => &["m", "metre", "metres", "meter", "meters"],
+            Self::Inch => &["inch", "in", "inches", "zoll", "pouce", "pouces"],
+        }
+    }
+
+    /// Returns whether a word in lower case stands for it.
+    pub(super) fn is(self, word: &str) -> bool {
+        self.words().contains(&word)
+    }
+}
+
+impl FromStr for Unit {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let word = text.trim().to_lowercase();
+        let all = || Self::ALL.map(|unit| unit.words()[0]).join(", ");
+        Self::ALL
+            .into_iter()
+            .find(|unit| unit.is(&word))
+            .ok_or_else(|| format!("expected one of {}, found `{text}`", all()))
+    }
+}
+
+impl fmt::Display for Unit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.words()[0])
+    }
+}
 
 /// Points that a column belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -178,13 +348,13 @@ fn base_of(name: &str) -> &str {
     name.trim_end_matches([' ', '_', '-', '.', '/'])
 }
 
-pub(super) fn is_millimetre(unit: &str) -> bool {
-    ["mm", "millimetre", "millimetres", "millimeter", "millimeters"].contains(&unit)
+fn is_millimetre(unit: &str) -> bool {
+    Unit::Millimetre.is(unit)
 }
 
-/// Returns whether a word in lower case is a unit of length that is not the millimetre.
-pub(super) fn is_other_unit(word: &str) -> bool {
-    OTHER_UNITS.contains(&word)
+/// Returns whether a word in lower case is a unit of length.
+pub(super) fn is_unit(word: &str) -> bool {
+    is_millimetre(word) || OTHER_UNITS.contains(&word)
 }
 
 /// Units of length that are not the millimetre, in lower case.
@@ -244,6 +414,32 @@ mod tests {
         ] {
             assert!(axes(header).chosen(false).is_err(), "{header}");
         }
+    }
+
+    #[test]
+    fn columns_are_given_by_name_or_number() {
+        let names = ["nr", "x_nom", "x_act [mm]", "y_act", "z_act", "y_act"].map(str::to_owned);
+        let places = |text: &str| text.parse::<Columns>().unwrap().places(&names, 6);
+        assert_eq!(places("z=Z_act,x=X_act,y=4"), Ok([2, 3, 4]));
+        assert_eq!(places("x=2,y=3,z=1"), Ok([1, 2, 0]));
+        for wrong in ["x=X_act,y=Y_act,z=Z_act", "x=X_act,y=4,z=7", "x=none,y=4,z=5", "x=X_act,y=3,z=5"] {
+            assert!(places(wrong).is_err(), "{wrong}");
+        }
+        for wrong in
+            ["", "x=1,y=2", "x=1,y=2,z=2", "x=0,y=1,z=2", "x=1,y=2,z=3,z=4", "a=1,y=2,z=3", "x,y,z", "x=,y=2,z=3"]
+        {
+            assert!(wrong.parse::<Columns>().is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_unit_is_asked_for_by_any_of_its_words() {
+        for (word, in_mm) in
+            [("mm", 1.0), ("Inch", 25.4), ("zoll", 25.4), ("\u{b5}m", 1e-3), ("microns", 1e-3), ("m", 1000.0)]
+        {
+            assert_eq!(word.parse::<Unit>().map(Unit::in_mm), Ok(in_mm), "{word}");
+        }
+        assert!("waves".parse::<Unit>().is_err());
     }
 
     #[test]

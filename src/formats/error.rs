@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
+use super::columns::Unit;
 use super::number::LIMIT_MM;
 
 /// Why a file could not be read or written. Lines, columns and rows count from 1, bytes and vertices from 0; a place is a line or
@@ -87,20 +88,22 @@ pub enum FormatError {
     )]
     HeaderColumns { path: PathBuf, line: u64, found: usize, expected: usize, separator: &'static str },
     /// A header from which the three coordinates cannot be told.
-    #[error("{path}, line {line}: the header {reason}; name exactly one column each x, y and z")]
+    #[error(
+        "{path}, line {line}: the header {reason}; name exactly one column each x, y and z, or give --columns where a command takes it"
+    )]
     HeaderNames { path: PathBuf, line: u64, reason: String },
     /// A table of more columns than three, and nothing says which hold what.
     #[error(
-        "{path}, line {line}: {columns} columns without names, and x, y and z may be any of them; put a line above them that names the columns x, y \
-         and z"
+        "{path}, line {line}: {columns} columns without names, and x, y and z may be any of them; put a line above them that names \
+         them, or give --columns where a command takes it"
     )]
     UnnamedColumns { path: PathBuf, line: u64, columns: usize },
-    /// A unit other than the millimetre.
+    /// A unit other than the one that the table is read in.
     #[error(
-        "{path}, line {line}: expected coordinates in mm, found the unit {}; convert the file to mm",
+        "{path}, line {line}: expected coordinates in {unit}, found the unit {}; convert the file to {unit}, or give --unit where a command takes it",
         quoted(found)
     )]
-    Unit { path: PathBuf, line: u64, found: String },
+    Unit { path: PathBuf, line: u64, found: String, unit: Unit },
     /// A text file that stops in the middle.
     #[error(
         "{path}, line {line}: the file is cut in the middle of a line, found {}; copy or export it again",

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::path::Path;
 
-use super::columns::{Axes, is_millimetre, is_other_unit, split_unit};
+use super::columns::{Axes, Table, Unit, is_unit, split_unit};
 use super::error::{FormatError, excerpt};
 use super::number::{Decimal, Evidence, evidence, looks_numeric, without_blanks};
 
@@ -160,6 +160,8 @@ pub(super) struct Preamble<'p> {
     path: &'p Path,
     /// Whether the nominal points are looked for.
     of_nominal: bool,
+    /// What a person said of the table.
+    table: &'p Table,
     /// The last comment that names x, y and z: many programs comment their header out.
     comment: Option<(u64, Vec<u8>)>,
     header: Option<(u64, Vec<u8>)>,
@@ -168,8 +170,8 @@ pub(super) struct Preamble<'p> {
 }
 
 impl<'p> Preamble<'p> {
-    pub(super) fn new(path: &'p Path, of_nominal: bool) -> Self {
-        Self { path, of_nominal, comment: None, header: None, title: None }
+    pub(super) fn new(path: &'p Path, of_nominal: bool, table: &'p Table) -> Self {
+        Self { path, of_nominal, table, comment: None, header: None, title: None }
     }
 
     /// Returns the names of the columns in lower case, if a header gives each of them one.
@@ -203,14 +205,14 @@ impl<'p> Preamble<'p> {
     fn take_words(&mut self, line: &[u8], number: u64) -> Result<(), FormatError> {
         let likely = likely_separator(line);
         let fields: Vec<&[u8]> = Fields::of(line, likely).collect();
-        let has_header = self.header.as_ref().is_some_and(|(_, header)| is_understood(header));
+        let has_header = self.header.as_ref().is_some_and(|(_, header)| self.is_understood(header));
         if has_header && self.take_units(&fields, number)? {
             return Ok(());
         }
         if !has_header && !fields.iter().any(|field| looks_numeric(field)) {
             // Lines above the header are titles.
             self.header = Some((number, line.to_vec()));
-            if is_understood(line) {
+            if self.is_understood(line) {
                 self.title = None;
             }
             return Ok(());
@@ -239,23 +241,36 @@ impl<'p> Preamble<'p> {
         let path = self.path.to_owned();
         match (self.title.take(), &self.header) {
             (Some(title), _) => title,
-            (None, Some((number, header))) if !is_understood(header) => self.no_point(header, *number),
+            (None, Some((number, header))) if !self.is_understood(header) => self.no_point(header, *number),
             (None, Some(_)) => FormatError::NoData { path, expected: "points" },
             (None, None) => FormatError::Empty { path, expected: "points" },
         }
+    }
+
+    /// Whether a line names coordinates.
+    fn is_understood(&self, header: &[u8]) -> bool {
+        let names = names(header, likely_separator(header));
+        match &self.table.columns {
+            Some(columns) if columns.are_numbers() => names.len() > 2,
+            Some(columns) => columns.are_in(&names),
+            None => Axes::of(&names).are_named(),
+        }
+    }
+
+    /// Refuses a unit that a table states, unless it is the one that it is read in.
+    fn check_unit(&self, line: u64, found: String) -> Result<(), FormatError> {
+        let unit = self.table.unit.unwrap_or(Unit::Millimetre);
+        if unit.is(&found) { Ok(()) } else { Err(FormatError::Unit { path: self.path.to_owned(), line, found, unit }) }
     }
 
     /// Takes a line of units below a header; false where it is none.
     fn take_units(&self, fields: &[&[u8]], number: u64) -> Result<bool, FormatError> {
         let unit = |field: &[u8]| String::from_utf8_lossy(field).trim_matches(['[', ']', '(', ')', ' ']).to_lowercase();
         let units: Vec<String> = fields.iter().map(|field| unit(field)).filter(|unit| !unit.is_empty()).collect();
-        if units.is_empty() || !units.iter().all(|unit| is_millimetre(unit) || is_other_unit(unit)) {
+        if units.is_empty() || !units.iter().all(|unit| is_unit(unit)) {
             return Ok(false);
         }
-        match units.into_iter().find(|unit| !is_millimetre(unit)) {
-            Some(found) => Err(FormatError::Unit { path: self.path.to_owned(), line: number, found }),
-            None => Ok(true),
-        }
+        units.into_iter().try_for_each(|unit| self.check_unit(number, unit)).map(|()| true)
     }
 
     fn take_comment(&mut self, comment: &[u8], number: u64) -> Result<(), FormatError> {
@@ -264,9 +279,9 @@ impl<'p> Preamble<'p> {
         let start = text.iter().position(|&b| b != b'#').unwrap_or(text.len());
         let text = text[start..].trim_ascii();
         if let Some(unit) = unit_statement(text) {
-            return Err(FormatError::Unit { path: self.path.to_owned(), line: number, found: unit });
+            self.check_unit(number, unit)?;
         }
-        if is_understood(text) {
+        if self.is_understood(text) {
             self.comment = Some((number, text.to_vec()));
         }
         Ok(())
@@ -280,20 +295,28 @@ impl<'p> Preamble<'p> {
         data_line: u64,
     ) -> Result<[usize; 3], FormatError> {
         let path = || self.path.to_owned();
+        if let Some(columns) = self.table.columns.as_ref().filter(|columns| columns.are_numbers()) {
+            let refused = |reason| FormatError::HeaderNames { path: path(), line: data_line, reason };
+            return columns.places(&[], count).map_err(refused);
+        }
         let (line, names) = match (&self.header, &self.comment) {
             (Some((line, header)), _) => (*line, names(header, separator)),
             (None, Some((line, comment))) => {
                 let own = if comment.contains(&separator.byte()) { separator } else { Separator::Blank };
                 (*line, names(comment, own))
             }
+            (None, None) if self.table.columns.is_some() => (data_line, Vec::new()),
             (None, None) => {
                 let is_clear = count == 3 || (count == 6 && has_normal(data, separator));
                 let refused = FormatError::UnnamedColumns { path: path(), line: data_line, columns: count };
                 return if is_clear { Ok([0, 1, 2]) } else { Err(refused) };
             }
         };
-        let columns = Axes::of(&names).chosen(self.of_nominal);
-        if names.len() != count {
+        let columns = match &self.table.columns {
+            Some(columns) => columns.places(&names, count),
+            None => Axes::of(&names).chosen(self.of_nominal),
+        };
+        if names.len() != count && !names.is_empty() {
             // A comment may be a sentence that names the three columns of a table in their order.
             let is_sentence = self.header.is_none() && count == 3 && names.len() > count;
             if is_sentence && columns.as_ref().is_ok_and(|columns| columns.is_sorted()) {
@@ -310,19 +333,12 @@ impl<'p> Preamble<'p> {
         }
         let columns = columns.map_err(|reason| FormatError::HeaderNames { path: path(), line, reason })?;
         for name in columns.iter().filter_map(|&column| names.get(column)) {
-            if let (_, Some(unit)) = split_unit(name)
-                && !is_millimetre(&unit)
-            {
-                return Err(FormatError::Unit { path: path(), line, found: unit });
+            if let (_, Some(unit)) = split_unit(name) {
+                self.check_unit(line, unit)?;
             }
         }
         Ok(columns)
     }
-}
-
-/// Whether a line names coordinates.
-fn is_understood(header: &[u8]) -> bool {
-    Axes::of(&names(header, likely_separator(header))).are_named()
 }
 
 /// Whether the last three of six columns are a direction.
@@ -369,7 +385,7 @@ fn unit_statement(comment: &[u8]) -> Option<String> {
     let after = &text[text.find("unit")? + 4..];
     let after = after.strip_prefix('s').unwrap_or(after).trim_start().strip_prefix([':', '='])?.trim_start();
     let end = after.find(|c: char| !c.is_alphabetic()).unwrap_or(after.len());
-    is_other_unit(&after[..end]).then(|| after[..end].to_owned())
+    is_unit(&after[..end]).then(|| after[..end].to_owned())
 }
 
 #[cfg(test)]
@@ -411,7 +427,7 @@ mod tests {
     #[test]
     fn a_comment_states_a_unit() {
         assert_eq!(unit_statement(b"Units : Inch, made by hand"), Some("inch".to_owned()));
-        assert_eq!(unit_statement(b"unit = mm"), None);
+        assert_eq!(unit_statement(b"unit = mm"), Some("mm".to_owned()));
         assert_eq!(unit_statement(b"unity"), None);
     }
 }

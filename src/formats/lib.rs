@@ -36,6 +36,7 @@ pub mod x3p;
 
 use std::path::Path;
 
+pub use columns::{Columns, Table, Unit};
 pub use document::{
     Alternative, MeasuredInput, NominalInput, Program, RegistrationDocument, StandardUncertainty, save_registration,
 };
@@ -124,9 +125,19 @@ pub fn read_nominal_with_identity(path: impl AsRef<Path>) -> Result<(NominalFile
 /// # Errors
 /// Those of the format found.
 pub fn read_nominal(path: impl AsRef<Path>) -> Result<NominalFile, FormatError> {
+    read_nominal_as(path, &Table::default())
+}
+
+/// Reads a nominal surface as [`read_nominal`] does; of a table of points `table` says what it does not say of itself.
+///
+/// # Errors
+/// Those of [`read_nominal`], columns that are not there, and columns or a unit of what is no table.
+pub fn read_nominal_as(path: impl AsRef<Path>, table: &Table) -> Result<NominalFile, FormatError> {
     let path = path.as_ref();
-    Ok(match kind(path)? {
-        Kind::Text => NominalFile::Points(read_nominal_points(path)?),
+    let kind = kind(path)?;
+    check_is_table(path, &kind, table)?;
+    Ok(match kind {
+        Kind::Text => NominalFile::Points(read_nominal_points(path, table)?),
         Kind::Toml => NominalFile::Definition(read_definition(path)?),
         Kind::Stl => {
             let StlFile { points, triangles, .. } = read_stl(path)?;
@@ -155,26 +166,41 @@ pub fn read_nominal(path: impl AsRef<Path>) -> Result<NominalFile, FormatError> 
 /// # Errors
 /// Those of the format found, and a file that is STL or TOML.
 pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
-    read_measured_with_notes(path).map(|read| read.points)
+    read_measured_with_notes(path, &Table::default()).map(|read| read.points)
 }
 
-/// Reads measured points as [`read_measured`] does, with what the file leaves open.
+/// Reads measured points as [`read_measured`] does, with what the file leaves open; of a table `table` says what it does not say of itself.
 ///
 /// # Errors
-/// Those of [`read_measured`].
-pub fn read_measured_with_notes(path: impl AsRef<Path>) -> Result<NotedPoints, FormatError> {
+/// Those of [`read_measured`], columns that are not there, and columns or a unit of what is no table.
+pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
     let wrong = |found, remedy| {
         let expected = "measured points as text or PLY, or a map as X3P, SDF or MetroPro";
         Err(FormatError::WrongKind { path: path.to_owned(), expected, found, remedy })
     };
-    match kind(path)? {
-        Kind::Text => read_points_with_notes(path),
+    let kind = kind(path)?;
+    check_is_table(path, &kind, table)?;
+    match kind {
+        Kind::Text => read_points_with_notes(path, table),
         Kind::Ply => read_ply(path).map(|file| file.points.into()),
         Kind::Stl => wrong("an STL mesh", "export the points, or give the mesh as the nominal"),
         Kind::Toml => wrong("a TOML file", "give the definition as the nominal"),
         Kind::Map(format) => (format.read)(path).map(|map| map.points.into()),
     }
+}
+
+/// Refuses columns and a unit of a file that is no table.
+fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatError> {
+    if matches!(kind, Kind::Text) || *table == Table::default() {
+        return Ok(());
+    }
+    Err(FormatError::WrongKind {
+        path: path.to_owned(),
+        expected: "a table of points, of which columns and a unit can be given",
+        found: "a file that says both itself",
+        remedy: "leave --columns and --unit out",
+    })
 }
 
 /// Tells the kind of a file by its beginning, and by its extension where that leaves it open.

@@ -10,6 +10,7 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
+use super::columns::{Table, Unit};
 use super::error::{FormatError, excerpt};
 use super::layout::{Fields, Layout, Preamble, Separator, is_comment};
 use super::note::{NotedPoints, PointNote};
@@ -42,17 +43,18 @@ const SHARE: usize = 256 << 10;
 /// finite number of at most 1e7 mm where a coordinate should be; a header that states another unit than mm or whose columns
 /// x, y, z are not clear.
 pub fn read_points(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
-    read_points_with_notes(path).map(|read| read.points)
+    read_points_with_notes(path, &Table::default()).map(|read| read.points)
 }
 
-/// Reads the points of a nominal surface as [`read_points`] does; their columns may be called nominal.
+/// Reads the points of a nominal surface as [`read_points`] does; their columns may be called nominal. `table` says what the file does not.
 ///
 /// # Errors
-/// Those of [`read_points`].
-pub fn read_nominal_points(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
+/// Those of [`read_points`], and columns that are not there.
+pub fn read_nominal_points(path: impl AsRef<Path>, table: &Table) -> Result<Vec<Point>, FormatError> {
     let path = path.as_ref();
     let (file, length) = opened(path)?;
-    Cloud { preamble: Preamble::new(path, true), ..Cloud::new(path, length) }.read(file).map(|read| read.points)
+    let preamble = Preamble::new(path, true, table);
+    Cloud { preamble, ..Cloud::new(path, length, table) }.read(file).map(|read| read.points)
 }
 
 fn opened(path: &Path) -> Result<(File, u64), FormatError> {
@@ -62,14 +64,14 @@ fn opened(path: &Path) -> Result<(File, u64), FormatError> {
     Ok((file, length))
 }
 
-/// Reads a point cloud as [`read_points`] does, with what the file leaves open.
+/// Reads a point cloud as [`read_points`] does, with what the file leaves open; `table` says what it does not say of itself.
 ///
 /// # Errors
-/// Those of [`read_points`].
-pub fn read_points_with_notes(path: impl AsRef<Path>) -> Result<NotedPoints, FormatError> {
+/// Those of [`read_points`], and columns that are not there.
+pub fn read_points_with_notes(path: impl AsRef<Path>, table: &Table) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
     let (file, length) = opened(path)?;
-    Cloud::new(path, length).read(file)
+    Cloud::new(path, length, table).read(file)
 }
 
 /// Reads a point cloud from a stream of text; `path` is only what messages call it.
@@ -77,12 +79,12 @@ pub fn read_points_with_notes(path: impl AsRef<Path>) -> Result<NotedPoints, For
 /// # Errors
 /// Those of [`read_points`].
 pub fn parse_points(path: impl AsRef<Path>, reader: impl Read + Send) -> Result<Vec<Point>, FormatError> {
-    Cloud::new(path.as_ref(), 0).read(reader).map(|read| read.points)
+    Cloud::new(path.as_ref(), 0, &Table::default()).read(reader).map(|read| read.points)
 }
 
 /// Reads a point cloud whose decimal mark is known from elsewhere.
 pub(super) fn parse_points_with(path: &Path, text: &[u8], decimal: Option<Decimal>) -> Result<Vec<Point>, FormatError> {
-    Cloud { decimal, ..Cloud::new(path, 0) }.read(text).map(|read| read.points)
+    Cloud { decimal, ..Cloud::new(path, 0, &Table::default()) }.read(text).map(|read| read.points)
 }
 
 /// A cloud while it is being read.
@@ -90,6 +92,8 @@ struct Cloud<'p> {
     path: &'p Path,
     /// The decimal mark, where it need not be told from the file.
     decimal: Option<Decimal>,
+    /// Millimetres in its unit.
+    unit_mm: f64,
     /// Expected length of the file, for reserving memory only.
     length: u64,
     preamble: Preamble<'p>,
@@ -160,9 +164,10 @@ struct Share {
 }
 
 impl<'p> Cloud<'p> {
-    fn new(path: &'p Path, length: u64) -> Self {
-        let (preamble, points, grouped) = (Preamble::new(path, false), Vec::new(), Grouped::default());
-        Self { path, decimal: None, length, preamble, layout: None, lines: 0, points, grouped }
+    fn new(path: &'p Path, length: u64, table: &'p Table) -> Self {
+        let (preamble, points, grouped) = (Preamble::new(path, false, table), Vec::new(), Grouped::default());
+        let unit_mm = table.unit.map_or(1.0, Unit::in_mm);
+        Self { path, unit_mm, decimal: None, length, preamble, layout: None, lines: 0, points, grouped }
     }
 
     fn read(mut self, mut reader: impl Read + Send) -> Result<NotedPoints, FormatError> {
@@ -286,8 +291,11 @@ impl<'p> Cloud<'p> {
         Ok(rest)
     }
 
-    fn finish(self) -> Result<Vec<Point>, FormatError> {
+    fn finish(mut self) -> Result<Vec<Point>, FormatError> {
         if !self.points.is_empty() {
+            if self.unit_mm != 1.0 {
+                self.points.iter_mut().for_each(|point| point.coords *= self.unit_mm);
+            }
             return Ok(self.points);
         }
         Err(self.preamble.without_points())

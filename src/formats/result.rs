@@ -21,6 +21,7 @@ use std::path::Path;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::columns::Table;
 use super::error::excerpt;
 use super::height_map::MapPoints;
 use super::layout::{Fields, Layout, Preamble, is_comment};
@@ -383,7 +384,8 @@ impl Columns {
     /// Goes through the lines again for the columns that the header names; the points have been read from the same lines.
     fn read(path: &Path, text: &[u8], points: usize, decimal: Option<Decimal>) -> Result<Self, FormatError> {
         let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text);
-        let mut preamble = Preamble::new(path, false);
+        let table = Table::default();
+        let mut preamble = Preamble::new(path, false, &table);
         let mut lines = text.split(|&b| b == b'\n').map(|l| l.strip_suffix(b"\r").unwrap_or(l)).zip(1..);
         let (first, mut layout) = loop {
             let Some((line, number)) = lines.next() else { return Ok(Self::default()) };

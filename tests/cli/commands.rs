@@ -671,3 +671,37 @@ fn shells_and_man_know_every_command() {
         assert!(text.contains(words), "{page}: {text}");
     }
 }
+
+/// What most machines give out: the nominal points and the measured ones of a part side by side.
+#[test]
+fn columns_of_nominal_points_are_not_read_as_measured_and_a_person_says_which_are() {
+    let bench = Bench::new();
+    let plain = bench.registered("nominal.csv", "measured.csv", &[]);
+    let beside = |separator: &str| -> String {
+        let planned = nominal().iter().cycle().zip(measured());
+        let row =
+            |(n, m): (&Vec3, &Vec3)| n.iter().chain(m).map(f64::to_string).collect::<Vec<_>>().join(separator) + "\n";
+        planned.map(row).collect()
+    };
+    let by_name = "x=X_act,y=Y_act,z=Z_act";
+    fs::remove_dir_all(bench.path("out")).unwrap();
+    for (name, header) in [
+        ("both.csv", "X_nom,Y_nom,Z_nom,X_act,Y_act,Z_act\n"),
+        ("words.csv", "Nominal X,Nominal Y,Nominal Z,Measured X,Measured Y,Measured Z\n"),
+        ("remark.csv", "# X_nom,Y_nom,Z_nom,X_act,Y_act,Z_act\n"),
+        ("none.csv", ""),
+    ] {
+        bench.write(name, format!("{header}{}", beside(",")));
+        bench.refused("nominal.csv", name, &[], &["line 1", "--columns"]);
+        let told = if name == "both.csv" { by_name } else { "x=4,y=5,z=6" };
+        let found = bench.registered("nominal.csv", name, &["--columns", told]);
+        assert_eq!(pose(&found), pose(&plain), "{name}");
+        fs::remove_dir_all(bench.path("out")).unwrap();
+    }
+    bench.refused("nominal.csv", "both.csv", &["--columns", "x=X_ist,y=Y_act,z=Z_act"], &["x_ist"]);
+    // A table in inches that does not say so.
+    bench.write("inches.csv", rows(&scaled(measured(), 1.0 / 25.4), ","));
+    bench.write("nominal_inches.csv", format!("X_nom,Y_nom,Z_nom\n{}", rows(&scaled(nominal(), 1.0 / 25.4), ",")));
+    let found = bench.registered("nominal_inches.csv", "inches.csv", &["--unit", "inch", "--nominal-unit", "inch"]);
+    assert!((number(&found["rms_mm"]) / number(&plain["rms_mm"]) - 1.0).abs() < 1e-6, "{found}");
+}

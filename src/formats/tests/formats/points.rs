@@ -563,7 +563,7 @@ fn notes(content: &str) -> Vec<String> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("measured.csv");
     fs::write(&path, content).unwrap();
-    let read = read_measured_with_notes(&path).unwrap();
+    let read = read_measured_with_notes(&path, &Table::default()).unwrap();
     assert_eq!(read.points, read_points(&path).unwrap());
     let name = path.display().to_string();
     read.notes.iter().map(|note| note.to_string().strip_prefix(&name).expect("names the file").to_owned()).collect()
@@ -615,4 +615,47 @@ fn one_number_with_a_mark_between_its_thousands_is_noted() {
     assert_eq!(notes(&format!("{rows}1,5;1.234,5;3,5\n{rows}1,5;1.234,5;3,5\n")), [""; 0]);
     assert_eq!(notes("1.5;2.5;3.5\n1.5;1,234.5;3.5\n1.5;2.5;3.5\n").len(), 1);
     assert_eq!(notes("1.5,2.5,3.5\n1.5,2,3.5\n"), [""; 0]);
+}
+
+#[test]
+fn a_person_says_which_columns_are_read_and_in_which_unit() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("table.csv");
+    let read = |content: &str, columns: Option<&str>, unit: Option<Unit>| {
+        std::fs::write(&path, content).unwrap();
+        let table = Table { columns: columns.map(|columns| columns.parse().unwrap()), unit };
+        read_measured_with_notes(&path, &table).map(|read| read.points)
+    };
+    let both = "Nr,X_nom,Y_nom,Z_nom,X_act,Y_act,Z_act\n1,9,9,9,1.5,-2.25,3\n2,9,9,9,4,5.5,-1200.125\n";
+    let headless = "1.5 -2.25 3 0.1\n4 5.5 -1200.125 0.1\n";
+    for (content, columns) in [
+        (both, "x=X_act,y=Y_act,z=Z_act"),
+        (both, "x=5,y=6,z=7"),
+        (both, "x=x_act,y=6,z=Z_ACT"),
+        (headless, "x=1,y=2,z=3"),
+        ("left;right;up\n1.5;-2.25;3\n4;5.5;-1200.125\n", "x=left,y=right,z=up"),
+        ("made by hand, 20 degrees\nup;right [mm];left\n3;-2.25;1.5\n-1200.125;5.5;4\n", "x=left,y=right,z=up"),
+    ] {
+        assert_eq!(read(content, Some(columns), None).unwrap(), two_points(), "{content} {columns}");
+    }
+    let inches = |content: &str| read(content, None, Some(Unit::Inch));
+    let one = [Point::new(25.4, -50.8, 12.7)];
+    for content in [
+        "x,y,z\n1,-2,0.5\n",
+        "x [in],y [in],z [inch]\n1,-2,0.5\n",
+        "# units: inch\n1,-2,0.5\n",
+        "x,y,z\nZoll,Zoll,Zoll\n1,-2,0.5\n",
+    ] {
+        assert_eq!(inches(content).unwrap(), one, "{content}");
+    }
+    for content in ["x_mm,y_mm,z_mm\n1,-2,0.5\n", "# unit: mm\n1,-2,0.5\n"] {
+        assert!(matches!(inches(content), Err(FormatError::Unit { line: 1, unit: Unit::Inch, .. })), "{content}");
+    }
+    for (content, columns) in [(both, "x=X,y=Y_act,z=Z_act"), (headless, "x=1,y=2,z=5"), (headless, "x=a,y=b,z=c")] {
+        let refused = read(content, Some(columns), None);
+        assert!(matches!(refused, Err(FormatError::HeaderNames { .. })), "{columns}: {refused:?}");
+    }
+    // A file that says both itself.
+    let ply = "ply\nformat ascii 1.0\nelement vertex 1\nproperty double x\nproperty double y\nproperty double z\nend_header\n1 2 3\n";
+    assert!(matches!(read(ply, None, Some(Unit::Inch)), Err(FormatError::WrongKind { .. })));
 }
