@@ -20,7 +20,7 @@ const SPREAD: usize = 150;
 const DRIFTS: [f64; 3] = [0.3, 0.6, 0.85];
 const DRIFT_STEPS: [f64; 3] = [0.12, 0.06, 0.03];
 const MOST_DRIFT: f64 = 0.97;
-pub(super) const DRIFT_EVIDENCE: f64 = 2.0;
+const DRIFT_EVIDENCE: f64 = 2.0;
 /// The logarithm of the stretch of a lay at which the search begins, the most that is told, and by how much it has to be spoken for.
 const FIRST_STRETCH: f64 = 0.6;
 const MOST_STRETCHED: f64 = 10.0;

@@ -12,7 +12,7 @@ use nalgebra::{DMatrix, DVector, SymmetricEigen};
 use rayon::prelude::*;
 
 use super::fields::{Fields, Kind, Node, strengths};
-use super::kind::{DRIFT_EVIDENCE, kinds};
+use super::kind::kinds;
 use super::normals::Normals;
 use super::{Field, Hyper, ModelError, Observed, Priors, Smoothness};
 
@@ -35,7 +35,7 @@ pub(super) fn laid(observed: &Observed) -> Result<Fields, ModelError> {
     let Some(drifting) = drifting else { return Ok(fields) };
     let other = Fields::over(observed, drifting)?;
     let [without, with] = [&fields, &other].map(|of| Posterior::of(of, observed, None, None).log_likelihood());
-    Ok(if with > without + DRIFT_EVIDENCE { other } else { fields })
+    Ok(if with > without { other } else { fields })
 }
 
 /// What is known of the scatter of the probe beforehand: its size, and the standard deviation of the logarithm of that.
@@ -586,7 +586,7 @@ mod tests {
         let at = |k: usize| {
             [if (k / 30).is_multiple_of(2) { k % 30 } else { 29 - k % 30 }, k / 30].map(|at| 3.5 * at as f64)
         };
-        for drift in [0.0, 0.7] {
+        for drift in [0.0, 0.7, 0.9] {
             let planted = Hyper { drift, ..PLANTED };
             // Of a strong drift few independent touches are left, and how much it is spoken for is chance.
             const PARTS: u64 = 5;
