@@ -50,7 +50,7 @@ pub struct PartSpec {
     pub form_error_correlation_mm: f64,
     /// A job number that the grinder has not seen last means that somebody has put in a new blank.
     pub fresh_per_job: bool,
-    /// What happens to it.
+    /// Damage that comes to it after passes.
     pub defects: Vec<DefectSpec>,
 }
 

@@ -160,7 +160,7 @@ pub(super) struct Preamble<'p> {
     path: &'p Path,
     /// Whether the nominal points are looked for.
     of_nominal: bool,
-    /// What a person said of the table.
+    /// The columns and the unit that a person gave.
     table: &'p Table,
     /// The last comment that names x, y and z: many programs comment their header out.
     comment: Option<(u64, Vec<u8>)>,
@@ -208,6 +208,9 @@ impl<'p> Preamble<'p> {
         let has_header = self.header.as_ref().is_some_and(|(_, header)| self.is_understood(header));
         if has_header && self.take_units(&fields, number)? {
             return Ok(());
+        }
+        if !has_header && !self.is_understood(line) {
+            self.check_title(line, number)?;
         }
         if !has_header && !fields.iter().any(|field| looks_numeric(field)) {
             // Lines above the header are titles.
@@ -263,6 +266,24 @@ impl<'p> Preamble<'p> {
         if unit.is(&found) { Ok(()) } else { Err(FormatError::Unit { path: self.path.to_owned(), line, found, unit }) }
     }
 
+    /// Refuses a title that speaks of another unit, unless a person gave the unit.
+    fn check_title(&self, title: &[u8], number: u64) -> Result<(), FormatError> {
+        /// Shorter words may mean anything in a sentence.
+        const SHORTEST: usize = 4;
+        let text = String::from_utf8_lossy(title).to_lowercase();
+        let mut words = text.split(|c: char| !c.is_alphanumeric()).filter(|word| word.chars().count() >= SHORTEST);
+        match words.find(|word| is_unit(word) && !Unit::Millimetre.is(word)) {
+            Some(unit) if self.table.unit.is_none() => self.check_unit(number, unit.to_owned()),
+            _ => Ok(()),
+        }
+    }
+
+    /// The same of the units that a header states of some columns.
+    fn check_units(&self, line: u64, columns: [usize; 3], names: &[String]) -> Result<(), FormatError> {
+        let units = columns.iter().filter_map(|&column| split_unit(names.get(column)?).1);
+        units.into_iter().try_for_each(|unit| self.check_unit(line, unit))
+    }
+
     /// Takes a line of units below a header; false where it is none.
     fn take_units(&self, fields: &[&[u8]], number: u64) -> Result<bool, FormatError> {
         let unit = |field: &[u8]| String::from_utf8_lossy(field).trim_matches(['[', ']', '(', ')', ' ']).to_lowercase();
@@ -297,7 +318,13 @@ impl<'p> Preamble<'p> {
         let path = || self.path.to_owned();
         if let Some(columns) = self.table.columns.as_ref().filter(|columns| columns.are_numbers()) {
             let refused = |reason| FormatError::HeaderNames { path: path(), line: data_line, reason };
-            return columns.places(&[], count).map_err(refused);
+            let places = columns.places(&[], count).map_err(refused)?;
+            let header = self.header.as_ref().or(self.comment.as_ref());
+            let named = header.map(|(line, header)| (*line, names(header, separator))).filter(|of| of.1.len() == count);
+            return match named {
+                Some((line, names)) => self.check_units(line, places, &names).map(|()| places),
+                None => Ok(places),
+            };
         }
         let (line, names) = match (&self.header, &self.comment) {
             (Some((line, header)), _) => (*line, names(header, separator)),
@@ -332,11 +359,7 @@ impl<'p> Preamble<'p> {
             });
         }
         let columns = columns.map_err(|reason| FormatError::HeaderNames { path: path(), line, reason })?;
-        for name in columns.iter().filter_map(|&column| names.get(column)) {
-            if let (_, Some(unit)) = split_unit(name) {
-                self.check_unit(line, unit)?;
-            }
-        }
+        self.check_units(line, columns, &names)?;
         Ok(columns)
     }
 }

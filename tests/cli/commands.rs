@@ -672,7 +672,7 @@ fn shells_and_man_know_every_command() {
     }
 }
 
-/// What most machines give out: the nominal points and the measured ones of a part side by side.
+/// Most machines give out the nominal points and the measured ones of a part side by side.
 #[test]
 fn columns_of_nominal_points_are_not_read_as_measured_and_a_person_says_which_are() {
     let bench = Bench::new();

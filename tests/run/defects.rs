@@ -168,7 +168,7 @@ fn told(case: Case) -> Told {
 #[test]
 fn no_part_is_accepted_that_is_beyond_its_limits_where_it_was_touched() {
     let count = 8 * seeds(1);
-    // Of each recipe by turns the whole pattern and touches that are chosen, where few are drawn.
+    // Where few are drawn each recipe has one part, the whole pattern and chosen touches by turns.
     let drawn: Vec<u64> = (0..count).filter(|number| all() || (number / 2 + number) % 2 == 0).collect();
     let next = AtomicU64::new(0);
     let take = || {

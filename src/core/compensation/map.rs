@@ -98,7 +98,7 @@ pub struct ErrorMap {
 ///
 /// Shapes: readings in any order. Frames: x and y of the model frame. Units: millimetres. Equation: weighted least squares of a
 /// polynomial at every node with weights exp(-pi (r / (alpha cutoff))^2), see [`Order::alpha`]; or the smoothing spline. Of what two neighbouring
-/// readings found far from the surface around the Gaussian filter leaves half at least, however narrow it is. A cut-off that is
+/// readings found far from the surface around the Gaussian filter leaves half at least, unless less than an eighth of it passes at once. A cut-off that is
 /// short for the wheel or the distance of the points is no error but is said in [`ErrorMap::advice`].
 ///
 /// # Errors
@@ -151,11 +151,11 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
     Ok(ErrorMap { advice, ..map }.advised(options, readings.len(), apart_mm))
 }
 
-/// Lets what the filter leaves of features go through it again, until half of each is in what was filtered.
+/// Lets what the filter leaves of features go through it again, until half of each is in the filtered surface.
 ///
 /// `features` are numbers of readings, with their heights over the surface around. A chip that two targets lie on is narrower than the filter.
 fn hold_features(filtered: &mut Filtered, gaussian: &Gaussian, kept: &Kept, features: &[(usize, f64)]) {
-    /// Of readings so dense that a feature passes by an eighth only, it takes so many.
+    /// A feature of which an eighth passes at a time is held after so many. Readings that are denser hold less of it.
     const MOST_TIMES: usize = 8;
     /// More than half, for between the nodes of the map there is less than at the readings.
     const HELD: f64 = 0.65;

@@ -446,7 +446,7 @@ fn is_seen(posterior: &Posterior) -> bool {
     posterior.evidence > EVIDENCE
 }
 
-/// What is given where a form is told from below: that all of the scatter is the probe's, where it may be.
+/// Takes all of the scatter for that of the probe, where it may be: by this a form is told from below.
 ///
 /// A reference sphere that was touched some twenty times tells the scatter of the probe to 15 %. What the points scatter by more need be no form.
 fn least_form(posterior: &Posterior, given: &Given) -> Given {

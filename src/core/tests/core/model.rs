@@ -453,14 +453,14 @@ fn a_scatter_that_the_sphere_may_have_missed_is_not_told_as_form() {
         let part = part(seed, 1e-3);
         let [unstated_mm, chance_mm, form_mm] = [part.model.figures.rms.low_mm, low_mm(&part, 0.8), low_mm(&part, 0.4)];
         println!("seed {seed}: from below {unstated_mm:.3e}, {chance_mm:.3e}, {form_mm:.3e} mm");
-        // Of a probe that is known to scatter far less the rest is form.
+        // A probe is known to scatter far less: the rest is form.
         assert!(form_mm > 1.04 * unstated_mm, "{form_mm} {unstated_mm}");
         told += (chance_mm - unstated_mm) / (form_mm - unstated_mm) / parts as f64;
     }
     assert!(told < 0.09, "{told}");
 }
 
-/// Of 16 points 10 degrees of freedom are left, which tell no form from scatter: the upper end holds the form of the whole part then.
+/// 16 points leave 10 degrees of freedom, which tell no form from scatter: the upper end holds the form of the whole part then.
 #[test]
 fn too_few_points_have_the_upper_ends_of_a_form_that_is_all_of_what_was_found() {
     let (mut held, parts) = (0, parts());

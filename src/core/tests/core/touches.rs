@@ -135,7 +135,7 @@ fn what_is_narrower_than_the_touches_are_apart_is_in_the_figures() {
     let rough = Part::new(3, 1e-9, |x, y| 5e-4 * (f64::sin(9.1 * x) * f64::cos(7.7 * y)).signum());
     let (first, last) = apart(&rough, 120);
     let told = rough.form(&[first.clone(), last.clone()].concat()).figures;
-    // Of a thousand places that were not touched the outermost one at either end is left out of PV 99.8 %.
+    // PV 99.8 % leaves out the outermost one at either end of a thousand places that were not touched.
     let many = rough.targets.repeat(1500_usize.div_ceil(rough.targets.len()));
     let FormFigures { pv, pv_most_points, .. } =
         Form::over(&rough.measured(&[first.clone(), last.clone()].concat()), &given(), &many).unwrap().figures;

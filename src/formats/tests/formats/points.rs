@@ -109,6 +109,8 @@ fn a_fault_is_named_with_place_finding_and_remedy() {
         ("# y, x, z, q\n1,2,3\n", "line 1: the header has 4 columns separated by comma, the data under it has 3"),
         ("1,2,3,1,2,3\n", "line 1: 6 columns without names"),
         ("7,1,2,3\n", "line 1: 4 columns without names"),
+        ("all dimensions in inches\nx,y,z\n1,2,3\n", "line 1: expected coordinates in mm, found the unit `inches`"),
+        ("Part 7, Zoll\nx,y,z\n1,2,3\n", "line 1: expected coordinates in mm, found the unit `zoll`"),
         ("x,y,z\nmm,mm,um\n1,2,3\n", "line 2: expected coordinates in mm, found the unit `um`"),
         ("1,2,3\n0x10,2,3\n", "found `0x10`"),
         ("1,2,3\n1,2,3mm\n", "line 2, column 3: expected a number in millimetres, found `3mm`"),
@@ -651,6 +653,9 @@ fn a_person_says_which_columns_are_read_and_in_which_unit() {
     for content in ["x_mm,y_mm,z_mm\n1,-2,0.5\n", "# unit: mm\n1,-2,0.5\n"] {
         assert!(matches!(inches(content), Err(FormatError::Unit { line: 1, unit: Unit::Inch, .. })), "{content}");
     }
+    // Numbers say nothing of the unit that the header states.
+    let metres = read("a [m],b [m],c [m]\n1,2,3\n", Some("x=1,y=2,z=3"), None);
+    assert!(matches!(metres, Err(FormatError::Unit { line: 1, .. })), "{metres:?}");
     for (content, columns) in [(both, "x=X,y=Y_act,z=Z_act"), (headless, "x=1,y=2,z=5"), (headless, "x=a,y=b,z=c")] {
         let refused = read(content, Some(columns), None);
         assert!(matches!(refused, Err(FormatError::HeaderNames { .. })), "{columns}: {refused:?}");
