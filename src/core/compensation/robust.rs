@@ -7,7 +7,7 @@
 //! reading in the value at its place, and the variance v of that value, a residual r has the variance sigma^2 (1 - 2 l + v);
 //! z = r / sqrt(1 - 2 l + v) scatters alike everywhere. Sigma is 1.4826 median |z|. What has |z| above the limit is an outlier
 //! unless one of its eight neighbours is off to the same side too, by half the limit and a quarter of the height at least: that is a feature of
-//! the part, or dirt as large as one, and no point rule can tell which. As the surface leans towards a wide feature, heights are also told from
+//! the part, or dirt as large as one, and no point rule can tell which. A place that is touched again is not its own neighbour. As the surface leans towards a wide feature, heights are also told from
 //! the plane through what was read around.
 
 use nalgebra::{Matrix3, Vector3};
@@ -36,6 +36,8 @@ const SHARE_OF_HEIGHT: f64 = 0.25;
 const AROUND: usize = 48;
 /// What is within so many distances of neighbours along both axes is a neighbour: eight are, on a grid.
 const NEIGHBOUR: f64 = 1.5;
+/// What is nearer than so many distances along both axes is the same place, touched again: it says nothing of what is around.
+const SAME_PLACE: f64 = 0.25;
 
 /// The robust filter's result.
 #[derive(Clone, Debug)]
@@ -174,16 +176,25 @@ impl Robust {
     /// Whether one of the eight neighbours is off too, to the same side; `off` is sorted along x.
     fn is_feature(&self, n: usize, off: &[usize], places: &[[f64; 2]], apart: [f64; 2]) -> bool {
         let k = off[n];
-        let reach = apart.map(|a| NEIGHBOUR * a);
-        let away = |j: usize, axis: usize| (places[j][axis] - places[k][axis]).abs();
+        let away = |j: usize| [0, 1].map(|axis| places[j][axis] - places[k][axis]);
         let agrees = |j: &usize| {
-            away(*j, 1) <= reach[1]
+            is_beside(away(*j), apart)
                 && self.scaled[*j] * self.scaled[k].signum() >= SHARE_OF_HEIGHT * self.scaled[k].abs()
         };
-        let mut before = off[..n].iter().rev().take_while(|j| away(**j, 0) <= reach[0]);
-        let mut after = off[n + 1..].iter().take_while(|j| away(**j, 0) <= reach[0]);
+        let in_reach = |j: &&usize| away(**j)[0].abs() <= NEIGHBOUR * apart[0];
+        let mut before = off[..n].iter().rev().take_while(in_reach);
+        let mut after = off[n + 1..].iter().take_while(in_reach);
         before.any(agrees) || after.any(agrees)
     }
+}
+
+/// Whether a place so far away along x and y is that of a neighbour, neither the same place nor beyond the eight around it.
+fn is_beside(away: [f64; 2], apart: [f64; 2]) -> bool {
+    is_within(away, apart, NEIGHBOUR) && !is_within(away, apart, SAME_PLACE)
+}
+
+fn is_within(away: [f64; 2], apart: [f64; 2], distances: f64) -> bool {
+    (0..2).all(|axis| away[axis].abs() <= distances * apart[axis])
 }
 
 /// Readings by their places.
@@ -200,8 +211,8 @@ impl Around<'_> {
         let own = on_plane(&self.places[k]);
         let near = self.tree.to(&own, AROUND as u32 + 1).map(|(other, _)| other).filter(|other| *other != k);
         let away = |other: usize| [0, 1].map(|a| self.places[other][a] - self.places[k][a]);
-        let is_beside = |other: &usize| (0..2).all(|a| away(*other)[a].abs() <= NEIGHBOUR * self.apart[a]);
-        let (beside, around): (Vec<usize>, Vec<usize>) = near.partition(is_beside);
+        let (near, around): (Vec<usize>, Vec<usize>) =
+            near.partition(|other| is_within(away(*other), self.apart, NEIGHBOUR));
         let row = |other: usize| {
             let [x, y] = away(other);
             Vector3::new(1.0, x, y)
@@ -213,7 +224,8 @@ impl Around<'_> {
         }
         let Some(plane) = gram.cholesky().map(|gram| gram.solve(&right)) else { return false };
         let height = |of: usize| side * (self.values[of] - row(of).dot(&plane));
-        beside.iter().any(|&other| height(other) >= least.max(SHARE_OF_HEIGHT * height(k)))
+        let agrees = |other: usize| height(other) >= least.max(SHARE_OF_HEIGHT * height(k));
+        near.into_iter().any(|other| is_beside(away(other), self.apart) && agrees(other))
     }
 }
 

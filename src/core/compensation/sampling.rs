@@ -7,6 +7,8 @@ use crate::geometry::Sample;
 
 /// Readings whose neighbours are looked up for the spacing; more would not change a median.
 const PROBED: usize = 50;
+/// Readings nearer to each other than this share of the spacing that all would have on a square grid are one place, touched again.
+const SAME_PLACE: f64 = 0.02;
 
 /// Returns the width over which a wheel touches a flat surface, in millimetres: 2 sqrt(2 R a - a^2).
 ///
@@ -37,9 +39,9 @@ pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_
 
 /// Estimates the distance between neighbouring readings in millimetres, in the direction in which it is larger.
 ///
-/// Around a reading the nearest other one is looked for in each of four sectors, about +x, -x, +y and -y. The median over
-/// readings is taken for x and y apart: rows that are dense along and sparse across give the distance across. 0 where
-/// there are too few readings to tell.
+/// Around a reading the nearest other place is looked for in each of four sectors, about +x, -x, +y and -y. The median over
+/// readings is taken for x and y apart: rows that are dense along and sparse across give the distance across. A place that
+/// was touched again is one place. 0 where there are too few readings to tell.
 pub fn point_spacing_mm(readings: &[Sample]) -> f64 {
     let [x, y] = point_spacings_mm(readings);
     x.max(y)
@@ -49,7 +51,9 @@ pub fn point_spacing_mm(readings: &[Sample]) -> f64 {
 pub(super) fn point_spacings_mm(readings: &[Sample]) -> [f64; 2] {
     let step = readings.len().div_ceil(PROBED).max(1);
     let chosen: Vec<&Sample> = readings.iter().step_by(step).collect();
-    let nearest: Vec<[f64; 4]> = chosen.par_iter().map(|from| nearest_by_sector(from.at_mm, readings)).collect();
+    let same_mm = SAME_PLACE * square_spacing_mm(readings);
+    let nearest: Vec<[f64; 4]> =
+        chosen.par_iter().map(|from| nearest_by_sector(from.at_mm, readings, same_mm)).collect();
     let median = |sectors: [usize; 2]| {
         let mut found: Vec<f64> =
             nearest.iter().flat_map(|n| sectors.map(|s| n[s])).filter(|d| d.is_finite()).collect();
@@ -59,15 +63,23 @@ pub(super) fn point_spacings_mm(readings: &[Sample]) -> [f64; 2] {
     [median([0, 1]), median([2, 3])]
 }
 
-/// Returns the distances of the nearest readings about +x, -x, +y and -y; infinite where there is none.
-fn nearest_by_sector([x, y]: [f64; 2], readings: &[Sample]) -> [f64; 4] {
+/// Returns the spacing that so many readings would have on a square grid over the same box.
+fn square_spacing_mm(readings: &[Sample]) -> f64 {
+    let [width, depth] = [0, 1].map(|axis| {
+        let along = readings.iter().map(|r| r.at_mm[axis]);
+        along.clone().fold(f64::NEG_INFINITY, f64::max) - along.fold(f64::INFINITY, f64::min)
+    });
+    (width.max(0.0) * depth.max(0.0) / readings.len().max(1) as f64).sqrt()
+}
+
+/// Returns the distances of the nearest other places about +x, -x, +y and -y; infinite where there is none.
+fn nearest_by_sector([x, y]: [f64; 2], readings: &[Sample], same_mm: f64) -> [f64; 4] {
     let mut nearest2 = [f64::INFINITY; 4];
     for r in readings {
         let (dx, dy) = (r.at_mm[0] - x, r.at_mm[1] - y);
         let sector = if dx.abs() >= dy.abs() { usize::from(dx < 0.0) } else { 2 + usize::from(dy < 0.0) };
         let distance2 = dx * dx + dy * dy;
-        // The same place measured twice is not a neighbour.
-        if distance2 > 0.0 && distance2 < nearest2[sector] {
+        if distance2 > same_mm * same_mm && distance2 < nearest2[sector] {
             nearest2[sector] = distance2;
         }
     }
@@ -97,6 +109,9 @@ mod tests {
         assert!((point_spacing_mm(&grid(500, 12, [0.1, 4.0])) - 4.0).abs() < 1e-12);
         assert_eq!(point_spacing_mm(&grid(1, 1, [1.0, 1.0])), 0.0);
         assert_eq!(point_spacing_mm(&[]), 0.0);
+        let again = |r: Sample| [0.0, 0.3, 0.6].map(|beside| Sample { at_mm: r.at_mm.map(|x| x + beside), ..r });
+        let thrice: Vec<Sample> = grid(20, 20, [260.0, 260.0]).into_iter().flat_map(again).collect();
+        assert!((point_spacing_mm(&thrice) - 260.0).abs() < 1.0, "{}", point_spacing_mm(&thrice));
     }
 
     #[test]
