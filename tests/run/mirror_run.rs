@@ -178,7 +178,8 @@ fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confir
     assert_eq!(correction.len(), (json["columns"].as_u64().unwrap() * json["rows"].as_u64().unwrap()) as usize);
     let largest_um = correction.iter().fold(0.0f64, |most, v| most.max(1e3 * v.abs()));
     println!("{} nodes, up to {largest_um:.1} um", correction.len());
-    assert!(largest_um > 20.0 && largest_um < 400.0);
+    // One target lies 630 um low in three touches, and one beside it agrees: half of that is in the map.
+    assert!(largest_um > 20.0 && largest_um < 500.0);
     assert!(folder.join("cycle-1/error_map.csv").is_file());
     // The word of a person who works by another map is not taken.
     program.until("a pass that is under way", |_| match shop.confirm("started", "00000000") {

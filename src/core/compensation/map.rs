@@ -161,10 +161,16 @@ fn hold_features(filtered: &mut Filtered, gaussian: &Gaussian, kept: &Kept, feat
     const HELD: f64 = 0.65;
     for _ in 0..MOST_TIMES {
         let mut left = vec![0.0; kept.values.len()];
-        for &(k, _) in features {
-            left[k] = kept.values[k] - filtered.at(kept.places[k]).map_or(kept.values[k], |[value, ..]| value);
+        let mut all_held = true;
+        for &(k, height) in features {
+            let own = kept.values[k] - filtered.at(kept.places[k]).map_or(kept.values[k], |[value, ..]| value);
+            // A feature that is held already does not grow while others are.
+            if own * height.signum() > (1.0 - HELD) * height.abs() {
+                left[k] = own;
+                all_held = false;
+            }
         }
-        if features.iter().all(|&(k, height)| left[k].abs() <= (1.0 - HELD) * height.abs()) {
+        if all_held {
             return;
         }
         let more = gaussian.scattered(&kept.places, &left, None, &filtered.grid);
