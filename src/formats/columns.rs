@@ -5,7 +5,10 @@
 //! of two groups of coordinates is a question, and a header that names no group at all is not taken for one in the usual order.
 
 use std::fmt;
+use std::path::Path;
 use std::str::FromStr;
+
+use super::error::FormatError;
 
 /// How a table is read where it does not say so itself, or says more than one thing.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -147,7 +150,7 @@ impl Unit {
             Self::Millimetre => &["mm", "millimetre", "millimetres", "millimeter", "millimeters"],
             Self::Centimetre => &["cm", "centimetre", "centimetres", "centimeter", "centimeters"],
             Self::Metre => &["m", "metre", "metres", "meter", "meters"],
-            Self::Inch => &["inch", "in", "inches", "zoll", "pouce", "pouces"],
+            Self::Inch => &["inch", "in", "inches", "zoll", "pouce", "pouces", "pulgadas"],
         }
     }
 
@@ -357,17 +360,76 @@ pub(super) fn is_unit(word: &str) -> bool {
     is_millimetre(word) || OTHER_UNITS.contains(&word)
 }
 
+/// Returns the unit that a title or a comment states: "units: inch", "UNITS/INCH", "all dimensions in inches".
+///
+/// A statement counts before a word. Short words may mean anything in a sentence: only those of four letters are taken for units there.
+pub(super) fn stated_unit(text: &str) -> Option<String> {
+    const SHORTEST: usize = 4;
+    let text = text.to_lowercase();
+    unit_statement(&text).or_else(|| {
+        let words = text.split(|c: char| !c.is_alphanumeric());
+        let mut long = words.filter(|word| word.chars().count() >= SHORTEST);
+        long.find(|word| is_unit(word) && !is_millimetre(word)).map(str::to_owned)
+    })
+}
+
+/// Returns the unit behind a word such as "units:", if one stands there.
+fn unit_statement(text: &str) -> Option<String> {
+    let behind = text.match_indices("unit").map(|(at, word)| &text[at + word.len()..]);
+    behind
+        .filter_map(|after| {
+            let after = after.strip_prefix(['s', 'e']).unwrap_or(after);
+            let marked = after.trim_start().strip_prefix([':', '=', '/']).map(str::trim_start);
+            // "unit in use" names no inch.
+            let rest = marked.or_else(|| after.strip_prefix([' ', '(', '[']))?;
+            let end = rest.find(|c: char| !c.is_alphabetic()).unwrap_or(rest.len());
+            let word = &rest[..end];
+            let is_meant = marked.is_some() || rest[end..].trim_matches([' ', ')', ']']).is_empty();
+            (is_meant && is_unit(word)).then(|| word.to_owned())
+        })
+        .next()
+}
+
+/// Refuses a file of millimetres whose header states another unit.
+pub(super) fn check_stated_unit(path: &Path, line: u64, header: &[u8]) -> Result<(), FormatError> {
+    match stated_unit(&String::from_utf8_lossy(header)) {
+        Some(found) if !is_millimetre(&found) => {
+            Err(FormatError::Unit { path: path.to_owned(), line, found, unit: Unit::Millimetre })
+        }
+        _ => Ok(()),
+    }
+}
+
 /// Units of length that are not the millimetre, in lower case.
 #[rustfmt::skip]
-const OTHER_UNITS: [&str; 36] = [
+const OTHER_UNITS: [&str; 38] = [
     "m", "metre", "metres", "meter", "meters", "dm", "cm", "centimetre", "centimetres", "centimeter", "centimeters", "km", "um", "\u{b5}m", "\u{3bc}m", "micron", "microns",
     "micrometre", "micrometres", "micrometer", "micrometers", "nm", "nanometre", "nanometres", "nanometer", "nanometers", "in", "inch", "inches", "ft", "feet", "mil", "mils", "thou",
-    "zoll", "pouce",
+    "zoll", "pouce", "pouces", "pulgadas",
 ];
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_comment_states_a_unit() {
+        let cases = [
+            ("Units : Inch, made by hand", Some("inch")),
+            ("unit = mm", Some("mm")),
+            ("UNITS/INCH", Some("inch")),
+            ("all dimensions in inches", Some("inches")),
+            ("Einheit: Zoll", Some("zoll")),
+            ("units: mm, converted from inches", Some("mm")),
+            ("unit in", Some("in")),
+            ("unit in use since May", None),
+            ("unity", None),
+            ("x in mm", None),
+        ];
+        for (text, unit) in cases {
+            assert_eq!(stated_unit(text).as_deref(), unit, "{text}");
+        }
+    }
 
     fn axes(header: &str) -> Axes {
         let names: Vec<String> = header.split(',').map(str::to_lowercase).collect();

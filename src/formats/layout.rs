@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::path::Path;
 
-use super::columns::{Axes, Table, Unit, is_unit, split_unit};
+use super::columns::{Axes, Table, Unit, is_unit, split_unit, stated_unit};
 use super::error::{FormatError, excerpt};
 use super::number::{Decimal, Evidence, evidence, looks_numeric, without_blanks};
 
@@ -183,7 +183,7 @@ impl<'p> Preamble<'p> {
     /// Takes the next line and returns the layout if it is the first with data.
     pub(super) fn take(&mut self, line: &[u8], number: u64) -> Result<Option<Layout>, FormatError> {
         let content = line.trim_ascii();
-        if content.is_empty() {
+        if content.is_empty() || (number == 1 && is_separator_line(content)) {
             return Ok(None);
         }
         if is_comment(content) {
@@ -268,12 +268,8 @@ impl<'p> Preamble<'p> {
 
     /// Refuses a title that speaks of another unit, unless a person gave the unit.
     fn check_title(&self, title: &[u8], number: u64) -> Result<(), FormatError> {
-        /// Shorter words may mean anything in a sentence.
-        const SHORTEST: usize = 4;
-        let text = String::from_utf8_lossy(title).to_lowercase();
-        let mut words = text.split(|c: char| !c.is_alphanumeric()).filter(|word| word.chars().count() >= SHORTEST);
-        match words.find(|word| is_unit(word) && !Unit::Millimetre.is(word)) {
-            Some(unit) if self.table.unit.is_none() => self.check_unit(number, unit.to_owned()),
+        match stated_unit(&String::from_utf8_lossy(title)) {
+            Some(unit) if self.table.unit.is_none() => self.check_unit(number, unit),
             _ => Ok(()),
         }
     }
@@ -299,7 +295,7 @@ impl<'p> Preamble<'p> {
         let text = text.strip_prefix(b"//").unwrap_or(text).trim_ascii_start();
         let start = text.iter().position(|&b| b != b'#').unwrap_or(text.len());
         let text = text[start..].trim_ascii();
-        if let Some(unit) = unit_statement(text) {
+        if let Some(unit) = stated_unit(&String::from_utf8_lossy(text)) {
             self.check_unit(number, unit)?;
         }
         if self.is_understood(text) {
@@ -402,13 +398,15 @@ fn names(header: &[u8], separator: Separator) -> Vec<String> {
     names
 }
 
-/// Returns the unit a comment such as "units: inch" states, if it is not the millimetre.
-fn unit_statement(comment: &[u8]) -> Option<String> {
-    let text = String::from_utf8_lossy(comment).to_lowercase();
-    let after = &text[text.find("unit")? + 4..];
-    let after = after.strip_prefix('s').unwrap_or(after).trim_start().strip_prefix([':', '='])?.trim_start();
-    let end = after.find(|c: char| !c.is_alphabetic()).unwrap_or(after.len());
-    is_unit(&after[..end]).then(|| after[..end].to_owned())
+/// Whether a line says which byte separates the columns, as Excel writes it: `sep=;`.
+pub(super) fn is_separator_line(line: &[u8]) -> bool {
+    let line = line.trim_ascii();
+    line.len() <= 5 && line.get(..4).is_some_and(|word| word.eq_ignore_ascii_case(b"sep="))
+}
+
+/// Whether lines have nothing but empty columns, or the mark that once ended a text.
+pub(super) fn are_empty_rows(lines: &[u8], separator: Separator) -> bool {
+    lines.iter().all(|b| b"\"\x1a \t\r\n".contains(b) || separator.separates(*b))
 }
 
 #[cfg(test)]
@@ -445,12 +443,5 @@ mod tests {
         }
         assert_eq!(data_separator(b"x,y,z"), None);
         assert_eq!(data_separator(b"1,2"), None);
-    }
-
-    #[test]
-    fn a_comment_states_a_unit() {
-        assert_eq!(unit_statement(b"Units : Inch, made by hand"), Some("inch".to_owned()));
-        assert_eq!(unit_statement(b"unit = mm"), Some("mm".to_owned()));
-        assert_eq!(unit_statement(b"unity"), None);
     }
 }

@@ -9,6 +9,7 @@ mod document;
 mod error;
 mod figures;
 mod folder;
+mod foreign;
 mod form_document;
 pub mod gcode;
 mod height_map;
@@ -68,6 +69,7 @@ pub use whole::read_whole;
 pub use x3p::{MapRecord, X3pFile, escaped, parse_x3p, read_x3p, write_error_map_x3p, write_x3p};
 
 use height_map::MapFormat;
+use layout::is_separator_line;
 use measured_map::map_format;
 use regrind_core::geometry::Point;
 
@@ -207,6 +209,7 @@ fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatE
 fn kind(path: &Path) -> Result<Kind, FormatError> {
     let opened = whole::open(path)?;
     let (head, length) = (&opened.head[..], opened.length);
+    foreign::check_is_ours(path, head)?;
     if ply::is_ply(head) {
         return Ok(Kind::Ply);
     }
@@ -240,12 +243,15 @@ fn first_words(head: &[u8]) -> Option<&[u8]> {
 /// Returns whether a file begins with `[table]` or `key = value`.
 fn is_toml(head: &[u8]) -> bool {
     let Some(line) = first_words(head) else { return false };
-    let is_key = |b: &u8| b.is_ascii_alphanumeric() || b"_-.\"' ".contains(b);
+    let is_key = |b: &u8| b.is_ascii_alphanumeric() || b"_-.".contains(b);
     let table = line.strip_prefix(b"[").and_then(|rest| rest.split(|&b| b == b']').next());
-    let key = line.iter().position(|&b| b == b'=').map(|at| &line[..at]);
+    // `sep=;` is a table of Excel.
+    let key =
+        line.iter().position(|&b| b == b'=').map(|at| line[..at].trim_ascii()).filter(|_| !is_separator_line(line));
     let opens_table = line.contains(&b']')
-        && table.is_some_and(|name| !name.is_empty() && name.iter().all(|b| is_key(b) || *b == b'['));
-    opens_table || key.is_some_and(|key| !key.is_empty() && key.iter().all(is_key))
+        && table.is_some_and(|name| !name.is_empty() && name.iter().all(|b| is_key(b) || b"[\"' ".contains(b)));
+    let is_quoted = |key: &[u8]| key.starts_with(b"\"") && key.len() > 1 && key.ends_with(b"\"");
+    opens_table || key.is_some_and(|key| !key.is_empty() && (key.iter().all(is_key) || is_quoted(key)))
 }
 
 fn read_definition(path: &Path) -> Result<String, FormatError> {

@@ -7,6 +7,7 @@
 use std::cell::{Cell, RefCell};
 use std::path::Path;
 
+use super::columns::check_stated_unit;
 use super::error::{FormatError, excerpt};
 use super::number::{any_number, is_believable};
 use super::whole::{is_degenerate, open};
@@ -163,7 +164,8 @@ impl Header {
                     let known = "format ascii, binary_little_endian or binary_big_endian";
                     encoding = Some(Encoding::named(name).ok_or_else(|| fault(known))?);
                 }
-                [b"comment" | b"obj_info", ..] | [] => {}
+                [b"comment" | b"obj_info", ..] => check_stated_unit(path, number, line)?,
+                [] => {}
                 _ if encoding.is_none() => return Err(fault("`format ascii 1.0` or another format")),
                 [b"end_header"] => break,
                 _ => header.declare(&words).map_err(fault)?,

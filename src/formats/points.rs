@@ -12,7 +12,8 @@ use rayon::prelude::*;
 
 use super::columns::{Table, Unit};
 use super::error::{FormatError, excerpt};
-use super::layout::{Fields, Layout, Preamble, Separator, is_comment};
+use super::foreign::{check_is_ours, is_utf16};
+use super::layout::{Fields, Layout, Preamble, Separator, are_empty_rows, is_comment};
 use super::note::{NotedPoints, PointNote};
 use super::number::{Decimal, NumberFault, coordinate, digits_after, has_both_marks, is_believable, looks_numeric};
 use regrind_core::geometry::Point;
@@ -100,6 +101,8 @@ struct Cloud<'p> {
     layout: Option<Layout>,
     /// Lines done.
     lines: u64,
+    /// The first of the rows of empty cells behind the last point.
+    empty_from: Option<u64>,
     points: Vec<Point>,
     grouped: Grouped,
 }
@@ -167,7 +170,18 @@ impl<'p> Cloud<'p> {
     fn new(path: &'p Path, length: u64, table: &'p Table) -> Self {
         let (preamble, points, grouped) = (Preamble::new(path, false, table), Vec::new(), Grouped::default());
         let unit_mm = table.unit.map_or(1.0, Unit::in_mm);
-        Self { path, unit_mm, decimal: None, length, preamble, layout: None, lines: 0, points, grouped }
+        Self {
+            path,
+            unit_mm,
+            decimal: None,
+            length,
+            preamble,
+            layout: None,
+            lines: 0,
+            empty_from: None,
+            points,
+            grouped,
+        }
     }
 
     fn read(mut self, mut reader: impl Read + Send) -> Result<NotedPoints, FormatError> {
@@ -212,7 +226,7 @@ impl<'p> Cloud<'p> {
         /// Lines above that its digits are compared with, and how many have to be there.
         const ABOVE: usize = 1000;
         const LEAST: usize = 3;
-        let (layout, point) = (self.layout.as_ref()?, *self.points.last()?);
+        let (layout, point) = (self.layout.as_ref()?, *self.points.last().filter(|_| self.empty_from.is_none())?);
         let mut lines = text.rsplit(|&b| b == b'\n');
         let last =
             lines.next().filter(|line| line.last().is_some_and(|b| !b.is_ascii_whitespace()) && !is_comment(line))?;
@@ -245,6 +259,11 @@ impl<'p> Cloud<'p> {
     fn take(&mut self, text: &[u8], bytes_so_far: u64) -> Result<(), FormatError> {
         let rest = self.take_preamble(text)?;
         let Some(layout) = &self.layout else { return self.check_preamble(bytes_so_far) };
+        if let Some(line) = self.empty_from {
+            let (path, column, found) = (self.path.to_owned(), layout.columns[0] + 1, String::new());
+            let not_the_end = FormatError::NotANumber { path, line, column, found };
+            return if are_empty_rows(rest, layout.separator) { Ok(()) } else { Err(not_the_end) };
+        }
         let mut shares: Vec<Share> = if rest.len() <= SHARE {
             vec![read_share(rest, layout)]
         } else {
@@ -255,8 +274,14 @@ impl<'p> Cloud<'p> {
             self.grouped.add(std::mem::take(&mut share.grouped), self.lines);
             self.lines += share.lines;
             if let Some(bad) = share.bad {
-                let (line, _, ended) = first_line(&rest[offset + bad..]);
-                return careful_line(self.path, self.lines + 1, line, layout, ended).map(|_| ());
+                let rest = &rest[offset + bad..];
+                let (line, _, ended) = first_line(rest);
+                // Rows of empty cells end a sheet.
+                if !are_empty_rows(rest, layout.separator) {
+                    return careful_line(self.path, self.lines + 1, line, layout, ended).map(|_| ());
+                }
+                self.empty_from = Some(self.lines + 1);
+                break;
             }
             offset += text.len();
         }
@@ -316,13 +341,26 @@ impl<'p> Cloud<'p> {
 
     /// Tells text from anything else by the first bytes.
     fn check_head(&self, head: &[u8]) -> Result<(), FormatError> {
-        if head.starts_with(b"\xff\xfe") || head.starts_with(b"\xfe\xff") {
+        check_is_ours(self.path, head)?;
+        if is_utf16(head) {
             return Err(FormatError::Utf16 { path: self.path.to_owned() });
         }
-        let Some(at) = head.iter().position(|&b| b < b' ' && !b.is_ascii_whitespace()) else { return Ok(()) };
+        let text = without_end_of_file(head);
+        if text.contains(&b'\r') && !text.contains(&b'\n') {
+            let (expected, found) = ("lines that end with LF or CR LF", "lines that end with CR alone");
+            let remedy = "save the file with one of those line ends";
+            return Err(FormatError::WrongKind { path: self.path.to_owned(), expected, found, remedy });
+        }
+        let Some(at) = text.iter().position(|&b| b < b' ' && !b.is_ascii_whitespace()) else { return Ok(()) };
         let line = 1 + head[..at].iter().filter(|&&b| b == b'\n').count() as u64;
         Err(FormatError::NotText { path: self.path.to_owned(), line, value: head[at] })
     }
+}
+
+/// Leaves out the marks that once ended a text.
+fn without_end_of_file(text: &[u8]) -> &[u8] {
+    let end = text.iter().rposition(|b| *b != 0x1a && !b.is_ascii_whitespace()).map_or(0, |at| at + 1);
+    if text[end..].contains(&0x1a) { &text[..end] } else { text }
 }
 
 /// Reads until the buffer is full or the stream ends; returns how much it read.

@@ -7,6 +7,7 @@
 use std::path::Path;
 
 use super::error::{FormatError, excerpt};
+use super::foreign::check_is_ours;
 use super::height_map::{HeightMap, MapFormat, check_size};
 use super::whole::{MOST_BYTES, open};
 use regrind_core::geometry::Grid;
@@ -50,14 +51,14 @@ fn check_version(path: &Path, head: &[u8]) -> Result<(), FormatError> {
     if is_sdf(head) {
         return Ok(());
     }
+    check_is_ours(path, head)?;
     Err(unexpected(path, "byte 0", "aISO-1.0 or bISO-1.0", excerpt(&head[..head.len().min(8)])))
 }
 
 /// Returns whether a file begins like SDF.
 fn is_sdf(head: &[u8]) -> bool {
     let version = head.get(..8).unwrap_or_default();
-    matches!(version.first(), Some(b'a' | b'b'))
-        && [&b"ISO-1.0"[..], b"BCR-0.0", b"BCR-1.0"].contains(&version.get(1..).unwrap_or_default())
+    matches!(version.first(), Some(b'a' | b'b')) && version[1..] == b"ISO-1.0"[..]
 }
 
 fn unexpected(path: &Path, place: &str, expected: &str, found: impl Into<String>) -> FormatError {

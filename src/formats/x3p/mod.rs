@@ -222,7 +222,12 @@ impl<'a> Container<'a> {
         }
         match folders.len() {
             1 => Ok(Self { path, zip, folder: folders.remove(0) }),
-            0 => Err(FormatError::Missing { path: path.to_owned(), expected: "main.xml".to_owned() }),
+            0 => Err(FormatError::WrongKind {
+                path: path.to_owned(),
+                expected: "an X3P map, whose main.xml says what it holds",
+                found: "a zip archive without one",
+                remedy: "unpack it and give the file that is in it, or export the map again",
+            }),
             _ => Err(FormatError::Unexpected {
                 path: path.to_owned(),
                 place: "the container".to_owned(),

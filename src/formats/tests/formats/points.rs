@@ -69,6 +69,64 @@ fn every_separator_and_header_is_understood() {
 }
 
 #[test]
+fn what_a_spreadsheet_leaves_around_a_table_is_no_data() {
+    let forms: &[&str] = &[
+        "sep=;\nX;Y;Z\n1,5;-2,25;3\n4;5,5;-1200,125\n",
+        "x,y,z\r\n1.5,-2.25,3\r\n4,5.5,-1200.125\r\n,,\r\n,,\r\n",
+        "x;y;z\n1.5;-2.25;3\n4;5.5;-1200.125\n;;\n\n\"\";\"\";\"\"\n",
+        "1.5,-2.25,3\n4,5.5,-1200.125\n\x1a",
+        "1.5 -2.25 3\r\n4 5.5 -1200.125\r\n\x1a\r\n",
+    ];
+    for form in forms {
+        assert_eq!(text(form).unwrap_or_else(|e| panic!("{e}\n{form}")), two_points(), "{form}");
+    }
+    // A row of empty cells between points is a point that was lost.
+    let between = "x,y,z\n1,2,3\n,,\n4,5,6\n";
+    assert!(matches!(text(between), Err(FormatError::NotANumber { line: 3, column: 1, .. })), "{:?}", text(between));
+    let far = format!("1,2,3\n,,\n{}4,5,6\n", ",,\n".repeat(2_000_000));
+    assert!(matches!(text(far), Err(FormatError::NotANumber { line: 2, column: 1, .. })));
+    assert!(matches!(text("1,2,3\r4,5,6\r"), Err(FormatError::WrongKind { .. })));
+    let wide: Vec<u8> = "x\ty\tz\r\n1\t2\t3\r\n".bytes().flat_map(|b| [b, 0]).collect();
+    assert!(matches!(text(wide), Err(FormatError::Utf16 { .. })));
+}
+
+#[test]
+fn a_unit_in_any_words_is_not_read_over() {
+    let stated = [
+        "# all dimensions in inches\nx,y,z\n1,2,3\n",
+        "// UNITS/INCH\n1,2,3\n",
+        "# Einheit: Zoll\n1 2 3\n",
+        "All dimensions in inches\nx,y,z\n1,2,3\n",
+        "# units = um\n1,2,3\n",
+    ];
+    for content in stated {
+        assert!(matches!(text(content), Err(FormatError::Unit { line: 1, .. })), "{content} {:?}", text(content));
+    }
+    let mesh = |comment: &str| {
+        format!(
+            "ply\nformat ascii 1.0\ncomment {comment}\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n"
+        )
+    };
+    let ply = |comment: &str| parse_ply(Path::new("m.ply"), mesh(comment).as_bytes()).map(|file| file.points.len());
+    assert!(matches!(ply("units inches"), Err(FormatError::Unit { line: 3, .. })));
+    assert!(matches!((ply("units: mm"), ply("an inch"), ply("a part")), (Ok(1), Err(_), Ok(1))));
+    let facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n";
+    let stl =
+        |name: &str| parse_stl(Path::new("m.stl"), format!("solid {name}\n{facet}endsolid\n").as_bytes()).map(|_| ());
+    assert!(stl("UNITS=mm").is_ok() && matches!(stl("UNITS=in"), Err(FormatError::Unit { line: 1, .. })));
+}
+
+#[test]
+fn a_file_of_another_program_is_called_by_its_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let step = folder.path().join("surface.csv");
+    fs::write(&step, "ISO-10303-21;\nHEADER;\n").unwrap();
+    assert!(matches!(read_nominal(&step), Err(FormatError::WrongKind { found: "a STEP file", .. })));
+    assert!(matches!(read_measured(&step), Err(FormatError::WrongKind { found: "a STEP file", .. })));
+    assert!(matches!(read_points(&step), Err(FormatError::WrongKind { found: "a STEP file", .. })));
+}
+
+#[test]
 fn a_fault_is_named_with_place_finding_and_remedy() {
     let cases: &[(&str, &str)] = &[
         ("", "measured.csv: the file is empty, expected points; export it again"),

@@ -1,0 +1,210 @@
+//! Files of other programs that are not read, told by their first bytes, each with what to do.
+
+use std::path::Path;
+
+use super::error::FormatError;
+
+/// A file that is not read, and how its content gets here all the same.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Foreign {
+    /// With its article.
+    pub found: &'static str,
+    pub remedy: &'static str,
+}
+
+/// What is read instead of it.
+const EXPECTED: &str = "points as text or PLY, a mesh, or a map as X3P, SDF or MetroPro";
+
+const AS_TEXT: &str = "save the sheet with the points as CSV";
+const UNPACK: &str = "unpack it and give the file that is in it";
+const SAMPLE: &str = "sample the surface as points in the CAD system, or export a mesh as STL or PLY";
+const DEFINE: &str = "write the equation of the surface into a definition (TOML), or export points as text";
+const MAP: &str = "export the map as X3P, or as SDF of version 1.0";
+
+/// First bytes that nothing else has.
+const BEGINNINGS: [(&[u8], &str, &str); 20] = [
+    (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "a workbook of an old Excel, or another file of Office (xls)", AS_TEXT),
+    (b"\x1f\x8b", "a file packed by gzip", UNPACK),
+    (b"BZh", "a file packed by bzip2", UNPACK),
+    (b"\xfd7zXZ\0", "a file packed by xz", UNPACK),
+    (b"\x28\xb5\x2f\xfd", "a file packed by zstd", UNPACK),
+    (b"7z\xbc\xaf\x27\x1c", "a 7z archive", UNPACK),
+    (b"Rar!\x1a\x07", "a RAR archive", UNPACK),
+    (
+        b"\x89HDF\r\n\x1a\n",
+        "an HDF5 file (.datx of Zygo Mx is one)",
+        "export .dat (MetroPro) or X3P from the instrument's program, or points as text",
+    ),
+    (b"%PDF", "a PDF", "export the points as text"),
+    (b"\x89PNG", "a picture", "export the heights as X3P or SDF, or points as text"),
+    (b"\xff\xd8\xff", "a picture", "export the heights as X3P or SDF, or points as text"),
+    (b"II*\0", "a TIFF picture", "export the heights as X3P or SDF, or points as text"),
+    (b"MM\0*", "a TIFF picture", "export the heights as X3P or SDF, or points as text"),
+    (b"ISO-10303-21;", "a STEP file", SAMPLE),
+    (b"DMISMN/", "a DMIS program", "give the results that it writes, as DMIS output or as points in a table"),
+    (b"DMISMD/", "a DMIS program", "give the results that it writes, as DMIS output or as points in a table"),
+    (b"Wyko ASCII Data File", "an ASCII map of Wyko Vision", MAP),
+    (b"Zygo XYZ Data File", "an XYZ map of Zygo", "save the map as .dat (MetroPro) or X3P"),
+    (b"Zygo ASCII Data File", "an ASCII map of Zygo", "save the map as .dat (MetroPro) or X3P"),
+    (b"BEGIN PGM", "a program in Klartext", "give the measured points"),
+];
+
+/// Tells a file that is not read by its first bytes.
+pub(super) fn foreign(head: &[u8]) -> Option<Foreign> {
+    let plain = narrowed(head);
+    let text = plain.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&plain).trim_ascii_start();
+    let begins = BEGINNINGS.iter().find(|(bytes, ..)| text.starts_with(bytes) || head.starts_with(bytes));
+    let begins = begins.map(|(_, found, remedy)| Foreign { found, remedy });
+    begins.or_else(|| packed(head)).or_else(|| by_lines(text)).or_else(|| surface_data(head))
+}
+
+/// Refuses a file of another program.
+pub(super) fn check_is_ours(path: &Path, head: &[u8]) -> Result<(), FormatError> {
+    let Some(Foreign { found, remedy }) = foreign(head) else { return Ok(()) };
+    Err(FormatError::WrongKind { path: path.to_owned(), expected: EXPECTED, found, remedy })
+}
+
+/// Whether text has two bytes a character, with or without the mark that says so.
+pub(super) fn is_utf16(head: &[u8]) -> bool {
+    /// So many characters are looked at.
+    const LOOKED_AT: usize = 200;
+    if head.starts_with(b"\xff\xfe") || head.starts_with(b"\xfe\xff") {
+        return true;
+    }
+    let pairs = || head.chunks_exact(2).take(LOOKED_AT);
+    // ASCII in two bytes: every second one is 0. A cut off last byte does not matter.
+    let is_wide = |zero: usize| pairs().all(|pair| pair[zero] == 0 && matches!(pair[1 - zero], b'\t'..=b'\r' | b' '..));
+    head.len() > 3 && (is_wide(0) || is_wide(1))
+}
+
+/// The first bytes of text, one a character.
+fn narrowed(head: &[u8]) -> std::borrow::Cow<'_, [u8]> {
+    if is_utf16(head) { head.iter().copied().filter(|b| (1..0x80).contains(b)).collect() } else { head.into() }
+}
+
+/// Tells what a zip container holds by the names of its first entries; X3P is one too.
+fn packed(head: &[u8]) -> Option<Foreign> {
+    const LOCAL: &[u8] = b"PK\x03\x04";
+    /// Where the length of a name and the name stand.
+    const LENGTH: usize = 26;
+    const NAME: usize = 30;
+    if !head.starts_with(LOCAL) {
+        return None;
+    }
+    let entries = head.windows(LOCAL.len()).enumerate().filter(|(_, window)| *window == LOCAL).map(|(at, _)| at);
+    let names: Vec<&[u8]> = entries
+        .filter_map(|at| {
+            let length = u16::from_le_bytes([*head.get(at + LENGTH)?, *head.get(at + LENGTH + 1)?]);
+            head.get(at + NAME..at + NAME + usize::from(length))
+        })
+        .collect();
+    let has = |begin: &str| names.iter().any(|name| name.starts_with(begin.as_bytes()));
+    let office = [
+        ("main.xml", None),
+        ("3D/", Some(("a 3MF mesh", "export the mesh as STL or PLY"))),
+        ("word/", Some(("a Word document", "export the points as text"))),
+        ("xl/", Some(("an Excel workbook (xlsx)", AS_TEXT))),
+        ("[Content_Types].xml", Some(("an Excel workbook (xlsx), or another file of Office", AS_TEXT))),
+        ("mimetype", Some(("a spreadsheet (ODS), or another open document", AS_TEXT))),
+    ];
+    let (_, found) = office.into_iter().find(|(begin, _)| has(begin))?;
+    found.map(|(found, remedy)| Foreign { found, remedy })
+}
+
+/// Tells text by its first lines.
+fn by_lines(text: &[u8]) -> Option<Foreign> {
+    /// Where the letter of a section stands in a line of IGES.
+    const SECTION: usize = 72;
+    let mut lines = text.split(|&b| b == b'\n').map(<[u8]>::trim_ascii_end);
+    let (first, second) = (lines.next()?, lines.next().unwrap_or_default());
+    let tail = first.get(SECTION..).unwrap_or_default();
+    let is_iges = tail.first() == Some(&b'S') && tail[1..].iter().all(|b| b.is_ascii_digit() || *b == b' ');
+    let words = |line: &'static str| first.starts_with(line.as_bytes());
+    let numbers = |line: &[u8]| -> Option<Vec<f64>> {
+        let fields = line.split(u8::is_ascii_whitespace).filter(|field| !field.is_empty());
+        fields.map(|field| fast_float2::parse(field).ok()).collect()
+    };
+    // Seven numbers of a grid, and rows of a height, its slopes and its twist.
+    let is_sag = numbers(first).zip(numbers(second)).is_some_and(|(grid, row)| {
+        grid.len() == 7 && grid[..2].iter().all(|n| n.fract() == 0.0 && *n > 1.0) && matches!(row.len(), 4 | 5)
+    });
+    let has = |word: &[u8]| text.windows(word.len()).any(|window| window == word);
+    let (found, remedy) = if is_iges {
+        ("an IGES file", SAMPLE)
+    } else if words("VERS ") && has(b"SURF 0") {
+        ("a lens file of Zemax (.zmx)", DEFINE)
+    } else if second.starts_with(b"GRD ") {
+        ("an interferogram file of Code V (.int)", "export points as text, or the map as X3P")
+    } else if is_sag {
+        ("a grid of sags of Zemax (.dat)", "write x, y and the height of each node as a table of three columns")
+    } else if words("DIM ") && first.contains(&b'=') {
+        ("a report of PC-DMIS", "export the measured points as a table of x, y and z")
+    } else if first.starts_with(b"<") && has(b"<QIFDocument") {
+        ("a QIF document", "export the measured points as a table of x, y and z")
+    } else if words("<?xml") {
+        ("an XML file", "export the points as text, one point a line")
+    } else {
+        return None;
+    };
+    Some(Foreign { found, remedy })
+}
+
+/// Tells surface data files of versions whose heights do not have the meaning of version 1.0.
+fn surface_data(head: &[u8]) -> Option<Foreign> {
+    const AGAIN: &str = "export it as SDF of version 1.0 (ISO), or as X3P";
+    let version = head.get(1..8).filter(|_| matches!(head[0], b'a' | b'b' | b'A' | b'B'))?.to_ascii_uppercase();
+    let found = match &version[..] {
+        b"BCR-0.0" | b"BCR-1.0" => {
+            "SDF of 1993 (BCR-1.0), in which neither the mark of a height that was not measured nor the direction of the profiles is fixed"
+        }
+        b"ISO-2.0" => "SDF version 2.0",
+        _ => return None,
+    };
+    Some(Foreign { found, remedy: AGAIN })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn other_files_are_called_by_their_names() {
+        let step = b"ISO-10303-21;\nHEADER;\n";
+        let iges = format!("{:72}S      1\n1H,,1H;\n", "case");
+        let wide: Vec<u8> = b"VERS 1\nMODE SEQ\nSURF 0\n".iter().flat_map(|b| [*b, 0]).collect();
+        let marked: Vec<u8> = [b"\xff\xfe".to_vec(), wide.clone()].concat();
+        let sheet = |name: &str| {
+            let length = (name.len() as u16).to_le_bytes();
+            [b"PK\x03\x04".to_vec(), vec![0; 22], length.to_vec(), vec![0; 2], name.as_bytes().to_vec()].concat()
+        };
+        let cases: [(&[u8], &str); 14] = [
+            (step, "STEP"),
+            (iges.as_bytes(), "IGES"),
+            (&wide, "Zemax"),
+            (&marked, "Zemax"),
+            (&sheet("xl/workbook.xml"), "xlsx"),
+            (&sheet("[Content_Types].xml"), "xlsx"),
+            (b"\x1f\x8b\x08", "gzip"),
+            (b"\x89HDF\r\n\x1a\n\0", "datx"),
+            (b"! grid\nGRD 5 5 SUR WVL 0.6328\n1 2 3\n", "Code V"),
+            (b"5 5 5.0 5.0 0 0.0 0.0\n2.0e-03 0 0 0\n", "sags"),
+            (b"DIM LOC1= LOCATION OF POINT PNT1\n", "PC-DMIS"),
+            (b"<?xml version=\"1.0\"?>\n<QIFDocument>", "QIF"),
+            (b"aBCR-1.0\n", "BCR-1.0"),
+            (b"bISO-2.0\n", "2.0"),
+        ];
+        for (head, name) in cases {
+            assert!(foreign(head).is_some_and(|foreign| foreign.found.contains(name)), "{name}: {:?}", foreign(head));
+        }
+    }
+
+    #[test]
+    fn what_is_read_is_not_foreign() {
+        let x3p = b"PK\x03\x04\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\x08\0\0\0main.xml";
+        let dense = b"5 5 5 5 0 0 0\n5 5 5 5 0 0 0\n";
+        for head in [&x3p[..], b"1,2,3\n", b"aISO-1.0\n", b"x,y,z\n1,2,3\n", b"ply\n", dense, b"", b"DIM x y\n", b"S"] {
+            assert_eq!(foreign(head), None, "{head:?}");
+        }
+        assert!(!is_utf16(b"1,2,3\n") && !is_utf16(b"\0\0\0\0\0\0") && is_utf16(b"x\0\t\0y\0"));
+    }
+}
