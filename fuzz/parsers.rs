@@ -17,7 +17,9 @@ use regrind::config::CellConfig;
 use regrind::device::exchange::Wanted as WantedResult;
 use regrind::document::Problems;
 use regrind::drive::{Reply, Request};
-use regrind::formats::gcode::{AlongNormals, Amendment, MapBase, correct_program, read_program_map};
+use regrind::formats::gcode::{
+    AlongNormals, Amendment, MapBase, MapKind, ProgramMap, correct_program, read_program_map,
+};
 use regrind::formats::result::{Content, Coordinates, DecimalMark, LengthUnit, check_ended, parse_result};
 use regrind::formats::{
     HeightMap, LIMIT_MM, Learned, X3pFile, parse_metropro, parse_ply, parse_points, parse_sdf, parse_stl, parse_x3p,
@@ -218,19 +220,24 @@ pub fn program(bytes: &[u8]) -> bool {
     let shift = Field::spline(grid, &values);
     let plane = Field::spline(grid, &vec![0.0; grid.len()]);
     let nominal = Wanted::new(plane, &Correction::none(grid, 0.0), 1.0).expect("finite values");
+    let map = ProgramMap {
+        grid,
+        values_mm: values,
+        valid: vec![true; grid.len()],
+        kind: MapKind::Correction,
+        identity: [7; 32],
+        part: None,
+        base: MapBase::Anything,
+        simulation: true,
+    };
     let mut is_read = false;
     for along_normals in [None, Some(AlongNormals { nominal: &nominal, centre_above_mm: 5.0 })] {
-        let amendment = Amendment {
-            shift: &shift,
-            along_normals,
-            tolerance_mm: 1e-3,
-            map_identity: [7; 32],
-            part: None,
-            base: MapBase::Anything,
-            gain: 1.0,
-            simulation: true,
-        };
-        if let Ok(amended) = correct_program(&base, &out, &amendment) {
+        let amendment =
+            Amendment { shift: &shift, along_normals, tolerance_mm: 1e-3, map: &map, gain: 1.0, largest_mm: 0.5 };
+        let amended = correct_program(&base, &out, &amendment);
+        // The two interpreters agree on whatever is not refused.
+        assert!(!amended.as_ref().is_err_and(|error| error.to_string().contains("please report it")), "{amended:?}");
+        if let Ok(amended) = amended {
             assert!(amended.largest_mm.is_finite());
             let text = fs::read_to_string(&out).expect("the program that was written");
             let words = text.lines().filter(|line| !line.contains(['(', ';']));

@@ -5,7 +5,9 @@ use std::path::PathBuf;
 use clap::Args;
 use regrind::compensation::Correction;
 use regrind::compensation::path::{Wanted, height_of, spline_of};
-use regrind::formats::gcode::{AlongNormals, Amendment, MapKind, correct_program, read_program_map};
+use regrind::formats::gcode::{
+    AlongNormals, Amended, Amendment, GcodeError, MapKind, correct_program, is_same_file, read_program_map,
+};
 use regrind::geometry::Grid;
 use regrind::surface::Projection;
 use serde::Serialize;
@@ -41,6 +43,9 @@ pub(super) struct Arguments {
     /// How far the new program may be from the corrected path, in um
     #[arg(long, value_name = "UM", default_value_t = 0.1, value_parser = finite_above_zero)]
     tolerance_um: f64,
+    /// The largest correction that is applied, in um: a map in another unit is refused by it
+    #[arg(long, value_name = "UM", default_value_t = 500.0, value_parser = finite_above_zero)]
+    largest_correction_um: f64,
     /// Print JSON instead of a summary
     #[arg(long)]
     json: bool,
@@ -55,9 +60,16 @@ x and y of the map are those of the program's work coordinates (G54): the model 
 and the program moves its centre, or its lowest point with --tip-of-radius.
 
 Straight moves at feed are divided where the correction changes along them. An arc stays an arc where the correction
-is the same all along it, else it becomes chords. Rapid moves (G0) and moves in machine coordinates (G53) stay as they
-are. Refused, with their line: variables, O-words, canned cycles, cutter compensation, G92 and other moved zeros, inverse
-time, rotary axes, a change of the work coordinates on the way. Comments are kept, line numbers are not.
+is the same all along it, else it becomes chords. Rapid moves (G0), moves in machine coordinates (G53) and ways to the
+reference point (G28, G30) stay as they are; the axes that they move are not known after them, nor is Z after a change
+of the tool's length (G43, G49), nor any axis after M6 or another zero. A move at feed from an axis that is not known is
+refused. Refused too, with their line: a word that has no meaning in its line, variables, O-words, canned cycles, cutter
+compensation, G92 and other moved zeros, inverse time, axes that turn away from 0, a change of the work coordinates on
+the way. Comments are kept, line numbers are not.
+
+A program without a move at feed is refused, one whose moves at feed all lie beside the map, and a correction of more
+than --largest-correction-um. Lengths beside the map are told: there its outermost values are levelled off within five
+nodes. Before the new program gets its name its lines are read again by other means and held against base and map.
 
 The new program names the hash of the old one and of the map. Refused are a program that names the map already, a map of another
 part, an error that was measured after a pass with another correction than the program has in it, and a correction.csv, which is
@@ -72,10 +84,16 @@ struct Document<'a> {
     simulation: bool,
     out: &'a std::path::Path,
     #[serde(flatten)]
-    amended: regrind::formats::gcode::Amended,
+    amended: Amended,
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let others = [Some(&arguments.map), arguments.nominal.as_ref()];
+    if let Some(path) = others.into_iter().flatten().find(|path| is_same_file(path, &arguments.out)) {
+        let what = "the corrected program would take the place of this file".to_owned();
+        let path = path.clone();
+        return Err(Failure::Program(GcodeError::Program { path, what, remedy: "give another name to --out" }));
+    }
     let map = read_program_map(&arguments.map).map_err(Failure::Program)?;
     // An error is taken off; a correction is what the surface is to be moved by.
     let sign = if map.kind == MapKind::Error { -arguments.gain } else { arguments.gain };
@@ -88,28 +106,41 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         shift: &shift,
         along_normals: ground.as_ref().map(|nominal| AlongNormals { nominal, centre_above_mm: tip_mm }),
         tolerance_mm: 1e-3 * arguments.tolerance_um,
-        map_identity: map.identity,
-        part: map.part,
-        base: map.base,
+        map: &map,
         gain: arguments.gain,
-        simulation: map.simulation,
+        largest_mm: 1e-3 * arguments.largest_correction_um,
     };
     let amended = correct_program(&arguments.program, &arguments.out, &amendment).map_err(Failure::Program)?;
     if arguments.json {
         super::print_json(&Document { simulation: map.simulation, out: &arguments.out, amended })?;
     } else {
         let marked = if map.simulation { "SIMULATION  " } else { "" };
-        super::print(&format!(
-            "{marked}{}: {} straight moves and {} arcs became {} moves, {} arcs among them; no point moved by more than {} um\n",
-            arguments.out.display(),
-            amended.straight,
-            amended.arcs,
-            amended.written,
-            amended.arcs_kept,
-            three_digits(1e3 * amended.largest_mm)
-        ))?;
+        super::print(&format!("{marked}{}: {}", arguments.out.display(), summary(&amended)))?;
     }
     Ok(Outcome::Accepted)
+}
+
+/// What became of the program, in lines.
+fn summary(amended: &Amended) -> String {
+    let mut text = format!(
+        "{} straight moves and {} arcs became {} moves, {} arcs among them; no point moved by more than {} um\n",
+        amended.straight,
+        amended.arcs,
+        amended.written,
+        amended.arcs_kept,
+        three_digits(1e3 * amended.largest_mm)
+    );
+    if amended.beside_map_mm > 0.0 {
+        text += &format!(
+            "beside the map: {} mm of {} mm at feed, where the outermost values of the map are levelled off\n",
+            three_digits(amended.beside_map_mm),
+            three_digits(amended.feed_mm)
+        );
+    }
+    if amended.unit_assumed {
+        text += "unit: neither G20 nor G21 stands before the first coordinate; millimetres were taken, and G21 was written\n";
+    }
+    text
 }
 
 /// Beyond its grid a map is levelled off within so many nodes.

@@ -213,6 +213,10 @@ impl<'p> Draft<'p> {
         if path.is_dir() {
             return Err(failed(io::Error::from(io::ErrorKind::IsADirectory)));
         }
+        // A device or a pipe would be replaced by a file of its name.
+        if path.metadata().is_ok_and(|there| !there.is_file()) {
+            return Err(failed(io::Error::new(io::ErrorKind::InvalidInput, "it is a device or a pipe, not a file")));
+        }
         let name = path.file_name().ok_or_else(|| failed(io::Error::from(io::ErrorKind::InvalidFilename)))?;
         let mut hidden = std::ffi::OsString::from(".");
         hidden.push(name);

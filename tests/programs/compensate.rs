@@ -40,6 +40,10 @@ impl Shop {
         write_correction(&self.path("map.csv"), &Correction::none(GRID, 0.02), (&identities, &[]), true).unwrap();
     }
 
+    fn folder(&self) -> &std::path::Path {
+        self.folder.path()
+    }
+
     pub fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
@@ -180,6 +184,24 @@ fn what_moves_the_tool_and_is_not_told_is_refused_with_its_line() {
         ("G1 X1e3", "not known"),
         ("E5", "not known"),
         ("G91\nG0 X1000000000\nX1000000000", "farther"),
+        ("G43 H1\nG1 X2", "not known where Z"),
+        ("G49\nG1 X2", "not known where Z"),
+        ("M6 T2\nG1 X2", "not known where XYZ"),
+        ("G91\nG28 Z0\nG1 X2", "not known where Z"),
+        ("G1 X1 R5", "R5 has no meaning"),
+        ("G1 X1 I5", "I5 has no meaning"),
+        ("I5 J5", "I5 has no meaning"),
+        ("G4 X2.", "X2. has no meaning"),
+        ("G1 X1 P2", "P2 has no meaning"),
+        ("G1 X1 H2", "H2 has no meaning"),
+        ("G0 G1 X2", "only one"),
+        ("G1 X2 G90 G91", "only one"),
+        ("M3 M5", "only one"),
+        ("G1 X1 F100 F200", "F stands twice"),
+        ("G1 X1\nA0", "turns the part"),
+        ("G0 A90", "turns the part"),
+        ("G10 L2 P1 X5", "may move the tool or the zero"),
+        ("G52 X1", "zero"),
     ] {
         let bench = Shop::new(error_mm, &format!("G21 G90\nG0 X0 Y0 Z1\nG1 Z0 F100\n{line}\nM2\n"));
         let said = bench.compensate(&[]).expect_err(line);
@@ -192,6 +214,133 @@ fn what_moves_the_tool_and_is_not_told_is_refused_with_its_line() {
 }
 
 #[test]
+fn what_is_in_force_is_written_and_nothing_is_lost() {
+    let kept = |program: &str, lines: &[&str]| {
+        let text = Shop::new(|_, _| 0.004, program).compensate(&[]).unwrap_or_else(|said| panic!("{program}: {said}"));
+        lines.iter().for_each(|line| assert!(text.lines().any(|of| of == *line), "{line}\n{text}"));
+        text
+    };
+    let begin = "G21 G90\nG0 X10 Y0 Z1\nG1 Z0 F300\n";
+    // A whole circle under a G3 in force, without an axis.
+    let circle = kept(
+        &format!("{begin}G3 X0 Y10 I-10 J0\nJ-10\nM2\n"),
+        &["G3 X0.000000 Y10.000000 Z-0.004000 I0.000000 J-10.000000"],
+    );
+    assert_eq!(circle.matches("\nG3 ").count(), 2);
+    // The move before G53 does not make a rapid of a feed.
+    kept(&format!("{begin}G0 Z5\nG1 F100\nG53 Z5\nM2\n"), &["G53 G1 Z5"]);
+    kept(&format!("{begin}M19 R45\nG4 P2\nG64 P0.01\nM2\n"), &["M19 R45", "G4 P2", "G64 P0.01"]);
+    kept(&format!("{begin}G91 G28 Z0\nG28 X0 Y0\nM2\n"), &["G91", "G28 Z0", "G28 X0 Y0", "G90"]);
+    kept(&format!("G0 A0. B0.\n{begin}G0 X0 A0\nG1 X1 B0.\nM2\n"), &["G0 A0. B0.", "G0 X0.000000 A0"]);
+    // The end of an arc in G18 and a centre in absolute places move with it.
+    let side = kept("G21 G90 G18 G90.1\nG0 X10 Y0 Z0\nG1 X10 F100\nG2 X0 Z10 I0 K0\nM2\n", &[]);
+    assert!(side.contains(" I0.000000 K-0.004000\n") || side.contains(" K-0.004000 I0.000000\n"), "{side}");
+}
+
+#[test]
+fn arcs_of_three_decimals_stay_arcs() {
+    // Ends that rounding puts half a micrometre beside the circle.
+    let mut program = String::from("G21 G90 G17\nG0 X14.142 Y0 Z1\nG1 Z0 F300\n");
+    for k in 1..=8 {
+        let (sine, cosine) = (f64::from(k) * std::f64::consts::FRAC_PI_4).sin_cos();
+        let (from_sine, from_cosine) = (f64::from(k - 1) * std::f64::consts::FRAC_PI_4).sin_cos();
+        program += &format!("G3 X{:.3} Y{:.3} ", 14.142 * cosine, 14.142 * sine);
+        program += &format!("I{:.3} J{:.3}\n", -14.142 * from_cosine, -14.142 * from_sine);
+    }
+    let text = Shop::new(|_, _| 0.005, &(program + "M2\n")).compensate(&[]).unwrap();
+    assert_eq!(text.matches("\nG3 ").count(), 8, "{text}");
+}
+
+#[test]
+fn a_program_without_a_unit_gets_the_one_that_it_is_taken_for() {
+    let program = "G90 G54\nG0 X0.5 Y0\nG0 Z0.2\nG1 Z0 F20\nG1 X-0.5\nM30\n";
+    let bench = Shop::new(|_, _| 0.005, program);
+    let (code, told, _) =
+        run(&["compensate", "--program", "base.ngc", "--map", "map.csv", "--out", "out.ngc", "--json"], bench.folder());
+    let document: serde_json::Value = serde_json::from_str(&told).unwrap();
+    assert_eq!((code, &document["unit_assumed"]), (0, &true.into()));
+    let text = fs::read_to_string(bench.path("out.ngc")).unwrap();
+    assert!(text.find("G21 ").unwrap() < text.find("G0 X").unwrap(), "{text}");
+    let stated = Shop::new(|_, _| 0.005, &format!("G21\n{program}")).compensate(&[]).unwrap();
+    assert_eq!(stated.matches("G21").count(), 1);
+}
+
+#[test]
+fn a_program_beside_the_map_is_refused_or_told() {
+    let at = |x: i32| format!("G21 G90\nG0 X{x} Y0 Z1\nG1 Z0 F100\nG1 X{}\nM2\n", x + 20);
+    let told = |program: &str| {
+        let bench = Shop::new(|_, _| 0.005, program);
+        let (code, told, said) = run(
+            &["compensate", "--program", "base.ngc", "--map", "map.csv", "--out", "out.ngc", "--json"],
+            bench.folder(),
+        );
+        assert_eq!(bench.path("out.ngc").exists(), code == 0);
+        if code == 0 { Ok(serde_json::from_str::<serde_json::Value>(&told).unwrap()) } else { Err(said) }
+    };
+    let over = told(&at(-10)).unwrap();
+    assert_eq!((over["beside_map_mm"].as_f64(), over["feed_mm"].as_f64()), (Some(0.0), Some(21.0)));
+    let partly = told(&at(20)).unwrap()["beside_map_mm"].as_f64().unwrap();
+    assert!((partly - 9.75).abs() < 0.2, "{partly}");
+    assert!(told(&at(100)).unwrap_err().contains("over the map"));
+    assert!(told(&at(-8000)).unwrap_err().contains("over the map"));
+    assert!(told("G21 G90\nG0 X1\nM2\n").unwrap_err().contains("no move at feed"));
+}
+
+#[test]
+fn a_foreign_map_is_used_where_it_is_valid_and_within_reason() {
+    let bench = Shop::new(|_, _| 0.0, "G21 G90\nG0 X-4 Y0 Z1\nG1 Z0 F100\nG1 X4\nM2\n");
+    let map = |value: &dyn Fn(i32) -> String| {
+        let rows: String = (-3..=3)
+            .flat_map(|j| (-6..=6).map(move |i| (i, j)))
+            .map(|(i, j)| format!("{},{},{}\n", i, j, value(i)))
+            .collect();
+        fs::write(bench.path("map.csv"), format!("x_mm,y_mm,error_mm,valid\n{rows}")).unwrap();
+    };
+    // To the right nothing was measured, and the number there means nothing.
+    map(&|i| if i < 2 { "0.004,1".into() } else { "NaN,0".into() });
+    let points = feeds(&bench.compensate(&[]).unwrap());
+    assert!(points.iter().all(|point| (point[2] + 0.004).abs() < 1e-6 || point[2] > 0.5), "{points:?}");
+    map(&|_| "5.0,1".into());
+    let said = bench.compensate(&[]).unwrap_err();
+    assert!(said.contains("5000") && said.contains("--largest-correction-um"), "{said}");
+    bench.compensate(&["--largest-correction-um", "6000"]).unwrap();
+    map(&|_| "0.004,0".into());
+    assert!(bench.compensate(&[]).unwrap_err().contains("valid"));
+    map(&|_| "0.004,x".into());
+    assert!(bench.compensate(&[]).unwrap_err().contains("neither 1 nor 0"));
+}
+
+#[test]
+fn the_corrected_program_takes_the_place_of_nothing_else() {
+    let program = "G21 G90\nG0 X0 Y0 Z1\nG1 X5 F100\nM2\n";
+    let bench = Shop::new(error_mm, program);
+    for out in ["base.ngc", "./base.ngc", "map.csv"] {
+        let said = bench.correct("base.ngc", out, &[]).unwrap_err();
+        assert!(said.contains("take the place"), "{out}: {said}");
+    }
+    assert_eq!(fs::read_to_string(bench.path("base.ngc")).unwrap(), program);
+    #[cfg(unix)]
+    {
+        fs::hard_link(bench.path("base.ngc"), bench.path("other.ngc")).unwrap();
+        assert!(bench.correct("base.ngc", "other.ngc", &[]).unwrap_err().contains("take the place"));
+        let said = bench.correct("base.ngc", "/dev/null", &[]).unwrap_err();
+        assert!(said.contains("device"), "{said}");
+    }
+}
+
+#[test]
+fn programs_of_other_controls_are_called_so() {
+    for (program, name) in [
+        ("%\nO7001(PART)\nG21 G90\nG0 X0. Y0. Z1.\nG1 X5. F100\nM30\n%\n", "Fanuc"),
+        ("0 BEGIN PGM PART MM\n1 L X+0 Y+0 R0 FMAX\n", "Klartext"),
+        ("%_N_PART_MPF\nG71 G90\nG1 X5 F100\n", "Sinumerik"),
+    ] {
+        let said = Shop::new(error_mm, program).compensate(&[]).unwrap_err();
+        assert!(said.contains(name), "{said}");
+    }
+}
+
+#[test]
 fn a_map_is_applied_once_and_only_to_its_part() {
     let program = "G21 G90\nG0 X0 Y0 Z1\nG1 X5 F100\nM2\n";
     let bench = Shop::new(error_mm, program);
@@ -200,7 +349,7 @@ fn a_map_is_applied_once_and_only_to_its_part() {
     assert!(again.contains("already applied") && !bench.path("twice.ngc").exists(), "{again}");
     // Another map of the same part goes on top.
     let first = fs::read_to_string(bench.path("map.csv")).unwrap();
-    fs::write(bench.path("map.csv"), first.replace(",1\n", ",0\n")).unwrap();
+    fs::write(bench.path("map.csv"), first.replacen(",1\n", ",0\n", 1)).unwrap();
     let both = bench.correct("out.ngc", "both.ngc", &[]).unwrap();
     assert_eq!(both.matches("(map: sha256 ").count(), 2);
     let other = Shop::new(error_mm, &format!("(part: sha256 {})\n{program}", "cd".repeat(32)));

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use crate::compensate::Shop;
+use crate::generated::Move;
 use crate::path::{correction, error_mm, part, read, wheels, with};
 use regrind::compensation::path::{Lean, PathMode, PathOptions, Pattern, Rotary, TurnAxis};
 use regrind::geometry::Vector;
@@ -16,7 +17,9 @@ fn interpret(program: &Path) -> Result<String, String> {
     let folder = program.parent().expect("a program stands in a folder");
     let mut command = Command::new("rs274");
     // It keeps its tools in a file that it maps into memory in the home folder: two at once with one home kill each other (SIGBUS).
-    command.arg("-g").arg(program).current_dir(folder).env("HOME", folder).stdin(Stdio::null());
+    // A tool without a length, so that G43 finds one.
+    fs::write(folder.join("tool.tbl"), "T1 P1 Z0.0 D1.0\n").unwrap();
+    command.args(["-t", "tool.tbl", "-g"]).arg(program).current_dir(folder).env("HOME", folder).stdin(Stdio::null());
     let output = command.output().expect("rs274 starts: apt-get install linuxcnc-uspace");
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     match output.status.success() {
@@ -207,4 +210,70 @@ fn corrected_programs_are_read_by_the_interpreter_of_linuxcnc() {
             calls.unwrap_or_else(|said| panic!("{name}: {said}"));
         }
     }
+}
+
+/// Where the interpreter's moves at feed end, in millimetres.
+fn ends_of_feeds(said: &str) -> Vec<[f64; 3]> {
+    let (mut unit, mut axes, mut found) = (1.0, [0, 1, 2], Vec::new());
+    for line in said.lines() {
+        let numbers = |call: &str| -> Option<Vec<f64>> {
+            let numbers = line.split_once(call)?.1.trim_end_matches(')');
+            numbers.split(',').map(|n| n.trim().parse().ok()).collect()
+        };
+        if let Some((_, name)) = line.split_once("USE_LENGTH_UNITS(CANON_UNITS_") {
+            unit = if name.starts_with("IN") { 25.4 } else { 1.0 };
+        } else if let Some((_, plane)) = line.split_once("SELECT_PLANE(CANON_PLANE_") {
+            axes = match &plane[..2] {
+                "XY" => [0, 1, 2],
+                "XZ" => [2, 0, 1],
+                _ => [1, 2, 0],
+            };
+        } else if let Some(arc) = numbers("ARC_FEED(") {
+            let mut at = [0.0; 3];
+            [(axes[0], arc[0]), (axes[1], arc[1]), (axes[2], arc[5])].into_iter().for_each(|(k, v)| at[k] = unit * v);
+            found.push(at);
+        } else if let Some(straight) = numbers("STRAIGHT_FEED(") {
+            found.push([0, 1, 2].map(|k| unit * straight[k]));
+        }
+    }
+    found
+}
+
+#[test]
+#[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
+fn drawn_programs_are_corrected_as_the_interpreter_of_linuxcnc_reads_them() {
+    let (mut read, mut moves) = (0, 0);
+    for seed in 0..crate::sample::seeds(25) {
+        let drawn = crate::generated::drawn(seed);
+        let bench = Shop::new(error_mm, &drawn.text);
+        // What the interpreter does not take (another rule for a small arc) is not a base to correct.
+        let Ok(base) = interpret(&bench.path("base.ngc")) else { continue };
+        let Ok(text) = bench.compensate(&["--tolerance-um", "0.1"]) else {
+            assert!(drawn.refused.is_some(), "seed {seed}\n{}", drawn.text);
+            continue;
+        };
+        // It reads the base as it was drawn.
+        let ends = |moves: &[Move]| -> Vec<[f64; 3]> {
+            let ways = moves.iter().filter_map(|step| match step {
+                Move::Feed(way) => Some(way.to),
+                _ => None,
+            });
+            ways.collect()
+        };
+        let said = interpret(&bench.path("out.ngc")).unwrap_or_else(|said| panic!("seed {seed}: {said}\n{text}"));
+        let corrected = ends(&crate::generated::read(&text));
+        for (name, said, ours) in [("base", &base, ends(&drawn.moves)), ("corrected", &said, corrected)] {
+            let theirs = ends_of_feeds(said);
+            assert_eq!(theirs.len(), ours.len(), "seed {seed}, {name}\n{}", drawn.text);
+            for (is, should) in theirs.iter().zip(&ours) {
+                // It prints four decimals, of an inch too.
+                let off = (0..3).map(|k| (is[k] - should[k]).abs()).fold(0.0, f64::max);
+                assert!(off < 0.6e-4 * 25.4, "seed {seed}, {name}: {is:?} {should:?}\n{}", drawn.text);
+            }
+            moves += ours.len();
+        }
+        read += 1;
+    }
+    println!("{read} programs, {moves} moves at feed");
+    assert!(read > 10);
 }

@@ -3,6 +3,7 @@
 mod compensate;
 mod dialects;
 mod gcode;
+mod generated;
 #[path = "../common/keep.rs"]
 mod keep;
 mod linuxcnc;

@@ -1,17 +1,23 @@
 //! Correcting a program that exists already, by a map over x and y.
 //!
+//! ```text
+//!  line of the program --control--> what the tool does --Rewriter--> corrected lines --Check--> the new program
+//! ```
 //! Every straight line is divided where the correction along it changes, not by its length; an arc stays an arc where the correction is
-//! the same all along it, and is written as chords where it is not. Rapid moves and moves in machine coordinates (G53) stay as they
-//! are. What moves the tool in a way that the program's text does not tell is refused with its line.
+//! the same all along it, and is written as chords where it is not. Rapid moves, moves in machine coordinates (G53) and ways to the
+//! reference point (G28, G30) stay as they are. What moves the tool in a way that the program's text does not tell is refused with its line.
+//! Every line that comes out is read again, by other means, and held against the base and the map before the program gets its name.
 
 use std::fmt::Write as _;
 use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
-use super::arc::{Arc, Centre, Plane};
-use super::map::{MapBase, identity_in};
-use super::number::{LARGEST_MM, push_fixed, rounded};
+use super::arc::Arc;
+use super::check::Check;
+use super::control::{AXES, Act, Control, all};
+use super::map::{MapBase, ProgramMap, identity_in};
+use super::number::{push_fixed, rounded};
 use super::read::{Block, Refusal, Word, block};
 use super::write::UNCORRECTED;
 use super::{GcodeError, hex};
@@ -24,7 +30,6 @@ use regrind_core::geometry::{Point, Vector};
 const MOST_BYTES: u64 = 1 << 30;
 /// Most points that one line is divided into.
 const MOST_POINTS: f64 = 2e6;
-const INCH_MM: f64 = 25.4;
 
 /// How a program is corrected.
 #[derive(Debug)]
@@ -35,16 +40,12 @@ pub struct Amendment<'a> {
     pub along_normals: Option<AlongNormals<'a>>,
     /// How far the new program may be from the corrected path, in millimetres.
     pub tolerance_mm: f64,
-    /// Identity of the map.
-    pub map_identity: [u8; 32],
-    /// The part that the map belongs to, where it says so.
-    pub part: Option<[u8; 32]>,
-    /// What the program must have in it already.
-    pub base: MapBase,
+    /// The map that the shift was made of.
+    pub map: &'a ProgramMap,
     /// What the map was multiplied by.
     pub gain: f64,
-    /// Whether the map comes from a simulated cell.
-    pub simulation: bool,
+    /// A point that would be moved by more than this is refused, in millimetres.
+    pub largest_mm: f64,
 }
 
 /// The nominal surface under a program, for corrections along its normals.
@@ -71,24 +72,36 @@ pub struct Amended {
     pub written: u64,
     /// Largest change of a point, in millimetres.
     pub largest_mm: f64,
+    /// Length of the moves at feed, in millimetres.
+    pub feed_mm: f64,
+    /// The part of it that lies beside the map, where its outermost values are levelled off.
+    pub beside_map_mm: f64,
+    /// Whether the program says neither G20 nor G21 before its first coordinate, so that millimetres were assumed and written.
+    pub unit_assumed: bool,
 }
 
 /// Reads a program, corrects it, and writes it under another name.
 ///
 /// # Errors
 /// A program that has the map in it already, that belongs to another part or has another correction in it than the map takes up, or that
-/// holds what cannot be corrected; files.
+/// holds what cannot be corrected; one without a move at feed, or with none over the map; corrected lines that are not the base and the map; files.
 pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result<Amended, GcodeError> {
     let bytes = read_whole(base, MOST_BYTES)?;
-    let text = std::str::from_utf8(&bytes).map_err(|_| GcodeError::Program {
-        path: base.to_owned(),
-        what: "the program is no plain text".into(),
-        remedy: "give the program as the controller reads it",
-    })?;
+    let program = |what: &str, remedy| GcodeError::Program { path: base.to_owned(), what: what.into(), remedy };
+    let text = std::str::from_utf8(&bytes)
+        .map_err(|_| program("the program is no plain text", "give the program as the controller reads it"))?;
+    if let Some((what, remedy)) = other_control(text) {
+        return Err(program(what, remedy));
+    }
+    if is_same_file(base, out) {
+        return Err(program("the corrected program would take the place of this one", "give another name to --out"));
+    }
     refuse_foreign(base, text, amendment)?;
     let mut writer = Rewriter::new(amendment);
+    writer.done.unit_assumed = !states_unit_first(text);
     let mut draft = Draft::create(out)?;
-    let header = header(&Sha256::digest(&bytes).into(), amendment);
+    let header = header(&Sha256::digest(&bytes).into(), amendment, writer.done.unit_assumed);
+    let mut check = Check::new(amendment, &header);
     let mut begun = false;
     for (number, line) in (1..).zip(text.lines()) {
         let refused = |(what, remedy): Refusal| GcodeError::Line { path: base.to_owned(), line: number, what, remedy };
@@ -100,10 +113,76 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
         }
         writer.text.clear();
         writer.line(line, &block).map_err(refused)?;
+        check.line(line, &writer.text).map_err(refused)?;
         draft.write(&writer.text)?;
     }
+    let done = writer.done;
+    if done.straight + done.arcs == 0 {
+        return Err(program(
+            "it has no move at feed, so there is nothing to correct",
+            "is it the program of the pass?",
+        ));
+    }
+    if done.beside_map_mm >= done.feed_mm {
+        let remedy =
+            "give the map in the program's coordinates, and the program in millimetres with points in its numbers";
+        return Err(program("no move at feed lies over the map", remedy));
+    }
     draft.publish()?;
-    Ok(writer.done)
+    Ok(done)
+}
+
+/// Tells a program of another control than LinuxCNC by its first lines.
+fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
+    const AGAIN: &str = "compensate reads and writes the dialect of LinuxCNC; plan the next program by regrind plan --program and its dialect";
+    /// Behind so many lines nothing tells the control any more.
+    const LOOKED_AT: usize = 20;
+    let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty() && *line != "%").take(LOOKED_AT);
+    lines
+        .find_map(|line| {
+            let number = line.strip_prefix(['O', 'o', ':'])?;
+            let digits = number.bytes().take_while(u8::is_ascii_digit).count();
+            let rest = number[digits..].trim_start();
+            (digits > 0 && (rest.is_empty() || rest.starts_with('(')))
+                .then_some("it is a program of a Fanuc control: a line of it is a program number")
+        })
+        .or_else(|| {
+            let mut lines = text.lines().take(LOOKED_AT);
+            lines
+                .any(|line| line.contains("BEGIN PGM"))
+                .then_some("it is a program in Klartext, for a Heidenhain control")
+        })
+        .or_else(|| text.starts_with("%_N_").then_some("it is a program of a Sinumerik control"))
+        .map(|what| (what, AGAIN))
+}
+
+/// Whether G20 or G21 stands before the first coordinate.
+fn states_unit_first(text: &str) -> bool {
+    for line in text.lines() {
+        let Ok(block) = block(line) else { return true };
+        if block.words.iter().any(|word| word.letter == b'G' && [20.0, 21.0].contains(&word.value)) {
+            return true;
+        }
+        if block.words.iter().any(|word| b"XYZIJKRF".contains(&word.letter)) {
+            return false;
+        }
+    }
+    true
+}
+
+/// Returns whether two names are those of one file that is there.
+pub fn is_same_file(one: &Path, other: &Path) -> bool {
+    let Ok((a, b)) = std::fs::metadata(one).and_then(|a| Ok((a, std::fs::metadata(other)?))) else { return false };
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::MetadataExt;
+        (a.dev(), a.ino()) == (b.dev(), b.ino())
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = (a, b);
+        one.canonicalize().ok() == other.canonicalize().ok()
+    }
 }
 
 /// Refuses a program that has the map in it, that belongs to another part than the map, or to another correction.
@@ -117,19 +196,19 @@ fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), 
             maps.pop();
         }
         maps.extend(identity_in(line, "map:"));
-        if identity_in(line, "map:") == Some(amendment.map_identity) {
+        if identity_in(line, "map:") == Some(amendment.map.identity) {
             return refused(
                 "this map is already applied in the program",
                 "use the program as it is, or correct the program that it was made from",
             );
         }
-        if let (Some(of_program), Some(of_map)) = (identity_in(line, "part:"), amendment.part)
+        if let (Some(of_program), Some(of_map)) = (identity_in(line, "part:"), amendment.map.part)
             && of_program != of_map
         {
             return refused("the map belongs to another part than the program", "give the map of this part");
         }
     }
-    match amendment.base {
+    match amendment.map.base {
         MapBase::Nothing if !maps.is_empty() => refused(
             "the program has a correction in it, and this one is absolute: it replaces that, it does not come on top of it",
             "correct the program without a correction, as regrind plan --program writes it",
@@ -142,16 +221,16 @@ fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), 
     }
 }
 
-fn header(base: &[u8; 32], amendment: &Amendment) -> String {
+fn header(base: &[u8; 32], amendment: &Amendment, unit_assumed: bool) -> String {
     let mut text = String::new();
     // Writing to a string does not fail.
     let _ = writeln!(text, "(Regrind {} corrected program)", env!("CARGO_PKG_VERSION"));
-    if amendment.simulation {
+    if amendment.map.simulation {
         text.push_str("(SIMULATION)\n");
     }
     let _ = writeln!(text, "(base: sha256 {})", hex(base));
-    let _ = writeln!(text, "(map: sha256 {})", hex(&amendment.map_identity));
-    if let Some(part) = &amendment.part {
+    let _ = writeln!(text, "(map: sha256 {})", hex(&amendment.map.identity));
+    if let Some(part) = &amendment.map.part {
         let _ = writeln!(text, "(part: sha256 {})", hex(part));
     }
     let _ = writeln!(text, "(gain: {}, within {} mm)", amendment.gain, super::number::short(amendment.tolerance_mm));
@@ -159,277 +238,97 @@ fn header(base: &[u8; 32], amendment: &Amendment) -> String {
         Some(_) => "(applied along the normals of the corrected surface)\n",
         None => "(applied along z: where the surface has a normal n, e [1 - nz] of a correction e is missing)\n",
     });
-    text.push_str("G90\n");
+    text.push_str(if unit_assumed { "G21 G90\n" } else { "G90\n" });
     text
 }
 
-/// The state of a controller, as far as it tells where the tool moves, and the text that comes out.
+/// The text that comes out, and where it has the tool.
 struct Rewriter<'a> {
     amendment: &'a Amendment<'a>,
+    control: Control,
     text: Vec<u8>,
     done: Amended,
-    /// Where the base program has the tool, and where the corrected one; `None` where an axis is not known.
-    base: [Option<f64>; 3],
+    /// Where the corrected program has the tool; `None` where an axis is not known.
     actual: [Option<f64>; 3],
-    motion: Option<u8>,
-    plane: Plane,
-    unit_mm: f64,
-    relative: bool,
-    arcs_absolute: bool,
-    system: Option<i64>,
-    /// Whether anything was moved by now: the coordinate system must not change after that.
-    moved: bool,
-    ended: bool,
-}
-
-/// What the G words of a line ask for.
-#[derive(Default)]
-struct Asked {
-    motion: Option<u8>,
-    machine: bool,
+    /// Words of axes that stand at 0 and go with the next move that is written.
+    beside: String,
 }
 
 impl<'a> Rewriter<'a> {
     fn new(amendment: &'a Amendment<'a>) -> Self {
-        Self {
-            amendment,
-            text: Vec::new(),
-            done: Amended::default(),
-            base: [None; 3],
-            actual: [None; 3],
-            motion: None,
-            plane: Plane::XY,
-            unit_mm: 1.0,
-            relative: false,
-            arcs_absolute: false,
-            system: None,
-            moved: false,
-            ended: false,
-        }
+        let (control, done) = (Control::new(), Amended::default());
+        Self { amendment, control, text: Vec::new(), done, actual: [None; 3], beside: String::new() }
     }
 
     /// Takes one line and writes what becomes of it.
     fn line(&mut self, line: &str, block: &Block) -> Result<(), Refusal> {
         self.done.lines += 1;
-        if self.ended || block.words.is_empty() {
+        if self.control.ended || block.words.is_empty() {
             self.text.extend_from_slice(line.as_bytes());
             self.text.push(b'\n');
             return Ok(());
         }
-        let asked = self.states(block)?;
-        let axes = block.words.iter().any(|w| matches!(w.letter, b'X' | b'Y' | b'Z'));
-        if let Some(w) = block.words.iter().find(|w| matches!(w.letter, b'A' | b'B' | b'C' | b'U' | b'V' | b'W')) {
-            let found = format!("{} moves an axis that turns the part or the tool", w.text);
-            return Err((found, "only programs of X, Y and Z can be corrected by a map over x and y"));
+        let act = self.control.take(block)?;
+        // An axis that a word of this line made unknown is so in the corrected program too.
+        (0..3).filter(|&k| self.control.at[k].is_none()).for_each(|k| self.actual[k] = None);
+        self.copy_words(block, |w| !is_of_the_move(w, &act) && !takes_effect_after(w));
+        self.beside.clear();
+        for word in block.words.iter().filter(|w| is_turning(w)) {
+            self.beside += " ";
+            self.beside += word.text;
         }
-        if !axes {
-            if asked.motion.is_some_and(|m| m >= 2) {
-                return self.moves(line, block, &asked);
+        match act {
+            Act::Stay => {}
+            Act::Upright { by } => {
+                let _ = std::io::Write::write_fmt(&mut self.text, format_args!("G{by}{}\n", self.beside));
             }
-            self.copy(block);
-            return Ok(());
-        }
-        self.moves(line, block, &asked)
-    }
-
-    /// Takes in what a line puts in force; refuses what moves the tool otherwise.
-    fn states(&mut self, block: &Block) -> Result<Asked, Refusal> {
-        let mut asked = Asked::default();
-        for word in &block.words {
-            match word.letter {
-                b'G' => self.g(word, &mut asked)?,
-                b'M' => self.m(word)?,
-                b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'R' | b'F' | b'S' | b'T' | b'H' | b'D' | b'P' | b'Q'
-                | b'N' => {}
-                // Axes that turn are refused by name.
-                b'A' | b'B' | b'C' | b'U' | b'V' | b'W' => {}
-                _ => return Err((format!("{} is not known", word.text), "remove it, if it does not move the tool")),
+            Act::Rapid(to) => self.rapid(to),
+            Act::Machine { by } => self.machine(block, by),
+            Act::Feed { from, to, arc: None } => {
+                self.done.straight += 1;
+                self.feed(from, to, &|share| from + (to - from) * share, (to - from).norm(), None)?;
+            }
+            Act::Feed { from, to, arc: Some(arc) } => {
+                self.done.arcs += 1;
+                self.feed(from, to, &|share| arc.at(share), arc.length(), Some(&arc))?;
             }
         }
-        Ok(asked)
-    }
-
-    fn g(&mut self, word: &Word, asked: &mut Asked) -> Result<(), Refusal> {
-        let tenths = (word.value * 10.0).round();
-        if (word.value * 10.0 - tenths).abs() > 1e-6 {
-            return Err((format!("{} is not known", word.text), "correct the number"));
-        }
-        match tenths as i64 {
-            code @ (0 | 10 | 20 | 30) => {
-                (self.motion, asked.motion) = (Some((code / 10) as u8), Some((code / 10) as u8));
-            }
-            170 => self.plane = Plane::XY,
-            180 => self.plane = Plane::ZX,
-            190 => self.plane = Plane::YZ,
-            200 => self.unit_mm = INCH_MM,
-            210 => self.unit_mm = 1.0,
-            900 => self.relative = false,
-            910 => self.relative = true,
-            901 => self.arcs_absolute = true,
-            911 => self.arcs_absolute = false,
-            530 => asked.machine = true,
-            code @ (540 | 550 | 560 | 570 | 580 | 590 | 591 | 592 | 593) => self.choose_system(code, word)?,
-            800 => self.motion = None,
-            40 | 400 | 430 | 490 | 610 | 611 | 640 | 940 | 950 | 960 | 970 | 980 | 990 => {}
-            930 => {
-                let remedy = "let the CAM system write feeds a minute (G94)";
-                return Err((
-                    format!("{} states times of moves, which a divided line does not keep", word.text),
-                    remedy,
-                ));
-            }
-            410..=429 => {
-                let remedy = "let the CAM system write the path of the tool's centre (G40)";
-                return Err((format!("{} lets the controller move the path by a radius", word.text), remedy));
-            }
-            730 | 760 | 810..=890 => {
-                let remedy = "let the CAM system write the moves of the cycle out";
-                return Err((format!("{} is a canned cycle", word.text), remedy));
-            }
-            _ => {
-                let found =
-                    format!("{} may move the tool or the zero in a way that the program does not tell", word.text);
-                return Err((found, "let the CAM system write plain G0, G1, G2 and G3"));
-            }
-        }
-        Ok(())
-    }
-
-    fn choose_system(&mut self, code: i64, word: &Word) -> Result<(), Refusal> {
-        let same = self.system == Some(code);
-        if !same && self.moved {
-            let remedy = "a map belongs to one zero: divide the program";
-            return Err((format!("{} changes the zero after the tool has moved at feed", word.text), remedy));
-        }
-        if !same {
-            self.forget([true; 3]);
-        }
-        self.system = Some(code);
-        Ok(())
-    }
-
-    fn m(&mut self, word: &Word) -> Result<(), Refusal> {
-        match word.value {
-            v if v == 2.0 || v == 30.0 => self.ended = true,
-            v if v.fract() == 0.0 && (matches!(v as i64, 0..=9 | 19 | 48..=53 | 60..=68)) => {}
-            _ => {
-                let found = format!("{} is a subprogram, a state of the controller, or the machine's own", word.text);
-                return Err((found, "remove it, or write out what it does"));
-            }
-        }
-        Ok(())
-    }
-
-    /// Takes in a line that moves the tool.
-    fn moves(&mut self, line: &str, block: &Block, asked: &Asked) -> Result<(), Refusal> {
-        let Some(motion) = self.motion else {
-            return Err(("axes are named and no G0, G1, G2 or G3 is in force".into(), "write which move is meant"));
-        };
-        let value = |letter: u8| block.words.iter().find(|w| w.letter == letter).map(|w| w.value);
-        let named = [b'X', b'Y', b'Z'].map(value);
-        for (k, letter) in [b'X', b'Y', b'Z'].into_iter().enumerate() {
-            if block.words.iter().filter(|w| w.letter == letter).count() > 1 {
-                return Err((format!("{} stands twice", ['X', 'Y', 'Z'][k]), "keep one of them"));
-            }
-        }
-        if asked.machine {
-            if motion > 1 || self.relative {
-                return Err(("G53 stands with an arc or in G91".into(), "G53 goes with G0 and G1, in G90"));
-            }
-            self.forget(named.map(|v| v.is_some()));
-            self.text.extend_from_slice(line.as_bytes());
-            self.text.push(b'\n');
-            return Ok(());
-        }
-        let target = self.target(named)?;
-        if motion == 0 {
-            return self.rapid(block, named, target);
-        }
-        let (Some(from), Some(to)) = (all(self.base), all(target)) else {
-            let missing: String =
-                ['X', 'Y', 'Z'].into_iter().zip(self.base).filter(|(_, v)| v.is_none()).map(|(c, _)| c).collect();
-            let remedy = "write a G0 with these axes before it";
-            return Err((format!("it is not known where {missing} is when this move begins"), remedy));
-        };
-        self.copy_before(block);
-        self.moved = true;
-        let ended = if motion == 1 {
-            self.done.straight += 1;
-            self.feed(from, to, &|share| from + (to - from) * share, (to - from).norm(), None)
-        } else {
-            self.done.arcs += 1;
-            let arc = self.arc(block, from, to, motion == 2)?;
-            self.feed(from, to, &|share| arc.at(share), arc.length(), Some(&arc))
-        };
-        ended?;
-        self.base = target;
         self.copy_after(block);
         Ok(())
-    }
-
-    /// Where the base program moves to.
-    fn target(&self, named: [Option<f64>; 3]) -> Result<[Option<f64>; 3], Refusal> {
-        let mut target = self.base;
-        for k in 0..3 {
-            let Some(value) = named[k].map(|v| v * self.unit_mm) else { continue };
-            let to = if self.relative {
-                let Some(before) = self.base[k] else {
-                    let found = format!("{} moves by a distance from a place that is not known", ['X', 'Y', 'Z'][k]);
-                    return Err((found, "begin with a G0 in absolute coordinates (G90)"));
-                };
-                before + value
-            } else {
-                value
-            };
-            if to.abs() > LARGEST_MM {
-                let found = format!(
-                    "{} goes to {to:e} mm, farther than the {LARGEST_MM:e} that are written",
-                    ['X', 'Y', 'Z'][k]
-                );
-                return Err((found, "correct the number, or the unit (G20, G21)"));
-            }
-            target[k] = Some(to);
-        }
-        Ok(target)
     }
 
     /// A rapid move goes where it went; only the axes that it names.
-    fn rapid(&mut self, block: &Block, named: [Option<f64>; 3], target: [Option<f64>; 3]) -> Result<(), Refusal> {
-        self.copy_before(block);
+    fn rapid(&mut self, to: [Option<f64>; 3]) {
         self.text.extend_from_slice(b"G0");
-        for k in (0..3).filter(|&k| named[k].is_some()) {
-            if let Some(to) = target[k] {
-                self.word([b'X', b'Y', b'Z'][k], to);
-                (self.base[k], self.actual[k]) = (Some(to), Some(to));
+        for k in 0..3 {
+            if let Some(to) = to[k] {
+                self.word(AXES[k], to);
+                self.actual[k] = Some(to);
             }
         }
+        self.text.extend_from_slice(self.beside.as_bytes());
         self.text.push(b'\n');
-        self.copy_after(block);
-        Ok(())
     }
 
-    fn arc(&self, block: &Block, from: Point, to: Point, clockwise: bool) -> Result<Arc, Refusal> {
-        let value = |letter: u8| block.words.iter().find(|w| w.letter == letter).map(|w| w.value * self.unit_mm);
-        if value(b'P').is_some() {
-            return Err(("P lets the arc turn several times".into(), "write a line for every turn"));
+    /// A move in coordinates of the machine, or to its reference point, is written as it was.
+    fn machine(&mut self, block: &Block, by: Option<u8>) {
+        if self.control.relative {
+            self.text.extend_from_slice(b"G91\n");
         }
-        let [a, b, c] = self.plane.0;
-        let centres = [b'I', b'J', b'K'].map(value);
-        let centre = match (value(b'R'), centres[a].is_some() || centres[b].is_some()) {
-            (Some(radius), false) => Centre::Radius(radius),
-            (None, true) if centres[c].is_none() => Centre::At([a, b].map(|k| {
-                let at = centres[k].unwrap_or(0.0);
-                if self.arcs_absolute { at } else { at + from[k] }
-            })),
-            _ => {
-                let remedy = "give the two of I, J, K that lie in the plane of the arc, or R";
-                return Err(("the centre of the arc is not told, or told twice".into(), remedy));
+        let begin = self.text.len();
+        let by = by.map(|motion| format!("G{motion}"));
+        let words = |wanted: fn(&Word) -> bool| block.words.iter().filter(move |w| wanted(w)).map(|w| w.text);
+        let axes = words(|w| AXES.contains(&w.letter));
+        for piece in words(is_machine).chain(by.as_deref()).chain(axes) {
+            if self.text.len() > begin {
+                self.text.push(b' ');
             }
-        };
-        if self.arcs_absolute && (centres[a].is_none() || centres[b].is_none()) && matches!(centre, Centre::At(_)) {
-            return Err(("G90.1 asks for both places of the centre".into(), "add the missing one"));
+            self.text.extend_from_slice(piece.as_bytes());
         }
-        Arc::new(self.plane, from, to, clockwise, centre)
+        self.text.push(b'\n');
+        if self.control.relative {
+            self.text.extend_from_slice(b"G90\n");
+        }
     }
 
     /// Writes a move at feed, corrected.
@@ -442,39 +341,24 @@ impl<'a> Rewriter<'a> {
         arc: Option<&Arc>,
     ) -> Result<(), Refusal> {
         let tolerance = self.amendment.tolerance_mm;
-        // Fine enough for the map, and an arc's chords take half of the tolerance.
-        let grain = 0.25 * self.amendment.shift.spacing_mm().into_iter().fold(f64::INFINITY, f64::min);
-        let lateral = match arc {
-            None => (to - from).xy().norm(),
-            Some(_) => length,
-        };
-        let pieces = (lateral / grain).ceil().max(1.0).max(arc.map_or(1.0, |a| a.chords(0.5 * tolerance)));
-        if pieces > MOST_POINTS {
-            let found = format!("the move of {length:.1} mm would be divided into {pieces:.0} pieces");
-            return Err((found, "allow a larger tolerance, or take a coarser map"));
-        }
-        let count = pieces as usize;
-        let mut corrected = Vec::with_capacity(count + 1);
-        for k in 0..=count {
-            // The last point is the one that is written in the program.
-            let at = if k == count { to } else { way(k as f64 / count as f64) };
-            corrected.push(at + self.displacement(&at)?);
-        }
-        let largest = (0..=count).map(|k| (corrected[k] - way(k as f64 / count as f64)).norm()).fold(0.0, f64::max);
-        self.done.largest_mm = self.done.largest_mm.max(largest);
+        let lateral = arc.map_or((to - from).xy().norm(), |_| length);
+        let shifts = self.shifts(way, (lateral, length), arc)?;
+        let count = shifts.len() - 1;
+        let corrected: Vec<Point> =
+            shifts.iter().enumerate().map(|(k, shift)| way(k as f64 / count as f64) + shift).collect();
+        self.measure(way, length, &shifts)?;
         // After a rapid move the tool stands where the base program has it: it is brought to where the corrected path begins.
-        let here = all(self.actual);
-        let beside = here.is_none_or(|here| (here - corrected[0]).norm() > 0.5 * tolerance);
-        if beside && lateral > 0.0 {
+        let beside = all(self.actual).is_none_or(|here| (here - corrected[0]).norm() > 0.5 * tolerance);
+        if beside && (lateral > 0.0 || self.amendment.along_normals.is_some()) {
             self.point(&corrected[0]);
         }
         match arc {
-            Some(arc) if is_constant(&corrected, arc, 0.5 * tolerance) => {
+            Some(arc) if shifts.iter().all(|shift| (shift - shifts[0]).norm() <= 0.5 * tolerance) => {
                 self.done.arcs_kept += 1;
-                self.arc_to(arc, &corrected[count]);
+                self.arc_to(arc, &corrected[0], &corrected[count]);
             }
             _ => {
-                let allowed = if arc.is_some() { 0.45 * tolerance } else { 0.9 * tolerance };
+                let allowed = if arc.is_some() { 0.6 * tolerance } else { 0.85 * tolerance };
                 for k in kept(&corrected, allowed) {
                     self.point(&corrected[k]);
                 }
@@ -484,61 +368,83 @@ impl<'a> Rewriter<'a> {
         Ok(())
     }
 
-    fn displacement(&self, at: &Point) -> Result<Vector, Refusal> {
-        let shift = self.amendment.shift;
-        let Some(along) = &self.amendment.along_normals else { return Ok(Vector::z() * shift.at([at.x, at.y]).value) };
-        let centre = at + Vector::z() * along.centre_above_mm;
-        displaced(along.nominal, shift, &centre).ok_or_else(|| {
-            let found =
-                format!("no place of the nominal surface is under x {:.3}, y {:.3}, z {:.3} mm", at.x, at.y, at.z);
-            (found, "is the program in the frame of the nominal surface, and is its point the one that was told?")
-        })
+    /// By how much the map moves points of a way, at equal steps that are fine enough for the map, the arc and the tolerance.
+    fn shifts(
+        &self,
+        way: &dyn Fn(f64) -> Point,
+        (lateral, length): (f64, f64),
+        arc: Option<&Arc>,
+    ) -> Result<Vec<Vector>, Refusal> {
+        let tolerance = self.amendment.tolerance_mm;
+        let grain = 0.25 * self.amendment.shift.spacing_mm().into_iter().fold(f64::INFINITY, f64::min);
+        let chords = arc.map_or(1.0, |arc| arc.chords(0.25 * tolerance));
+        let changes = if self.amendment.along_normals.is_some() { length } else { lateral };
+        let mut pieces = (changes / grain).ceil().max(1.0).max(chords);
+        loop {
+            if pieces > MOST_POINTS {
+                let found = format!("the move of {length:.1} mm would be divided into {pieces:.0} pieces");
+                return Err((found, "allow a larger tolerance, or take a coarser map"));
+            }
+            let shifts: Vec<Vector> = (0..=pieces as usize)
+                .map(|k| displacement(self.amendment, &way(k as f64 / pieces)))
+                .collect::<Result<_, _>>()?;
+            // An eighth of the second difference is what a line between two points is off by.
+            let bends = shifts.windows(3).map(|three| (three[0] - three[1] * 2.0 + three[2]).norm() / 8.0);
+            if changes == 0.0 || (pieces > 1.0 && bends.fold(0.0, f64::max) <= 0.05 * tolerance) {
+                return Ok(shifts);
+            }
+            pieces *= 2.0;
+        }
+    }
+
+    /// Puts down how far a move is corrected and how much of it lies beside the map; refuses one that is corrected by more than is allowed.
+    fn measure(&mut self, way: &dyn Fn(f64) -> Point, length: f64, shifts: &[Vector]) -> Result<(), Refusal> {
+        let largest_mm = shifts.iter().map(Vector::norm).fold(0.0, f64::max);
+        if largest_mm > self.amendment.largest_mm {
+            let found = format!("the map would move the tool by {:.1} um", 1e3 * largest_mm);
+            return Err((found, "is it the right map, in the right unit? allow more by --largest-correction-um"));
+        }
+        self.done.largest_mm = self.done.largest_mm.max(largest_mm);
+        let count = shifts.len() - 1;
+        let beside = (0..count).filter(|&k| {
+            let at = way((k as f64 + 0.5) / count as f64);
+            !self.amendment.map.covers([at.x, at.y])
+        });
+        let share = beside.count() as f64 / count as f64;
+        // A move on the spot has no length, and a place all the same.
+        let length = length.max(1e-6);
+        self.done.feed_mm += length;
+        self.done.beside_map_mm += if share == 1.0 { length } else { share * length };
+        Ok(())
     }
 
     fn point(&mut self, at: &Point) {
         self.done.written += 1;
         self.text.extend_from_slice(b"G1");
-        for (k, letter) in [b'X', b'Y', b'Z'].into_iter().enumerate() {
-            self.word(letter, at[k]);
-        }
+        (0..3).for_each(|k| self.word(AXES[k], at[k]));
+        self.text.extend_from_slice(std::mem::take(&mut self.beside).as_bytes());
         self.text.push(b'\n');
     }
 
-    fn arc_to(&mut self, arc: &Arc, to: &Point) {
+    fn arc_to(&mut self, arc: &Arc, from: &Point, to: &Point) {
         self.done.written += 1;
         self.text.extend_from_slice(if arc.sweep < 0.0 { b"G2" } else { b"G3" });
-        for (k, letter) in [b'X', b'Y', b'Z'].into_iter().enumerate() {
-            self.word(letter, to[k]);
-        }
+        (0..3).for_each(|k| self.word(AXES[k], to[k]));
         for (k, by) in arc.centre_from_start() {
-            self.word([b'I', b'J', b'K'][k], if self.arcs_absolute { by + self.arc_start(k) } else { by });
+            self.word([b'I', b'J', b'K'][k], if self.control.arcs_absolute { by + from[k] } else { by });
         }
+        self.text.extend_from_slice(std::mem::take(&mut self.beside).as_bytes());
         self.text.push(b'\n');
-    }
-
-    fn arc_start(&self, axis: usize) -> f64 {
-        self.base[axis].unwrap_or(0.0)
     }
 
     fn word(&mut self, letter: u8, value_mm: f64) {
         self.text.extend_from_slice(&[b' ', letter]);
-        if self.unit_mm == 1.0 {
+        if self.control.unit_mm == 1.0 {
             push_fixed(&mut self.text, rounded(value_mm));
         } else {
             // A millionth of an inch is 25 nm: two digits more.
-            let _ = std::io::Write::write_fmt(&mut self.text, format_args!("{:.8}", value_mm / self.unit_mm));
+            let _ = std::io::Write::write_fmt(&mut self.text, format_args!("{:.8}", value_mm / self.control.unit_mm));
         }
-    }
-
-    /// Copies a line that does not move the tool; the coordinates that come out are absolute whatever the base says.
-    fn copy(&mut self, block: &Block) {
-        self.copy_before(block);
-        self.copy_after(block);
-    }
-
-    /// What takes effect before a move.
-    fn copy_before(&mut self, block: &Block) {
-        self.copy_words(block, |w| !is_of_the_move(w) && !takes_effect_after(w));
     }
 
     /// What takes effect after a move: stops and the end.
@@ -568,36 +474,43 @@ impl<'a> Rewriter<'a> {
             self.text.push(b'\n');
         }
     }
-
-    fn forget(&mut self, axes: [bool; 3]) {
-        for k in (0..3).filter(|&k| axes[k]) {
-            (self.base[k], self.actual[k]) = (None, None);
-        }
-    }
 }
 
-fn all(of: [Option<f64>; 3]) -> Option<Point> {
-    Some(Point::new(of[0]?, of[1]?, of[2]?))
+/// What the map moves a point of the program by.
+pub(super) fn displacement(amendment: &Amendment, at: &Point) -> Result<Vector, Refusal> {
+    let shift = amendment.shift;
+    let Some(along) = &amendment.along_normals else { return Ok(Vector::z() * shift.at([at.x, at.y]).value) };
+    let centre = at + Vector::z() * along.centre_above_mm;
+    displaced(along.nominal, shift, &centre).ok_or_else(|| {
+        let found = format!("no place of the nominal surface is under x {:.3}, y {:.3}, z {:.3} mm", at.x, at.y, at.z);
+        let remedy = "high above a hollow part its normals cross: go down by G0 and begin the move at feed nearer to the part; \
+                      else: is the program in the frame of the nominal surface, and is its point the one that was told?";
+        (found, remedy)
+    })
 }
 
 /// Words that are written anew for every move, and numbers of lines, which would stand twice.
-fn is_of_the_move(word: &Word) -> bool {
+fn is_of_the_move(word: &Word, act: &Act) -> bool {
     match word.letter {
-        b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'R' | b'N' => true,
-        b'G' => [0.0, 1.0, 2.0, 3.0, 80.0, 90.0, 91.0].contains(&word.value),
+        b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'N' | b'A' | b'B' | b'C' => true,
+        // Of a line that does not move the tool it belongs to another word.
+        b'R' => matches!(act, Act::Feed { .. }),
+        b'G' => [0.0, 1.0, 2.0, 3.0, 80.0, 90.0, 91.0].contains(&word.value) || is_machine(word),
         _ => false,
     }
 }
 
-fn takes_effect_after(word: &Word) -> bool {
-    word.letter == b'M' && [0.0, 1.0, 2.0, 30.0, 60.0].contains(&word.value)
+/// Whether a word makes the move of its line one in coordinates of the machine.
+fn is_machine(word: &Word) -> bool {
+    word.letter == b'G' && [28.0, 30.0, 53.0].contains(&word.value)
 }
 
-/// Whether a corrected arc is the same arc, moved.
-fn is_constant(corrected: &[Point], arc: &Arc, tolerance: f64) -> bool {
-    let count = (corrected.len() - 1) as f64;
-    let first = corrected[0] - arc.at(0.0);
-    (0..corrected.len()).all(|k| (corrected[k] - arc.at(k as f64 / count) - first).norm() <= tolerance)
+fn is_turning(word: &Word) -> bool {
+    matches!(word.letter, b'A' | b'B' | b'C')
+}
+
+fn takes_effect_after(word: &Word) -> bool {
+    word.letter == b'M' && [0.0, 1.0, 2.0, 30.0, 60.0].contains(&word.value)
 }
 
 /// Which points must be written so that the lines between them keep to all of them (Douglas and Peucker); without the first.

@@ -14,6 +14,8 @@ pub(super) struct Arc {
     /// In the plane.
     centre: [f64; 2],
     radius: f64,
+    /// The radius at the end, which rounding makes another one: the arc winds from one to the other.
+    end_radius: f64,
     begins: f64,
     /// Counter-clockwise is positive.
     pub(super) sweep: f64,
@@ -29,8 +31,8 @@ pub(super) enum Centre {
     Radius(f64),
 }
 
-/// How far the radius at the end may be from that at the beginning, as LinuxCNC has it: in millimetres, and as a share.
-const RADIUS_TOLERANCE: [f64; 2] = [0.0127, 0.001];
+/// How far the radius at the end may be from that at the beginning: in millimetres, as LinuxCNC has it, and as a share of a very small one.
+const RADIUS_TOLERANCE: [f64; 2] = [0.0127, 0.1];
 
 impl Arc {
     /// Lays an arc between two points.
@@ -48,7 +50,7 @@ impl Arc {
         let ([u, v], [s, t]) = (arm(p), arm(q));
         let (radius, end) = (u.hypot(v), s.hypot(t));
         let off = (radius - end).abs();
-        if radius == 0.0 || off > RADIUS_TOLERANCE[0].min(RADIUS_TOLERANCE[1] * radius.max(0.01)) {
+        if radius == 0.0 || off > RADIUS_TOLERANCE[0].min(RADIUS_TOLERANCE[1] * radius) {
             let found = format!("the radius of the arc is {radius:.4} mm at its beginning and {end:.4} mm at its end");
             return Err((found, "correct its centre or its end"));
         }
@@ -62,16 +64,17 @@ impl Arc {
             let up = turn.rem_euclid(TAU);
             if up < 1e-9 { up + TAU } else { up }
         };
-        Ok(Self { plane, from, centre, radius, begins, sweep, rise: to[c] - from[c] })
+        Ok(Self { plane, from, centre, radius, end_radius: end, begins, sweep, rise: to[c] - from[c] })
     }
 
     /// Returns the point at a share of the way.
     pub(super) fn at(&self, share: f64) -> Point {
         let [a, b, c] = self.plane.0;
         let (sine, cosine) = (self.begins + self.sweep * share).sin_cos();
+        let radius = self.radius + (self.end_radius - self.radius) * share;
         let mut at = self.from;
-        at[a] = self.centre[0] + self.radius * cosine;
-        at[b] = self.centre[1] + self.radius * sine;
+        at[a] = self.centre[0] + radius * cosine;
+        at[b] = self.centre[1] + radius * sine;
         at[c] = self.from[c] + self.rise * share;
         at
     }

@@ -40,6 +40,8 @@ pub struct ProgramMap {
     pub grid: Grid,
     /// The values in millimetres, row by row with x fastest.
     pub values_mm: Vec<f64>,
+    /// Whether enough was measured around a node; all, where the file does not say.
+    pub valid: Vec<bool>,
     /// What they are.
     pub kind: MapKind,
     /// The map's own identity, or the SHA-256 of the file where it states none.
@@ -52,8 +54,19 @@ pub struct ProgramMap {
     pub simulation: bool,
 }
 
+impl ProgramMap {
+    /// Returns whether a place lies over a node around which enough was measured.
+    pub fn covers(&self, place_mm: [f64; 2]) -> bool {
+        let counts = self.grid.counts();
+        let [column, row] = [0, 1].map(|k| ((place_mm[k] - self.grid.first_mm[k]) / self.grid.spacing_mm[k]).round());
+        let inside = column >= 0.0 && row >= 0.0 && column < counts[0] as f64 && row < counts[1] as f64;
+        inside && self.valid[row as usize * counts[0] + column as usize]
+    }
+}
+
 /// Reads a map: a header `x_mm,y_mm,error_mm` or `x_mm,y_mm,correction_mm`, perhaps with further columns, and a row for every node of a
-/// regular grid. Comments tell `part: sha256 ...`, `map: sha256 ...`, `ground with: sha256 ...` and `SIMULATION`.
+/// regular grid. A column `valid` says with 0 around which nodes too little was measured: a map that Regrind made has them levelled off, in another one their
+/// values are not used, and the nearest valid ones stand there. Comments tell `part: sha256 ...`, `map: sha256 ...`, `ground with: sha256 ...` and `SIMULATION`.
 ///
 /// # Errors
 /// A file that cannot be read, other columns, rows that are no numbers, nodes that are no whole grid.
@@ -86,7 +99,10 @@ pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
 struct MapLines {
     hash: Sha256,
     kind: Option<MapKind>,
+    /// Which column says whether a node is valid.
+    valid_column: Option<usize>,
     nodes: Vec<Point>,
+    valid: Vec<bool>,
     simulation: bool,
     part: Option<[u8; 32]>,
     /// The map's own identity.
@@ -106,8 +122,16 @@ impl MapLines {
             self.ground_with = self.ground_with.or(identity_in(comment, "ground with:"));
         } else if !text.is_empty() && self.kind.is_none() {
             self.kind = Some(columns(text).ok_or_else(|| format!("the columns are {text:?}"))?);
+            self.valid_column = text.split(',').position(|name| name.trim() == "valid");
         } else if !text.is_empty() {
-            self.nodes.push(node(text).ok_or_else(|| format!("{text:?} is no node of a map"))?);
+            let cell = self.valid_column.map(|column| text.split(',').nth(column).map(str::trim));
+            let valid = match cell {
+                None | Some(Some("1" | "true")) => true,
+                Some(Some("0" | "false")) => false,
+                Some(other) => return Err(format!("{:?} says neither 1 nor 0 of a node", other.unwrap_or_default())),
+            };
+            self.nodes.push(node(text, valid).ok_or_else(|| format!("{text:?} is no node of a map"))?);
+            self.valid.push(valid);
         }
         Ok(())
     }
@@ -117,11 +141,20 @@ impl MapLines {
         let remedy = "every node of a regular grid needs its row";
         let no_grid = |what: String| GcodeError::Program { path: path.to_owned(), what, remedy };
         let kind = self.kind.ok_or_else(|| no_grid("the map is empty".into()))?;
-        let (grid, values_mm) =
+        let (grid, order) =
             grid(&self.nodes).ok_or_else(|| no_grid(format!("its {} nodes are no whole grid", self.nodes.len())))?;
+        let mut values_mm: Vec<f64> = order.iter().map(|&point| self.nodes[point].z).collect();
+        let valid: Vec<bool> = order.iter().map(|&point| self.valid[point]).collect();
+        if !valid.contains(&true) {
+            return Err(no_grid("none of its nodes is valid".into()));
+        }
+        if self.stated.is_none() && self.part.is_none() {
+            level_off(&mut values_mm, &valid, grid.columns);
+        }
         Ok(ProgramMap {
             grid,
             values_mm,
+            valid,
             kind,
             identity: self.stated.unwrap_or_else(|| self.hash.finalize().into()),
             part: self.part,
@@ -144,12 +177,14 @@ fn columns(header: &str) -> Option<MapKind> {
     }
 }
 
-fn node(row: &str) -> Option<Point> {
+/// Reads the node of a row; the value of one that is not valid may be anything.
+fn node(row: &str, valid: bool) -> Option<Point> {
     let mut cells = row.split(',').map(|cell| cell.trim().parse::<f64>().ok().filter(|v| v.abs() < 1e7));
-    Some(Point::new(cells.next()??, cells.next()??, cells.next()??))
+    Some(Point::new(cells.next()??, cells.next()??, cells.next()?.or((!valid).then_some(0.0))?))
 }
 
-fn grid(points: &[Point]) -> Option<(Grid, Vec<f64>)> {
+/// The grid of the nodes, and which of them stands at each of its places.
+fn grid(points: &[Point]) -> Option<(Grid, Vec<usize>)> {
     let order = recognise_grid(points)?;
     if order.point_at.contains(&NO_POINT) {
         return None;
@@ -158,7 +193,28 @@ fn grid(points: &[Point]) -> Option<(Grid, Vec<f64>)> {
     let (first, last) = (at(0), at(order.columns * order.rows - 1));
     let spacing_mm = [(last.x - first.x) / (order.columns - 1) as f64, (last.y - first.y) / (order.rows - 1) as f64];
     let grid = Grid { columns: order.columns, rows: order.rows, first_mm: [first.x, first.y], spacing_mm };
-    Some((grid, (0..grid.len()).map(|k| at(k).z).collect()))
+    Some((grid, (0..grid.len()).map(|k| order.point_at[k] as usize).collect()))
+}
+
+/// Gives nodes that are not valid the value of the nearest one that is, by steps along rows and columns.
+fn level_off(values_mm: &mut [f64], valid: &[bool], columns: usize) {
+    let mut known = valid.to_vec();
+    let mut next: std::collections::VecDeque<usize> = (0..valid.len()).filter(|&k| valid[k]).collect();
+    while let Some(from) = next.pop_front() {
+        let column = from % columns;
+        let beside = [
+            (column > 0).then(|| from - 1),
+            (column + 1 < columns).then_some(from + 1),
+            from.checked_sub(columns),
+            Some(from + columns).filter(|&k| k < known.len()),
+        ];
+        for k in beside.into_iter().flatten() {
+            if !std::mem::replace(&mut known[k], true) {
+                values_mm[k] = values_mm[from];
+                next.push_back(k);
+            }
+        }
+    }
 }
 
 /// Finds an identity after a name in a comment.

@@ -7,6 +7,8 @@
 
 mod amend;
 mod arc;
+mod check;
+mod control;
 mod dialect;
 mod error;
 mod map;
@@ -15,7 +17,7 @@ mod read;
 mod table;
 mod write;
 
-pub use amend::{AlongNormals, Amended, Amendment, correct_program};
+pub use amend::{AlongNormals, Amended, Amendment, correct_program, is_same_file};
 pub use dialect::{ArcWords, CentreWords, Dialect, DialectError, Exactness, Fault, LINUXCNC, Tilting, Turning};
 pub use error::GcodeError;
 pub use map::{MapBase, MapKind, ProgramMap, read_program_map};

@@ -1,0 +1,347 @@
+//! Reads a corrected program again, line by line beside its base, and holds it against base and map.
+//!
+//! The interpreter here shares nothing with the one that corrects but how a line is taken apart: what one of them misreads, the other one finds.
+
+use std::collections::BTreeMap;
+
+use super::amend::{Amendment, displacement};
+use super::number::PER_MM;
+use super::read::{Block, Refusal, block};
+use regrind_core::geometry::{Point, Vector};
+
+/// More than the last digit that is written: rounding of three coordinates, and of an arc's centre.
+const DIGITS_MM: f64 = 4.0 / PER_MM;
+
+/// The base and what became of it, side by side.
+pub(super) struct Check<'a> {
+    amendment: &'a Amendment<'a>,
+    base: Machine,
+    corrected: Machine,
+}
+
+/// What a machine does and has in force.
+#[derive(Clone, Debug, Default)]
+struct Machine {
+    at: [Option<f64>; 3],
+    inches: bool,
+    by_distance: bool,
+    centres_absolute: bool,
+    /// 0 for XY, 1 for ZX, 2 for YZ.
+    plane: usize,
+    motion: Option<u8>,
+    feed: Option<f64>,
+    over: bool,
+}
+
+/// What one line moves.
+#[derive(Debug)]
+enum Way {
+    /// Not at feed: where it ends, and whether in coordinates of the machine.
+    Rapid([Option<f64>; 3]),
+    /// In coordinates of the machine: the motion and the words.
+    Machine(Option<u8>, bool, String),
+    Straight(Point, Point),
+    Round(Round),
+}
+
+/// A way around a centre, perhaps with a rise.
+#[derive(Debug)]
+struct Round {
+    from: Point,
+    to: Point,
+    centre: [f64; 2],
+    axes: [usize; 3],
+    angle: f64,
+}
+
+impl Way {
+    fn at(&self, share: f64) -> Point {
+        match self {
+            Self::Straight(from, to) => from + (to - from) * share,
+            Self::Round(round) => round.at(share),
+            Self::Rapid(_) | Self::Machine(..) => Point::origin(),
+        }
+    }
+
+    fn length(&self) -> f64 {
+        match self {
+            Self::Straight(from, to) => (to - from).norm(),
+            Self::Round(round) => round.length(),
+            Self::Rapid(_) | Self::Machine(..) => 0.0,
+        }
+    }
+}
+
+impl Round {
+    /// Turns the arm at the beginning about the centre, and stretches it to the one at the end.
+    fn at(&self, share: f64) -> Point {
+        let [a, b, c] = self.axes;
+        let [p, q] = [self.from[a] - self.centre[0], self.from[b] - self.centre[1]];
+        let [s, t] = [self.to[a] - self.centre[0], self.to[b] - self.centre[1]];
+        let stretch = 1.0 + (s.hypot(t) / p.hypot(q) - 1.0) * share;
+        let (sine, cosine) = (self.angle * share).sin_cos();
+        let mut at = self.from;
+        at[a] = self.centre[0] + stretch * (p * cosine - q * sine);
+        at[b] = self.centre[1] + stretch * (p * sine + q * cosine);
+        at[c] = self.from[c] + (self.to[c] - self.from[c]) * share;
+        at
+    }
+
+    fn length(&self) -> f64 {
+        let [a, b, c] = self.axes;
+        let radius = (self.from[a] - self.centre[0]).hypot(self.from[b] - self.centre[1]);
+        (radius * self.angle).hypot(self.to[c] - self.from[c])
+    }
+}
+
+impl Machine {
+    /// Reads a line.
+    fn read(&mut self, block: &Block) -> Result<Option<Way>, String> {
+        if self.over {
+            return Ok(None);
+        }
+        let number = |letter: u8| block.words.iter().find(|w| w.letter == letter).map(|w| w.value);
+        let codes: Vec<i64> =
+            block.words.iter().filter(|w| w.letter == b'G').map(|w| (w.value * 10.0).round() as i64).collect();
+        let lost = |k: usize| {
+            let tool = |w: &&super::read::Word| w.letter == b'M' && w.value == 6.0;
+            let zero = codes.iter().any(|code| (540..600).contains(code)) || block.words.iter().find(tool).is_some();
+            zero || (k == 2 && codes.iter().any(|code| [430, 490].contains(code)))
+        };
+        (0..3).filter(|&k| lost(k)).for_each(|k| self.at[k] = None);
+        for code in &codes {
+            match code {
+                0 | 10 | 20 | 30 => self.motion = Some((code / 10) as u8),
+                800 => self.motion = None,
+                170 | 180 | 190 => self.plane = ((code - 170) / 10) as usize,
+                200 | 210 => self.inches = *code == 200,
+                900 | 910 => self.by_distance = *code == 910,
+                901 | 911 => self.centres_absolute = *code == 901,
+                _ => {}
+            }
+        }
+        let scale = if self.inches { 25.4 } else { 1.0 };
+        self.feed = number(b'F').map(|feed| feed * scale).or(self.feed);
+        self.over = block.words.iter().any(|w| w.letter == b'M' && (w.value == 2.0 || w.value == 30.0));
+        let named = [number(b'X'), number(b'Y'), number(b'Z')];
+        if let Some(code) = codes.iter().find(|code| [280, 300, 530].contains(*code)) {
+            let alone = named.iter().all(Option::is_none);
+            (0..3).filter(|&k| alone || named[k].is_some()).for_each(|k| self.at[k] = None);
+            let by = self.motion.filter(|_| *code == 530);
+            return Ok(Some(Way::Machine(by, self.by_distance, format!("{code} {named:?} {scale}"))));
+        }
+        let offsets = [number(b'I'), number(b'J'), number(b'K')];
+        let around = offsets.iter().any(Option::is_some) && matches!(self.motion, Some(2 | 3));
+        if named.iter().all(Option::is_none) && !around {
+            return Ok(None);
+        }
+        let mut to = self.at;
+        for k in 0..3 {
+            if let Some(value) = named[k] {
+                let begin = if self.by_distance { self.at[k].ok_or("a distance from an unknown place")? } else { 0.0 };
+                to[k] = Some(begin + value * scale);
+            }
+        }
+        let from = std::mem::replace(&mut self.at, to);
+        match self.motion.ok_or("axes without a motion")? {
+            0 => Ok(Some(Way::Rapid([0, 1, 2].map(|k| to[k].filter(|_| named[k].is_some()))))),
+            motion => {
+                let whole = |of: [Option<f64>; 3]| Some(Point::new(of[0]?, of[1]?, of[2]?));
+                let (from, to) = whole(from).zip(whole(to)).ok_or("a move at feed from an unknown place")?;
+                if motion == 1 {
+                    return Ok(Some(Way::Straight(from, to)));
+                }
+                self.round((from, to), motion == 3, offsets, number(b'R'), scale).map(|round| Some(Way::Round(round)))
+            }
+        }
+    }
+
+    fn round(
+        &self,
+        (from, to): (Point, Point),
+        left: bool,
+        offsets: [Option<f64>; 3],
+        radius: Option<f64>,
+        scale: f64,
+    ) -> Result<Round, String> {
+        let axes = [[0, 1, 2], [2, 0, 1], [1, 2, 0]][self.plane];
+        let [a, b, _] = axes;
+        let (p, q) = (Vector::new(from[a], from[b], 0.0), Vector::new(to[a], to[b], 0.0));
+        let centre = match radius {
+            Some(radius) => {
+                let (half, radius) = ((q - p) / 2.0, radius * scale);
+                let height2 = radius * radius - half.norm_squared();
+                let normal = Vector::new(-half.y, half.x, 0.0) / half.norm();
+                let side = if left == (radius > 0.0) { 1.0 } else { -1.0 };
+                p + half + normal * (side * height2.max(0.0).sqrt())
+            }
+            None => {
+                let of = |k: usize| offsets[k].unwrap_or(0.0) * scale;
+                let given = Vector::new(of(a), of(b), 0.0);
+                if self.centres_absolute { given } else { p + given }
+            }
+        };
+        let (begin, end) = (p - centre, q - centre);
+        let mut angle = (begin.x * end.y - begin.y * end.x).atan2(begin.x * end.x + begin.y * end.y);
+        // On the spot it is a whole turn.
+        if left && angle < 1e-9 {
+            angle += std::f64::consts::TAU;
+        } else if !left && angle > -1e-9 {
+            angle -= std::f64::consts::TAU;
+        }
+        if begin.norm() == 0.0 {
+            return Err("an arc about its own beginning".into());
+        }
+        Ok(Round { from, to, centre: [centre.x, centre.y], axes, angle })
+    }
+}
+
+impl<'a> Check<'a> {
+    /// Begins with the header of the corrected program.
+    pub(super) fn new(amendment: &'a Amendment<'a>, header: &str) -> Self {
+        let mut check = Self { amendment, base: Machine::default(), corrected: Machine::default() };
+        for line in header.lines() {
+            // The header moves nothing.
+            let _ = block(line).map(|block| check.corrected.read(&block));
+        }
+        check
+    }
+
+    /// Takes a line of the base and what became of it.
+    ///
+    /// # Errors
+    /// Lines that do something else than the base and the map.
+    pub(super) fn line(&mut self, line: &str, text: &[u8]) -> Result<(), Refusal> {
+        self.compared(line, text).map_err(|found| {
+            let found = format!("the corrected lines would not be the base and the map: {found}");
+            (found, "nothing was written; please report it with the program and the map")
+        })
+    }
+
+    fn compared(&mut self, line: &str, text: &[u8]) -> Result<(), String> {
+        let readable = |(found, _): Refusal| found;
+        let base = block(line).map_err(readable)?;
+        let over = self.base.over;
+        let wanted = self.base.read(&base)?;
+        let text = std::str::from_utf8(text).map_err(|_| "no text")?;
+        let (mut ways, mut words) = (Vec::new(), BTreeMap::new());
+        for line in text.lines() {
+            let block = block(line).map_err(readable)?;
+            count_words(&block, &mut words, 1);
+            if let Some(way) = self.corrected.read(&block)? {
+                ways.push(way);
+            }
+        }
+        count_words(&base, &mut words, -1);
+        if let (false, Some((word, _))) = (over, words.iter().find(|(_, count)| **count != 0)) {
+            return Err(format!("{word} is lost or added"));
+        }
+        self.same_state()?;
+        match (wanted, &ways[..]) {
+            (None, []) => Ok(()),
+            (Some(Way::Rapid(to)), [Way::Rapid(found)]) => {
+                let same = |k: usize| match (to[k], found[k]) {
+                    (Some(a), Some(b)) => (a - b).abs() <= DIGITS_MM,
+                    (a, b) => a == b,
+                };
+                if (0..3).all(same) { Ok(()) } else { Err(format!("a rapid move to {found:?}, not to {to:?}")) }
+            }
+            (Some(Way::Machine(by, distance, what)), [Way::Machine(found_by, found_distance, found)])
+                if by == *found_by && distance == *found_distance && what == *found =>
+            {
+                Ok(())
+            }
+            (Some(way @ (Way::Straight(..) | Way::Round(_))), [_, ..])
+                if ways.iter().all(|way| matches!(way, Way::Straight(..) | Way::Round(_))) =>
+            {
+                self.along(&way, &ways)
+            }
+            (wanted, found) => Err(format!("{} moves of another kind for {wanted:?}", found.len())),
+        }
+    }
+
+    /// Whether both have the same in force behind a line.
+    fn same_state(&self) -> Result<(), String> {
+        let (base, corrected) = (&self.base, &self.corrected);
+        let same = base.inches == corrected.inches && base.plane == corrected.plane && base.feed == corrected.feed;
+        let known = (0..3).all(|k| base.at[k].is_some() == corrected.at[k].is_some());
+        let rest = base.centres_absolute == corrected.centres_absolute && base.over == corrected.over;
+        if same && known && rest && !corrected.by_distance {
+            Ok(())
+        } else {
+            Err("another state of the control".into())
+        }
+    }
+
+    /// Whether the corrected moves keep to the base's way and the map, in order and without a detour.
+    fn along(&self, way: &Way, found: &[Way]) -> Result<(), String> {
+        let allowed = self.amendment.tolerance_mm + DIGITS_MM;
+        let at = |share: f64| {
+            let base = way.at(share);
+            displacement(self.amendment, &base).map(|by| base + by).map_err(|(found, _)| found)
+        };
+        let (begin, end) = (at(0.0)?, at(1.0)?);
+        let off = |from: Point, to: Point| (from - to).norm();
+        // The first one may only bring the tool to where the corrected way begins.
+        let brings = found.len() > 1 && off(found[0].at(1.0), begin) <= allowed;
+        let found = if brings && off(found[0].at(0.0), begin) > 0.0 { &found[1..] } else { found };
+        let (first, last) = (found[0].at(0.0), found[found.len() - 1].at(1.0));
+        if off(last, end) > allowed {
+            return Err(format!("it ends {:.6} mm beside", off(last, end)));
+        }
+        let samples = 2 * found.len() + 3;
+        let (mut k, mut before, mut length) = (0, begin, 0.0);
+        for sample in 0..=samples {
+            // Not where the points were chosen.
+            let share = if sample == samples { 1.0 } else { (sample as f64 + 0.37) / samples as f64 };
+            let wanted = at(share)?;
+            length += off(before, wanted);
+            before = wanted;
+            let away = |way: &Way| match way {
+                Way::Straight(from, to) => beside(*from, *to, wanted),
+                // The arc that stayed one goes along by the same shares.
+                round => off(round.at(share), wanted),
+            };
+            while k + 1 < found.len() && away(&found[k + 1]) <= away(&found[k]) {
+                k += 1;
+            }
+            // A straight move down to the part may begin where the rapid one ended.
+            let reaches = away(&found[k]).min(beside(first, begin, wanted));
+            if reaches > allowed {
+                return Err(format!("it is {reaches:.6} mm from where the map has it"));
+            }
+        }
+        let written: f64 = found.iter().map(Way::length).sum();
+        // Chords of the samples are shorter than an arc.
+        let longest = length.max(way.length()) + off(first, begin) + 4.0 * allowed;
+        if written > longest * (1.0 + 1e-6) {
+            return Err(format!("it is {:.6} mm longer", written - longest));
+        }
+        Ok(())
+    }
+}
+
+/// How far a point is from a straight line between two.
+fn beside(from: Point, to: Point, point: Point) -> f64 {
+    let (along, arm) = (to - from, point - from);
+    let length2 = along.norm_squared();
+    let share = if length2 > 0.0 { (arm.dot(&along) / length2).clamp(0.0, 1.0) } else { 0.0 };
+    (arm - along * share).norm()
+}
+
+/// Counts the words that neither move the tool nor number a line.
+fn count_words(block: &Block, counts: &mut BTreeMap<String, i32>, by: i32) {
+    for word in &block.words {
+        let moves = match word.letter {
+            b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'N' | b'A' | b'B' | b'C' => true,
+            b'G' => [0.0, 1.0, 2.0, 3.0, 80.0, 90.0, 91.0].contains(&word.value),
+            // The radius of an arc becomes its centre.
+            b'R' => !block.words.iter().any(|w| w.letter == b'M' && w.value == 19.0),
+            _ => false,
+        };
+        if !moves {
+            let name = format!("{}{}", char::from(word.letter), word.value);
+            *counts.entry(name).or_default() += by;
+        }
+    }
+}

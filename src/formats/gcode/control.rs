@@ -1,0 +1,390 @@
+//! What a control has in force while it reads a program, and what each line has it do.
+//!
+//! A word without a meaning in its line is refused. What a word makes unknown is forgotten: the length of a tool changes where Z is, another
+//! zero changes where all axes are.
+
+use super::arc::{Arc, Centre, Plane};
+use super::number::LARGEST_MM;
+use super::read::{Block, Refusal, Word};
+use regrind_core::geometry::Point;
+
+pub(super) const INCH_MM: f64 = 25.4;
+pub(super) const AXES: [u8; 3] = *b"XYZ";
+const TURNING: [u8; 3] = *b"ABC";
+
+/// G words of which one line may have one, in tenths.
+const GROUPS: [&[i64]; 12] = [
+    &[0, 10, 20, 30, 800],
+    &[40, 280, 300, 530],
+    &[170, 180, 190],
+    &[200, 210],
+    &[900, 910],
+    &[901, 911],
+    &[930, 940, 950],
+    &[400, 410, 411, 420, 421],
+    &[430, 490],
+    &[540, 550, 560, 570, 580, 590, 591, 592, 593],
+    &[610, 611, 640],
+    &[960, 970],
+];
+/// The same of M words.
+const M_GROUPS: [&[i64]; 4] = [&[0, 1, 2, 30, 60], &[3, 4, 5, 19], &[6], &[48, 49]];
+
+/// What a line has the tool do, in millimetres.
+#[derive(Debug)]
+pub(super) enum Act {
+    /// Nothing: the line puts something in force.
+    Stay,
+    /// Axes that turn are brought to 0, by the motion in force.
+    Upright { by: u8 },
+    /// A rapid move of the axes that are named.
+    Rapid([Option<f64>; 3]),
+    /// A move to the reference point (G28, G30) or in machine coordinates (G53), by the motion in force.
+    Machine { by: Option<u8> },
+    /// A move at feed: a straight one, or an arc.
+    Feed { from: Point, to: Point, arc: Option<Arc> },
+}
+
+/// The state of a control, as far as it tells where the tool moves.
+#[derive(Debug)]
+pub(super) struct Control {
+    /// Where the program has the tool; `None` where an axis is not known.
+    pub at: [Option<f64>; 3],
+    pub unit_mm: f64,
+    pub relative: bool,
+    pub arcs_absolute: bool,
+    /// Whether the program ended.
+    pub ended: bool,
+    motion: Option<u8>,
+    plane: Plane,
+    system: Option<i64>,
+    /// Whether anything was moved at feed by now: neither the zero nor an axis that turns may change after that.
+    moved: bool,
+    /// The axes that turn and are known to stand at 0.
+    upright: [bool; 3],
+}
+
+/// What the words of a line ask for.
+#[derive(Default)]
+struct Asked {
+    motion: Option<u8>,
+    dwell: bool,
+    machine: bool,
+    reference: bool,
+    /// Words that take P, Q, R, H or D.
+    takes: Vec<u8>,
+    /// Axes that are not known any more before the line moves.
+    forgets: [bool; 3],
+}
+
+impl Control {
+    pub(super) fn new() -> Self {
+        Self {
+            at: [None; 3],
+            unit_mm: 1.0,
+            relative: false,
+            arcs_absolute: false,
+            ended: false,
+            motion: None,
+            plane: Plane::XY,
+            system: None,
+            moved: false,
+            upright: [false; 3],
+        }
+    }
+
+    /// Takes in a line and returns what it has the tool do.
+    pub(super) fn take(&mut self, block: &Block) -> Result<Act, Refusal> {
+        let asked = self.states(block)?;
+        (0..3).filter(|&k| asked.forgets[k]).for_each(|k| self.at[k] = None);
+        let turned = self.turning(block, &asked)?;
+        let named = AXES.map(|letter| value(block, letter));
+        let axes = named.iter().any(Option::is_some);
+        let centre = [b'I', b'J', b'K'].iter().any(|letter| value(block, *letter).is_some());
+        let turns = self.motion.filter(|motion| *motion > 1 && !asked.machine && !asked.reference && !asked.dwell);
+        let moves = axes || (turns.is_some() && (centre || asked.motion.is_some()));
+        let is_arc = moves && turns.is_some();
+        if asked.machine || asked.reference {
+            let act = self.machine(&asked, named, axes)?;
+            return check_uses(block, &asked, moves, is_arc).map(|()| act);
+        }
+        check_uses(block, &asked, moves, is_arc)?;
+        if !moves && turned.is_none() {
+            return Ok(Act::Stay);
+        }
+        let Some(motion) = self.motion else {
+            return Err(("axes are named and no G0, G1, G2 or G3 is in force".into(), "write which move is meant"));
+        };
+        if let (Some((word, true)), true) = (turned, moves && motion > 0 || motion > 1) {
+            return Err(axis_refused(word));
+        }
+        if !moves {
+            return Ok(Act::Upright { by: motion });
+        }
+        let target = self.target(named)?;
+        if motion == 0 {
+            let to = [0, 1, 2].map(|k| target[k].filter(|_| named[k].is_some()));
+            self.at = target;
+            return Ok(Act::Rapid(to));
+        }
+        let (Some(from), Some(to)) = (all(self.at), all(target)) else {
+            let missing: String =
+                ['X', 'Y', 'Z'].into_iter().zip(self.at).filter(|(_, v)| v.is_none()).map(|(c, _)| c).collect();
+            let remedy = "write a G0 with these axes before it";
+            return Err((format!("it is not known where {missing} is when this move begins"), remedy));
+        };
+        self.moved = true;
+        let arc = is_arc.then(|| self.arc(block, from, to, motion == 2)).transpose()?;
+        self.at = target;
+        Ok(Act::Feed { from, to, arc })
+    }
+
+    /// Takes in what a line puts in force; refuses what moves the tool otherwise.
+    fn states(&mut self, block: &Block) -> Result<Asked, Refusal> {
+        let mut asked = Asked::default();
+        for word in &block.words {
+            match word.letter {
+                b'G' => self.g(word, &mut asked)?,
+                b'M' => self.m(word, &mut asked)?,
+                b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'R' | b'F' | b'S' | b'T' | b'H' | b'D' | b'P' | b'Q'
+                | b'N' | b'A' | b'B' | b'C' => {}
+                b'U' | b'V' | b'W' => return Err(axis_refused(word)),
+                _ => return Err((format!("{} is not known", word.text), "remove it, if it does not move the tool")),
+            }
+        }
+        check_once(block)?;
+        Ok(asked)
+    }
+
+    fn g(&mut self, word: &Word, asked: &mut Asked) -> Result<(), Refusal> {
+        match tenths(word).ok_or_else(|| (format!("{} is not known", word.text), "correct the number"))? {
+            code @ (0 | 10 | 20 | 30) => {
+                (self.motion, asked.motion) = (Some((code / 10) as u8), Some((code / 10) as u8));
+            }
+            40 => (asked.dwell, asked.takes) = (true, [&asked.takes[..], b"P"].concat()),
+            170 => self.plane = Plane::XY,
+            180 => self.plane = Plane::ZX,
+            190 => self.plane = Plane::YZ,
+            200 => self.unit_mm = INCH_MM,
+            210 => self.unit_mm = 1.0,
+            900 => self.relative = false,
+            910 => self.relative = true,
+            901 => self.arcs_absolute = true,
+            911 => self.arcs_absolute = false,
+            280 | 300 => asked.reference = true,
+            530 => asked.machine = true,
+            code @ (540 | 550 | 560 | 570 | 580 | 590 | 591 | 592 | 593) => self.choose_system(code, word, asked)?,
+            800 => self.motion = None,
+            // Another length of the tool is another Z under the same place.
+            430 | 490 => {
+                asked.forgets[2] = true;
+                asked.takes.push(b'H');
+            }
+            640 => asked.takes.extend(b"PQ"),
+            960 => asked.takes.push(b'D'),
+            400 | 610 | 611 | 940 | 950 | 970 | 980 | 990 => {}
+            930 => {
+                let remedy = "let the CAM system write feeds a minute (G94)";
+                return Err((
+                    format!("{} states times of moves, which a divided line does not keep", word.text),
+                    remedy,
+                ));
+            }
+            410..=429 => {
+                let remedy = "let the CAM system write the path of the tool's centre (G40)";
+                return Err((format!("{} lets the controller move the path by a radius", word.text), remedy));
+            }
+            730 | 760 | 810..=890 => {
+                let remedy = "let the CAM system write the moves of the cycle out";
+                return Err((format!("{} is a canned cycle", word.text), remedy));
+            }
+            _ => {
+                let found =
+                    format!("{} may move the tool or the zero in a way that the program does not tell", word.text);
+                return Err((found, "let the CAM system write plain G0, G1, G2 and G3"));
+            }
+        }
+        Ok(())
+    }
+
+    fn choose_system(&mut self, code: i64, word: &Word, asked: &mut Asked) -> Result<(), Refusal> {
+        let same = self.system == Some(code);
+        if !same && self.moved {
+            let remedy = "a map belongs to one zero: divide the program";
+            return Err((format!("{} changes the zero after the tool has moved at feed", word.text), remedy));
+        }
+        asked.forgets = if same { asked.forgets } else { [true; 3] };
+        self.system = Some(code);
+        Ok(())
+    }
+
+    fn m(&mut self, word: &Word, asked: &mut Asked) -> Result<(), Refusal> {
+        match word.value {
+            v if v == 2.0 || v == 30.0 => self.ended = true,
+            // The tool goes where the machine changes it.
+            6.0 => asked.forgets = [true; 3],
+            19.0 => asked.takes.extend(b"RPQ"),
+            v if v.fract() == 0.0 && (matches!(v as i64, 61..=68)) => asked.takes.extend(b"PQ"),
+            v if v.fract() == 0.0 && (matches!(v as i64, 0..=9 | 48..=53 | 60)) => {}
+            _ => {
+                let found = format!("{} is a subprogram, a state of the controller, or the machine's own", word.text);
+                return Err((found, "remove it, or write out what it does"));
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes in axes that turn the part or the tool: they may be brought to 0, where a map over x and y holds.
+    ///
+    /// Returns the first of them, and whether one of them may turn now.
+    fn turning<'w>(&mut self, block: &'w Block, asked: &Asked) -> Result<Option<(&'w Word<'w>, bool)>, Refusal> {
+        let mut first = None;
+        for word in &block.words {
+            let Some(k) = TURNING.iter().position(|letter| *letter == word.letter) else { continue };
+            let may_turn = self.moved && !self.upright[k];
+            let to_nothing = word.value == 0.0 && (self.upright[k] || !self.relative);
+            if !to_nothing || may_turn || asked.machine || asked.reference || asked.dwell {
+                return Err(axis_refused(word));
+            }
+            let turns = !std::mem::replace(&mut self.upright[k], true);
+            let (word, before) = first.unwrap_or((word, false));
+            first = Some((word, before || turns));
+        }
+        Ok(first)
+    }
+
+    /// A move that the program tells in coordinates of the machine: its axes are not known after it.
+    fn machine(&mut self, asked: &Asked, named: [Option<f64>; 3], axes: bool) -> Result<Act, Refusal> {
+        if asked.machine && (self.relative || self.motion.is_none_or(|motion| motion > 1)) {
+            return Err(("G53 stands with an arc, without a move or in G91".into(), "G53 goes with G0 and G1, in G90"));
+        }
+        if asked.machine && !axes {
+            return Err(("G53 names no axis".into(), "name the axes that move"));
+        }
+        // Without an axis all of them go to the reference point.
+        (0..3).filter(|&k| named[k].is_some() || !axes).for_each(|k| self.at[k] = None);
+        Ok(Act::Machine { by: self.motion.filter(|_| asked.machine) })
+    }
+
+    /// Where the program moves to.
+    fn target(&self, named: [Option<f64>; 3]) -> Result<[Option<f64>; 3], Refusal> {
+        let mut target = self.at;
+        for k in 0..3 {
+            let Some(value) = named[k].map(|v| v * self.unit_mm) else { continue };
+            let to = if self.relative {
+                let Some(before) = self.at[k] else {
+                    let found = format!("{} moves by a distance from a place that is not known", ['X', 'Y', 'Z'][k]);
+                    return Err((found, "begin with a G0 in absolute coordinates (G90)"));
+                };
+                before + value
+            } else {
+                value
+            };
+            if to.abs() > LARGEST_MM {
+                let found = format!(
+                    "{} goes to {to:e} mm, farther than the {LARGEST_MM:e} that are written",
+                    ['X', 'Y', 'Z'][k]
+                );
+                return Err((found, "correct the number, or the unit (G20, G21)"));
+            }
+            target[k] = Some(to);
+        }
+        Ok(target)
+    }
+
+    fn arc(&self, block: &Block, from: Point, to: Point, clockwise: bool) -> Result<Arc, Refusal> {
+        let value = |letter: u8| value(block, letter).map(|value| value * self.unit_mm);
+        if value(b'P').is_some() {
+            return Err(("P lets the arc turn several times".into(), "write a line for every turn"));
+        }
+        let [a, b, c] = self.plane.0;
+        let centres = [b'I', b'J', b'K'].map(value);
+        let centre = match (value(b'R'), centres[a].is_some() || centres[b].is_some()) {
+            (Some(radius), false) if centres[c].is_none() => Centre::Radius(radius),
+            (None, true) if centres[c].is_none() => Centre::At([a, b].map(|k| {
+                let at = centres[k].unwrap_or(0.0);
+                if self.arcs_absolute { at } else { at + from[k] }
+            })),
+            _ => {
+                let remedy = "give the two of I, J, K that lie in the plane of the arc, or R";
+                return Err(("the centre of the arc is not told, or told twice".into(), remedy));
+            }
+        };
+        if self.arcs_absolute && (centres[a].is_none() || centres[b].is_none()) && matches!(centre, Centre::At(_)) {
+            return Err(("G90.1 asks for both places of the centre".into(), "add the missing one"));
+        }
+        Arc::new(self.plane, from, to, clockwise, centre)
+    }
+}
+
+pub(super) fn value(block: &Block, letter: u8) -> Option<f64> {
+    block.words.iter().find(|word| word.letter == letter).map(|word| word.value)
+}
+
+pub(super) fn all(of: [Option<f64>; 3]) -> Option<Point> {
+    Some(Point::new(of[0]?, of[1]?, of[2]?))
+}
+
+/// Ten times the number of a word, if it has one decimal at most.
+pub(super) fn tenths(word: &Word) -> Option<i64> {
+    let tenths = (word.value * 10.0).round();
+    ((word.value * 10.0 - tenths).abs() <= 1e-6).then_some(tenths as i64)
+}
+
+fn axis_refused(word: &Word) -> Refusal {
+    let found = format!("{} moves an axis that turns the part or the tool", word.text);
+    (
+        found,
+        "only programs of X, Y and Z can be corrected by a map over x and y, with other axes at 0 from the beginning",
+    )
+}
+
+/// Refuses words that stand twice, and words of which a line may have one.
+fn check_once(block: &Block) -> Result<(), Refusal> {
+    for (k, word) in block.words.iter().enumerate() {
+        let before = &block.words[..k];
+        let same = |groups: &[&[i64]], code: i64| {
+            let group = groups.iter().find(|group| group.contains(&code)).copied().unwrap_or(&[]);
+            before.iter().find(|other| {
+                let number = if other.letter == b'G' { tenths(other) } else { Some(other.value as i64) };
+                other.letter == word.letter && number.is_some_and(|number| group.contains(&number))
+            })
+        };
+        let other = match word.letter {
+            b'G' => same(&GROUPS, tenths(word).unwrap_or(i64::MIN)),
+            b'M' => same(&M_GROUPS, word.value as i64),
+            letter if before.iter().any(|other| other.letter == letter) => {
+                return Err((format!("{} stands twice", char::from(letter)), "keep one of them"));
+            }
+            _ => None,
+        };
+        if let Some(other) = other {
+            let found =
+                format!("{} and {} stand in one line, and only one of them can be meant", other.text, word.text);
+            return Err((found, "divide the line, or keep one of them"));
+        }
+    }
+    Ok(())
+}
+
+/// Refuses words that nothing in their line takes.
+fn check_uses(block: &Block, asked: &Asked, moves: bool, is_arc: bool) -> Result<(), Refusal> {
+    for word in &block.words {
+        let used = match word.letter {
+            b'X' | b'Y' | b'Z' => (moves || asked.machine || asked.reference) && !asked.dwell,
+            b'I' | b'J' | b'K' => is_arc,
+            b'R' | b'P' => is_arc || asked.takes.contains(&word.letter),
+            b'Q' | b'H' | b'D' => asked.takes.contains(&word.letter),
+            _ => true,
+        };
+        if !used {
+            let found = format!("{} has no meaning in this line", word.text);
+            return Err((found, "write what it belongs to into the line, or remove it"));
+        }
+    }
+    if asked.motion.is_some() && (asked.reference || asked.dwell) {
+        let found = "a move stands in one line with a pause or with a way to the reference point".to_owned();
+        return Err((found, "divide the line"));
+    }
+    Ok(())
+}
