@@ -67,7 +67,7 @@ refused. Refused too, with their line: a word that has no meaning in its line, v
 compensation, G92 and other moved zeros, inverse time, axes that turn away from 0, a change of the work coordinates on
 the way. Comments are kept, line numbers are not.
 
-A program without a move at feed is refused, one whose moves at feed all lie beside the map, and a correction of more
+A program without a move at feed is refused, one of whose moves at feed hardly any lie over the map, and a correction of more
 than --largest-correction-um. Lengths beside the map are told: there its outermost values are levelled off within five
 nodes. Before the new program gets its name its lines are read again by other means and held against base and map.
 

@@ -159,9 +159,10 @@ fn confirm(part: &Part, found: &Registration, measured: &[Point], options: &Opti
     if !doubtful {
         return Ok(());
     }
-    // A pose that is held does not tell a mirror image from a part that lies elsewhere: both are compared as they fit when nothing holds them.
+    // A pose that is held does not tell a mirror image from a part that lies elsewhere, and what a tenth of the points say of a defect does not tell
+    // it from another surface: both are compared as they fit when nothing holds them, by the same measure.
     let is_held = options.locked.contains(&true);
-    let free_rms_mm = if is_held { free_rms(part, measured, options, found.side).unwrap_or(rms_mm) } else { rms_mm };
+    let free_rms_mm = free_rms(part, measured, options, found.side).unwrap_or(rms_mm);
     if let Some(mirrored_rms_mm) = mirrored_rms(part, measured, options, found.side)
         && mirrored_rms_mm < 0.3 * free_rms_mm
         && mirrored_rms_mm <= limit_mm

@@ -31,6 +31,9 @@ const MOST_BYTES: u64 = 1 << 30;
 /// Most points that one line is divided into.
 const MOST_POINTS: f64 = 2e6;
 
+/// A program of which more than this share lies beside the map is not that of the map, or in another unit.
+const MOST_BESIDE: f64 = 0.95;
+
 /// How a program is corrected.
 #[derive(Debug)]
 pub struct Amendment<'a> {
@@ -84,7 +87,7 @@ pub struct Amended {
 ///
 /// # Errors
 /// A program that has the map in it already, that belongs to another part or has another correction in it than the map takes up, or that
-/// holds what cannot be corrected; one without a move at feed, or with none over the map; corrected lines that are not the base and the map; files.
+/// holds what cannot be corrected; one without a move at feed, or with hardly any over the map; corrected lines that are not the base and the map; files.
 pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result<Amended, GcodeError> {
     let bytes = read_whole(base, MOST_BYTES)?;
     let program = |what: &str, remedy| GcodeError::Program { path: base.to_owned(), what: what.into(), remedy };

@@ -229,6 +229,14 @@ fn what_a_surface_cannot_see_begins_at_the_frame_of_the_file() {
     let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
     let turned = found.cmm_from_model.angle_rad().to_degrees();
     assert!(turned < 3.0, "a flat is turned by {turned} degrees");
+    // A bump on a twentieth of the touches is a defect: a flat is its own mirror image.
+    let bump = |p: &Point| {
+        let away = (p.x - 9.0).hypot(p.y + 5.0);
+        Point::new(p.x, p.y, RADIUS_MM + 1e-3 * (1.0 - away / 6.0).max(0.0))
+    };
+    let bumped: Vec<Point> = (0..25 * 17).map(|k| bump(&centre(k))).collect();
+    let found = register(&nominal, &bumped, &Options::new(RADIUS_MM)).unwrap();
+    assert!(found.verdict.pv_mm > 6e-4 && found.cmm_from_model.angle_rad() < 1e-3, "{}", found.verdict.pv_mm);
 
     let sphere = Sphere { radius_mm: 80.0 };
     let cap = |k: usize| {
