@@ -20,7 +20,7 @@ use regrind::drive::{Reply, Request};
 use regrind::formats::gcode::{
     AlongNormals, Amendment, MapBase, MapKind, ProgramMap, correct_program, read_program_map,
 };
-use regrind::formats::result::{Content, Coordinates, DecimalMark, LengthUnit, check_ended, parse_result};
+use regrind::formats::result::{Content, Coordinates, DecimalMark, check_ended, parse_result};
 use regrind::formats::{
     HeightMap, LIMIT_MM, Learned, X3pFile, parse_metropro, parse_ply, parse_points, parse_sdf, parse_stl, parse_x3p,
     read_error_map, references::parse_references,
@@ -126,17 +126,17 @@ pub fn result(bytes: &[u8]) -> bool {
     let _ = check_ended(path(), bytes);
     let mut is_read = false;
     for (coordinates, decimal, unit) in [
-        (None, DecimalMark::Auto, LengthUnit::Mm),
-        (Some(Coordinates::Centres), DecimalMark::Comma, LengthUnit::Mm),
-        (Some(Coordinates::Contacts), DecimalMark::Point, LengthUnit::Inch),
+        (None, DecimalMark::Auto, Unit::Millimetre),
+        (Some(Coordinates::Centres), DecimalMark::Comma, Unit::Millimetre),
+        (Some(Coordinates::Contacts), DecimalMark::Point, Unit::Inch),
     ] {
-        let content = Content { coordinates, decimal, unit_mm: unit.mm() };
+        let content = Content { coordinates, decimal, unit, columns: None };
         let Ok(file) = parse_result(path(), bytes, &content) else { continue };
         is_read = true;
-        assert!(file.points.iter().all(|p| p.iter().all(|v| v.abs() <= LIMIT_MM * content.unit_mm)));
+        assert!(file.points.iter().all(|p| p.iter().all(|v| v.abs() <= LIMIT_MM * content.unit.in_mm())));
         assert!(file.indices.as_ref().is_none_or(|all| all.len() == file.points.len()));
         assert!(file.names.as_ref().is_none_or(|all| all.len() == file.points.len()));
-        let told = [file.probe_radius_mm, file.statements.temperature_c, file.statements.unit_mm];
+        let told = [file.probe_radius_mm, file.statements.temperature_c, file.statements.unit.map(Unit::in_mm)];
         assert!(told.into_iter().flatten().all(f64::is_finite));
         let targets = [0, 1, 2, 7];
         for targets in [None, Some(&targets[..])] {

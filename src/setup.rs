@@ -38,6 +38,8 @@ pub enum SetupError {
     Nominal { path: PathBuf, source: SurfaceError },
     #[error("{path}: {source}")]
     Definition { path: PathBuf, source: DefinitionError },
+    #[error("{}: {key}: {what}; correct the key", .path.display())]
+    Table { path: PathBuf, key: &'static str, what: String },
     #[error("{path}: {source}")]
     Pattern { path: PathBuf, source: PatternError },
     #[error(
@@ -287,8 +289,10 @@ fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> 
             let identity = identity_of(&nominal);
             Ok((nominal, recipe.path().to_owned(), identity))
         }
-        NominalSource::File { path, projection, aperture } => {
-            let (file, identity) = formats::read_nominal_with_identity(path)?;
+        NominalSource::File { path, columns, unit, projection, aperture } => {
+            let table = nominal_table(columns.as_deref(), unit.as_deref())
+                .map_err(|(key, what)| SetupError::Table { path: recipe.path().to_owned(), key, what })?;
+            let (file, identity) = formats::read_nominal_with_identity(path, &table)?;
             let nominal = surface(path, file, *projection)?;
             let nominal = match aperture {
                 Some(outline) => nominal.with_outline(outline.clone()),
@@ -297,6 +301,17 @@ fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> 
             Ok((nominal, path.clone(), identity))
         }
     }
+}
+
+/// Reads what a recipe says of its table of nominal points.
+///
+/// # Errors
+/// The key whose words cannot be understood, and why.
+pub fn nominal_table(columns: Option<&str>, unit: Option<&str>) -> Result<formats::Table, (&'static str, String)> {
+    Ok(formats::Table {
+        columns: columns.map(str::parse).transpose().map_err(|what| ("nominal.columns", what))?,
+        unit: unit.map(str::parse).transpose().map_err(|what| ("nominal.unit", what))?,
+    })
 }
 
 /// Makes the nominal surface of what a file holds; only points are projected.

@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use super::choice::word_of;
 use super::failure::Failure;
-use super::nominal;
+use super::nominal::{self, NominalTable};
 use super::words::{counted, three_digits};
 use super::{Outcome, finite_above_zero};
 
@@ -29,6 +29,8 @@ pub(super) struct Arguments {
     /// Nominal surface: points as text or PLY, a mesh as STL or PLY, or a TOML definition, in mm
     #[arg(long, value_name = "FILE")]
     nominal: PathBuf,
+    #[command(flatten)]
+    table: NominalTable,
     /// What scattered points are projected onto
     #[arg(long, value_parser = word_of::<Projection>(), default_value = "auto")]
     projection: Projection,
@@ -91,7 +93,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 fn judge(arguments: &Arguments) -> Result<Accuracy, Failure> {
     let path = &arguments.nominal;
     let projection = arguments.projection;
-    match nominal::read(path, arguments.projection)? {
+    match nominal::read(path, arguments.projection, &arguments.table.table())? {
         NominalFile::Points(points) | NominalFile::Mesh { points, .. } => {
             accuracy(Samples::Points { points: &points, projection })
         }

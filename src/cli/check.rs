@@ -11,6 +11,7 @@ use console::Term;
 use regrind::config::{CellConfig, read_dialect};
 use regrind::document::{Problem, Problems};
 use regrind::recipe::{NominalSource, Pattern, Recipe};
+use regrind::setup::nominal_table;
 use regrind::surface::Projection;
 use regrind_sim::spec::WorldSpec;
 use serde::Serialize;
@@ -131,22 +132,27 @@ fn has_table(path: &Path, heads: &[&str]) -> bool {
 /// Reads the files that a recipe names.
 fn check_files(recipe: &Recipe) -> Result<(), Problems> {
     let mut problems: Option<Problems> = None;
-    let mut add = |key: &str, failure: Failure| {
+    let mut add = |key: &str, failure: &dyn std::fmt::Display| {
         let more = recipe.problem(key, &format!("cannot be used: {failure}"), "", "");
         match &mut problems {
             None => problems = Some(more),
             Some(problems) => problems.problems.extend(more.problems),
         }
     };
-    if let NominalSource::File { path, .. } = &recipe.nominal
-        && let Err(failure) = nominal::read(path, Projection::Auto)
-    {
-        add("nominal.file", failure);
+    if let NominalSource::File { path, columns, unit, .. } = &recipe.nominal {
+        match nominal_table(columns.as_deref(), unit.as_deref()) {
+            Err((key, what)) => add(key, &what),
+            Ok(table) => {
+                if let Err(failure) = nominal::read(path, Projection::Auto, &table) {
+                    add("nominal.file", &failure);
+                }
+            }
+        }
     }
     if let Pattern::File(path) = &recipe.pattern
         && let Err(failure) = regrind::formats::read_points(path)
     {
-        add("measure.file", failure.into());
+        add("measure.file", &failure);
     }
     problems.map_or(Ok(()), Err)
 }

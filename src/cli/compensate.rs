@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use regrind::compensation::Correction;
 use regrind::compensation::path::{Wanted, height_of, spline_of};
+use regrind::formats::Table;
 use regrind::formats::gcode::{
     AlongNormals, Amended, Amendment, GcodeError, MapKind, correct_program, is_same_file, read_program_map,
 };
@@ -13,7 +14,7 @@ use regrind::surface::Projection;
 use serde::Serialize;
 
 use super::failure::Failure;
-use super::nominal;
+use super::nominal::{self, NominalTable};
 use super::words::three_digits;
 use super::{Outcome, finite_above_zero};
 
@@ -37,6 +38,8 @@ pub(super) struct Arguments {
     /// Apply the map along the normals of this nominal surface instead of along z
     #[arg(long, value_name = "FILE")]
     nominal: Option<PathBuf>,
+    #[command(flatten)]
+    table: NominalTable,
     /// With --nominal: the program moves the lowest point of a ball of this radius, not its centre; in mm
     #[arg(long, value_name = "MM", requires = "nominal", value_parser = finite_above_zero)]
     tip_of_radius: Option<f64>,
@@ -101,7 +104,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let tip_mm = arguments.tip_of_radius.unwrap_or(0.0);
     let level_off_mm = LEVEL_OFF_NODES * map.grid.spacing_mm[0].max(map.grid.spacing_mm[1]);
     let shift = spline_of(&Correction { grid: map.grid, values_mm, cycle: 1, level_mm: 0.0, set: None }, level_off_mm);
-    let ground = arguments.nominal.as_ref().map(|file| ground(file)).transpose()?;
+    let ground = arguments.nominal.as_ref().map(|file| ground(file, &arguments.table.table())).transpose()?;
     let amendment = Amendment {
         shift: &shift,
         along_normals: ground.as_ref().map(|nominal| AlongNormals { nominal, centre_above_mm: tip_mm }),
@@ -147,8 +150,8 @@ fn summary(amended: &Amended) -> String {
 const LEVEL_OFF_NODES: f64 = 5.0;
 
 /// Reads the nominal surface.
-fn ground(file: &std::path::Path) -> Result<Wanted, Failure> {
-    let surface = nominal::surface(file, Projection::Auto)?;
+fn ground(file: &std::path::Path, table: &Table) -> Result<Wanted, Failure> {
+    let surface = nominal::surface(file, Projection::Auto, table)?;
     let failed = |source| Failure::Path { path: file.to_owned(), source };
     let (field, _) = height_of(&surface).map_err(failed)?;
     let grid = Grid { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [1.0; 2] };

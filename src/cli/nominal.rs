@@ -2,22 +2,36 @@
 
 use std::path::Path;
 
-use regrind::formats::{NominalFile, Table, read_nominal_as};
+use clap::Args;
+use regrind::formats::{Columns, NominalFile, Table, Unit, read_nominal_as};
 use regrind::setup;
 use regrind::surface::{DefinedSurface, Nominal, NominalKind, Projection, SampledSurface};
 
 use super::failure::Failure;
 use super::words::count;
 
-/// Reads a nominal file.
-///
-/// # Errors
-/// A file that cannot be read, and a projection for what is no cloud of points.
-pub(super) fn read(path: &Path, projection: Projection) -> Result<NominalFile, Failure> {
-    read_as(path, projection, &Table::default())
+/// What a person says of a nominal table.
+#[derive(Args, Clone, Debug, Default)]
+pub(super) struct NominalTable {
+    /// Columns of the nominal table, by name or by number from 1, where its header does not tell
+    #[arg(long, value_name = "x=X_nom,y=Y_nom,z=Z_nom")]
+    nominal_columns: Option<Columns>,
+    /// Unit of the nominal table: mm, um, nm, cm, m or inch
+    #[arg(long, value_name = "UNIT")]
+    nominal_unit: Option<Unit>,
 }
 
-fn read_as(path: &Path, projection: Projection, table: &Table) -> Result<NominalFile, Failure> {
+impl NominalTable {
+    pub(super) fn table(&self) -> Table {
+        Table { columns: self.nominal_columns.clone(), unit: self.nominal_unit }
+    }
+}
+
+/// Reads a nominal file; of a table of points `table` says what it does not say of itself.
+///
+/// # Errors
+/// A file that cannot be read, columns that are not there, and a projection for what is no cloud of points.
+pub(super) fn read(path: &Path, projection: Projection, table: &Table) -> Result<NominalFile, Failure> {
     let file = read_nominal_as(path, table)?;
     let what = match file {
         NominalFile::Points(_) => return Ok(file),
@@ -34,16 +48,8 @@ fn read_as(path: &Path, projection: Projection, table: &Table) -> Result<Nominal
 ///
 /// # Errors
 /// Those of [`read`], and what makes no surface, by file name.
-pub(super) fn surface(path: &Path, projection: Projection) -> Result<Nominal, Failure> {
-    surface_as(path, projection, &Table::default())
-}
-
-/// The same; of a table of points `table` says what it does not say of itself.
-///
-/// # Errors
-/// Those of [`surface`], and columns that are not there.
-pub(super) fn surface_as(path: &Path, projection: Projection, table: &Table) -> Result<Nominal, Failure> {
-    setup::surface(path, read_as(path, projection, table)?, projection).map_err(Failure::Setup)
+pub(super) fn surface(path: &Path, projection: Projection, table: &Table) -> Result<Nominal, Failure> {
+    setup::surface(path, read(path, projection, table)?, projection).map_err(Failure::Setup)
 }
 
 /// Samples a defined surface at its spacing.

@@ -16,7 +16,7 @@ use regrind::surface::{Distance, Nominal, NominalKind, Projection};
 use super::choice::word_of;
 use super::failure::Failure;
 use super::initial::read_pose;
-use super::nominal::{self, kind_in_words};
+use super::nominal::{self, NominalTable, kind_in_words};
 use super::words::{count, counted, three_digits};
 use super::{Outcome, above_zero, finite_above_zero, finite_from_zero};
 
@@ -37,12 +37,8 @@ pub(super) struct Arguments {
     /// Unit of the measured table: mm, um, nm, cm, m or inch
     #[arg(long)]
     unit: Option<Unit>,
-    /// Columns of the nominal table
-    #[arg(long, value_name = "x=X_nom,y=Y_nom,z=Z_nom")]
-    nominal_columns: Option<Columns>,
-    /// Unit of the nominal table
-    #[arg(long, value_name = "UNIT")]
-    nominal_unit: Option<Unit>,
+    #[command(flatten)]
+    of_nominal: NominalTable,
     /// Radius of the probe in mm; 0 for one without a ball, such as an optical one. Not needed with --method contact
     #[arg(long, alias = "probe-radius-mm", value_name = "MM", allow_negative_numbers = true, value_parser = finite_from_zero)]
     probe_radius: Option<f64>,
@@ -171,10 +167,10 @@ fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure>
     if is_map(&arguments.measured)? && method(arguments) != Method::Contact {
         return Err(Failure::MapOfContacts { path: arguments.measured.clone() });
     }
-    let of_nominal = Table { columns: arguments.nominal_columns.clone(), unit: arguments.nominal_unit };
+    let of_nominal = arguments.of_nominal.table();
     let of_measured = Table { columns: arguments.columns.clone(), unit: arguments.unit };
     std::thread::scope(|scope| {
-        let nominal = scope.spawn(|| nominal::surface_as(path, projection, &of_nominal));
+        let nominal = scope.spawn(|| nominal::surface(path, projection, &of_nominal));
         let measured = read_measured_with_notes(&arguments.measured, &of_measured);
         let nominal = nominal.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
         Ok((nominal, measured?))

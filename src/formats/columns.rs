@@ -4,11 +4,15 @@
 //! measured stand beside nominal ones in what most machines give out, and reading those for these would make every part a good one. So a header
 //! of two groups of coordinates is a question, and a header that names no group at all is not taken for one in the usual order.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
-use super::error::FormatError;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::error::{FormatError, excerpt};
 
 /// How a table is read where it does not say so itself, or says more than one thing.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -20,7 +24,9 @@ pub struct Table {
 }
 
 /// Which columns of a table are x, y and z: `x=X_act,y=Y_act,z=Z_act` by their names, or `x=4,y=5,z=6` by their numbers from 1.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(try_from = "String", into = "String")]
+#[schemars(with = "String")]
 pub struct Columns([Column; 3]);
 
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -55,6 +61,33 @@ impl FromStr for Columns {
             return Err(format!("`{text}` gives one column to two axes"));
         }
         Ok(Self([x, y, z]))
+    }
+}
+
+impl TryFrom<String> for Columns {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
+    }
+}
+
+impl From<Columns> for String {
+    fn from(columns: Columns) -> Self {
+        columns.to_string()
+    }
+}
+
+impl fmt::Display for Columns {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (k, (axis, column)) in ["x", "y", "z"].into_iter().zip(&self.0).enumerate() {
+            f.write_str(if k > 0 { "," } else { "" })?;
+            match column {
+                Column::Named(name) => write!(f, "{axis}={name}")?,
+                Column::Numbered(number) => write!(f, "{axis}={}", number + 1)?,
+            }
+        }
+        Ok(())
     }
 }
 
@@ -100,19 +133,26 @@ impl Column {
 }
 
 /// A unit of length that tables are in.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub enum Unit {
     /// 1e-6 mm.
+    #[serde(rename = "nm")]
     Nanometre,
     /// 1e-3 mm.
+    #[serde(rename = "um")]
     Micrometre,
     /// The unit of everything here.
+    #[default]
+    #[serde(rename = "mm")]
     Millimetre,
     /// 10 mm.
+    #[serde(rename = "cm")]
     Centimetre,
     /// 1000 mm.
+    #[serde(rename = "m")]
     Metre,
     /// 25.4 mm.
+    #[serde(rename = "inch")]
     Inch,
 }
 
@@ -281,26 +321,64 @@ fn axis_of(name: &str) -> Option<(usize, Group)> {
 
 /// The columns of each group and axis, from 0.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Axes([[Vec<usize>; 3]; 3]);
+pub(super) struct Axes {
+    groups: [[Vec<usize>; 3]; 3],
+    /// A word that stands beside all three axes, and says of none of the groups that it is meant.
+    unknown: Option<String>,
+}
+
+/// Words beside an axis that make it no coordinate: deviations, directions, tolerances, uncertainties.
+#[rustfmt::skip]
+const BESIDE_AXES: [&str; 41] = [
+    "d", "dev", "devs", "deviation", "delta", "diff", "difference", "err", "error", "off", "offset", "abw", "abweichung", "ecart", "écart", "n", "norm", "normal", "normale", "normalvector", "dir", "direction",
+    "vec", "vector", "cos", "i", "tol", "tolerance", "upper", "lower", "u", "unc", "uncertainty", "sigma", "std", "rms", "res", "resolution", "scatter", "weight", "quality",
+];
+
+/// Returns the axis that a name in lower case has a word of, and what else stands in it; of a name that is one word, what stands before or behind a letter at its end.
+fn axis_beside(name: &str) -> Option<(usize, String)> {
+    let axis_of = |word: &str| ["x", "y", "z"].iter().position(|of| *of == word);
+    let words: Vec<&str> = name.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()).collect();
+    match words[..] {
+        [word] => {
+            let (first, last) = (word.chars().next()?, word.chars().next_back()?);
+            let (before, behind) = (&word[..word.len() - last.len_utf8()], &word[first.len_utf8()..]);
+            let found = axis_of(&first.to_string()).map(|axis| (axis, behind));
+            let (axis, rest) = found.or_else(|| Some((axis_of(&last.to_string())?, before)))?;
+            Some((axis, rest.to_owned())).filter(|(_, rest)| !rest.is_empty())
+        }
+        _ => {
+            let at = words.iter().position(|word| axis_of(word).is_some())?;
+            let rest: Vec<&str> = (0..words.len()).filter(|k| *k != at).map(|k| words[k]).collect();
+            Some((axis_of(words[at])?, rest.join(" "))).filter(|(_, rest)| !rest.is_empty())
+        }
+    }
+}
 
 impl Axes {
     pub(super) fn of(names: &[String]) -> Self {
         let mut axes = Self::default();
+        let mut beside: BTreeMap<String, [bool; 3]> = BTreeMap::new();
         for (column, name) in names.iter().enumerate() {
-            if let Some((axis, group)) = axis_of(split_unit(name).0) {
-                axes.0[group as usize][axis].push(column);
+            let name = split_unit(name).0;
+            if let Some((axis, group)) = axis_of(name) {
+                axes.groups[group as usize][axis].push(column);
+            } else if let Some((axis, rest)) = axis_beside(name)
+                && !rest.split(' ').any(|word| BESIDE_AXES.contains(&word))
+            {
+                beside.entry(rest).or_default()[axis] = true;
             }
         }
+        axes.unknown = beside.into_iter().find(|(_, there)| *there == [true; 3]).map(|(rest, _)| rest);
         axes
     }
 
     fn group(&self, group: Group) -> &[Vec<usize>; 3] {
-        &self.0[group as usize]
+        &self.groups[group as usize]
     }
 
-    /// Whether all three axes of any points are named.
+    /// Whether all three axes of any points are named, be it in words that nobody knows.
     pub(super) fn are_named(&self) -> bool {
-        self.0.iter().any(|group| group.iter().all(|columns| !columns.is_empty()))
+        self.unknown.is_some() || self.groups.iter().any(|group| group.iter().all(|columns| !columns.is_empty()))
     }
 
     /// Chooses the columns x, y and z, or says what of the names is not clear; `of_nominal` where the nominal points are looked for.
@@ -310,6 +388,10 @@ impl Axes {
             .filter(|group| self.group(*group).iter().any(|columns| !columns.is_empty()))
             .collect();
         let group = match there[..] {
+            [] if self.unknown.is_some() => {
+                let word = self.unknown.as_deref().unwrap_or_default();
+                return Err(format!("names x, y and z of `{word}`, and whether those were measured is not known"));
+            }
             [] => return Err("names none of x, y and z".to_owned()),
             [group] => group,
             [first, second, ..] => {
@@ -320,6 +402,9 @@ impl Axes {
             if columns.len() != 1 {
                 return Err(format!("names {} columns {axis}", columns.len()));
             }
+        }
+        if let Some(word) = &self.unknown {
+            return Err(format!("names {group} columns and others of `{word}`, and which are to be read is not said"));
         }
         if group == Group::Nominal && !of_nominal {
             return Err("names nominal columns alone, which nobody measured".to_owned());
@@ -335,14 +420,16 @@ pub(super) fn split_unit(name: &str) -> (&str, Option<String>) {
         if let (Some(at), true) = (name.rfind(open), name.ends_with(close)) {
             let unit = name[at + 1..name.len() - 1].trim();
             // Square brackets hold units by custom, round ones hold anything.
-            let states = open == '[' || is_millimetre(unit) || OTHER_UNITS.contains(&unit);
+            let is_mark = !unit.is_empty() && !unit.chars().any(char::is_alphanumeric);
+            let states = open == '[' || is_mark || is_unit(unit);
             return if states { (base_of(&name[..at]), Some(unit.to_owned())) } else { (name, None) };
         }
     }
+    if let Some(base) = INCH_MARKS.iter().find_map(|mark| name.strip_suffix(mark)) {
+        return (base_of(base), Some("inch".to_owned()));
+    }
     match name.rfind(['_', '/', ' ']) {
-        Some(at) if is_millimetre(&name[at + 1..]) || OTHER_UNITS.contains(&&name[at + 1..]) => {
-            (base_of(&name[..at]), Some(name[at + 1..].to_owned()))
-        }
+        Some(at) if is_unit(&name[at + 1..]) => (base_of(&name[..at]), Some(name[at + 1..].to_owned())),
         _ => (name, None),
     }
 }
@@ -373,32 +460,34 @@ pub(super) fn stated_unit(text: &str) -> Option<String> {
     })
 }
 
-/// Returns the unit behind a word such as "units:", if one stands there.
+/// Returns the unit behind a word such as "units:", if one stands there; behind a mark whatever stands there, for it shall be one.
 fn unit_statement(text: &str) -> Option<String> {
     let behind = text.match_indices("unit").map(|(at, word)| &text[at + word.len()..]);
     behind
         .filter_map(|after| {
             let after = after.strip_prefix(['s', 'e']).unwrap_or(after);
-            let marked = after.trim_start().strip_prefix([':', '=', '/']).map(str::trim_start);
+            let states = after.trim_start().strip_prefix([':', '=']).or_else(|| after.strip_prefix('/')).map(str::trim);
             // "unit in use" names no inch.
-            let rest = marked.or_else(|| after.strip_prefix([' ', '(', '[']))?;
+            let rest = states.or_else(|| after.strip_prefix([' ', '(', '[']))?;
             let end = rest.find(|c: char| !c.is_alphabetic()).unwrap_or(rest.len());
             let word = &rest[..end];
-            let is_meant = marked.is_some() || rest[end..].trim_matches([' ', ')', ']']).is_empty();
-            (is_meant && is_unit(word)).then(|| word.to_owned())
+            let is_meant = states.is_some() || rest[end..].trim_matches([' ', ')', ']']).is_empty();
+            let unknown = || states.filter(|rest| !rest.is_empty()).map(|rest| excerpt(rest.as_bytes()));
+            if is_meant && is_unit(word) { Some(word.to_owned()) } else { unknown() }
         })
         .next()
 }
 
-/// Refuses a file of millimetres whose header states another unit.
-pub(super) fn check_stated_unit(path: &Path, line: u64, header: &[u8]) -> Result<(), FormatError> {
+/// Refuses a file whose header states another unit than the one it is read in.
+pub(super) fn check_stated_unit(path: &Path, line: u64, header: &[u8], unit: Unit) -> Result<(), FormatError> {
     match stated_unit(&String::from_utf8_lossy(header)) {
-        Some(found) if !is_millimetre(&found) => {
-            Err(FormatError::Unit { path: path.to_owned(), line, found, unit: Unit::Millimetre })
-        }
+        Some(found) if !unit.is(&found) => Err(FormatError::Unit { path: path.to_owned(), line, found, unit }),
         _ => Ok(()),
     }
 }
+
+/// Marks of the inch.
+const INCH_MARKS: [&str; 3] = ["\"", "''", "\u{2033}"];
 
 /// Units of length that are not the millimetre, in lower case.
 #[rustfmt::skip]
@@ -428,6 +517,13 @@ mod tests {
         ];
         for (text, unit) in cases {
             assert_eq!(stated_unit(text).as_deref(), unit, "{text}");
+        }
+    }
+
+    #[test]
+    fn columns_are_written_as_they_are_read() {
+        for text in ["x=x act,y=y act,z=z act", "x=4,y=5,z=6", "x=2,y=b,z=1"] {
+            assert_eq!(text.parse::<Columns>().unwrap().to_string(), text);
         }
     }
 

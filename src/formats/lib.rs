@@ -100,21 +100,32 @@ enum Kind {
     Map(&'static MapFormat),
 }
 
-/// Reads a nominal surface as [`read_nominal`] does, and returns the SHA-256 of the file with it.
+/// Reads a nominal surface as [`read_nominal_as`] does, and returns the SHA-256 of the file with it; of the file and of what was said of its columns and unit, where
+/// something was: other columns are another surface.
 ///
 /// # Errors
-/// Those of [`read_nominal`].
-pub fn read_nominal_with_identity(path: impl AsRef<Path>) -> Result<(NominalFile, [u8; 32]), FormatError> {
+/// Those of [`read_nominal_as`].
+pub fn read_nominal_with_identity(
+    path: impl AsRef<Path>,
+    table: &Table,
+) -> Result<(NominalFile, [u8; 32]), FormatError> {
     use sha2::Digest;
     let path = path.as_ref();
-    let nominal = read_nominal(path)?;
+    let nominal = read_nominal_as(path, table)?;
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
     let mut hash = sha2::Sha256::new();
     let mut file = std::fs::File::open(path).map_err(unreadable)?;
     let mut chunk = vec![0; 1 << 16];
     loop {
         match std::io::Read::read(&mut file, &mut chunk).map_err(unreadable)? {
-            0 => return Ok((nominal, hash.finalize().into())),
+            0 => {
+                let columns = table.columns.as_ref().map(ToString::to_string);
+                let unit = table.unit.map(|unit| unit.to_string());
+                for said in [columns, unit].into_iter().flatten() {
+                    hash.update(said);
+                }
+                return Ok((nominal, hash.finalize().into()));
+            }
             n => hash.update(&chunk[..n]),
         }
     }

@@ -83,9 +83,14 @@ pub fn parse_points(path: impl AsRef<Path>, reader: impl Read + Send) -> Result<
     Cloud::new(path.as_ref(), 0, &Table::default()).read(reader).map(|read| read.points)
 }
 
-/// Reads a point cloud whose decimal mark is known from elsewhere.
-pub(super) fn parse_points_with(path: &Path, text: &[u8], decimal: Option<Decimal>) -> Result<Vec<Point>, FormatError> {
-    Cloud { decimal, ..Cloud::new(path, 0, &Table::default()) }.read(text).map(|read| read.points)
+/// Reads a point cloud of which a cell says what the file does not; the decimal mark may be known from elsewhere.
+pub(super) fn parse_points_with(
+    path: &Path,
+    text: &[u8],
+    decimal: Option<Decimal>,
+    table: &Table,
+) -> Result<Vec<Point>, FormatError> {
+    Cloud { decimal, ..Cloud::new(path, 0, table) }.read(text).map(|read| read.points)
 }
 
 /// A cloud while it is being read.

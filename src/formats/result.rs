@@ -15,13 +15,12 @@
 //! A map of an interferometer or profilometer (X3P, SDF, MetroPro) says nothing of itself; its measured samples are points of contact,
 //! in millimetres whatever the unit of other files.
 
-use std::borrow::Cow;
 use std::path::Path;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::columns::Table;
+use super::columns::{Columns, Table, Unit};
 use super::error::excerpt;
 use super::height_map::MapPoints;
 use super::layout::{Fields, Layout, Preamble, is_comment};
@@ -35,8 +34,6 @@ use regrind_core::geometry::Point;
 const MOST_BYTES: u64 = 512 << 20;
 /// Bytes at the beginning of a file in which it may say something of itself.
 const PREAMBLE_BYTES: usize = 64 << 10;
-/// Millimetres per inch.
-const INCH_MM: f64 = 25.4;
 
 /// What measured coordinates are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
@@ -70,41 +67,17 @@ pub enum DecimalMark {
     Comma,
 }
 
-/// Unit of length of files.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-#[allow(missing_docs)]
-pub enum LengthUnit {
-    #[default]
-    Mm,
-    Inch,
-}
-
-impl LengthUnit {
-    /// Millimetres per unit.
-    pub fn mm(self) -> f64 {
-        match self {
-            Self::Mm => 1.0,
-            Self::Inch => INCH_MM,
-        }
-    }
-}
-
 /// What the cell knows of its result files.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Content {
     /// What the coordinates are, where the cell says so.
     pub coordinates: Option<Coordinates>,
     /// The decimal mark.
     pub decimal: DecimalMark,
-    /// Millimetres per unit of length of the files: 1, or 25.4 for a machine that is known to write inches.
-    pub unit_mm: f64,
-}
-
-impl Default for Content {
-    fn default() -> Self {
-        Self { coordinates: None, decimal: DecimalMark::Auto, unit_mm: 1.0 }
-    }
+    /// The unit of length of the files: mm, but for a machine that is known to write another one.
+    pub unit: Unit,
+    /// Which columns of the files are x, y and z, where their headers do not say so.
+    pub columns: Option<Columns>,
 }
 
 /// What a file says of itself.
@@ -118,8 +91,8 @@ pub struct Statements {
     pub plan: Option<String>,
     /// What the coordinates are.
     pub coordinates: Option<Coordinates>,
-    /// Millimetres per unit of length.
-    pub unit_mm: Option<f64>,
+    /// Unit of length.
+    pub unit: Option<Unit>,
     /// Radius of the probe.
     pub probe_radius_mm: Option<f64>,
     /// Temperature of the part.
@@ -240,11 +213,9 @@ impl Statements {
                 };
             }
             "unit" | "units" => {
-                self.unit_mm = match value.to_lowercase().trim_end_matches('.') {
-                    "mm" | "millimetre" | "millimetres" | "millimeter" | "millimeters" => Some(1.0),
-                    "in" | "inch" | "inches" => Some(INCH_MM),
-                    _ => return Err(wrong("units", "`mm`, or `inch` where the cell file says so too")),
-                };
+                let word = value.trim_end_matches('.').parse();
+                self.unit =
+                    Some(word.map_err(|_| wrong("units", "`mm`, or another unit that the cell file says too"))?);
             }
             "probe radius mm" => {
                 self.probe_radius_mm = number("probe radius mm", 1e-3..=1e3, "a radius from 0.001 to 1000 mm")?;
@@ -276,20 +247,23 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     if dmis::is_dmis(text) {
         return dmis::parse(path, text, content);
     }
-    let unit_mm = agreed_unit(path, &statements, content)?;
+    let unit = agreed_unit(path, &statements, content)?;
     let is_ply = ply::is_ply(text);
     let decimal = match content.decimal {
         DecimalMark::Auto => None,
         DecimalMark::Point => Some(Decimal::Point),
         DecimalMark::Comma => Some(Decimal::Comma),
     };
-    let text = without_unit(text, unit_mm);
-    let mut points =
-        if is_ply { ply::parse_ply(path, &text)?.points } else { parse_points_with(path, &text, decimal)? };
-    let columns = if is_ply { Columns::default() } else { Columns::read(path, &text, points.len(), decimal)? };
-    if unit_mm != 1.0 {
-        points.iter_mut().for_each(|p| *p *= unit_mm);
-    }
+    let table = Table { columns: content.columns.clone(), unit: (unit != Unit::Millimetre).then_some(unit) };
+    let (points, columns) = if is_ply {
+        let mut points = ply::parse_ply_in(path, text, unit)?.points;
+        points.iter_mut().for_each(|point| point.coords *= unit.in_mm());
+        (points, OtherColumns::default())
+    } else {
+        let points = parse_points_with(path, text, decimal, &table)?;
+        let columns = OtherColumns::read(path, text, points.len(), decimal, &table)?;
+        (points, columns)
+    };
     let on = |k: usize| columns.enabled.get(k).copied().unwrap_or(true);
     let kept: Vec<usize> = (0..points.len()).filter(|&k| on(k)).collect();
     let switched_off = points.len() - kept.len();
@@ -308,17 +282,6 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     })
 }
 
-/// Returns a text without its statement of the unit where that is not mm and the cell has agreed to it: the reader of points refuses
-/// any other. Lines keep their numbers.
-fn without_unit(text: &[u8], unit_mm: f64) -> Cow<'_, [u8]> {
-    if unit_mm == 1.0 {
-        return Cow::Borrowed(text);
-    }
-    let states_unit = |line: &[u8]| is_comment(line) && line.to_ascii_lowercase().windows(4).any(|w| w == b"unit");
-    let kept = text.split(|&b| b == b'\n').map(|line| if states_unit(line) { &line[..0] } else { line });
-    Cow::Owned(kept.collect::<Vec<_>>().join(&b'\n'))
-}
-
 fn agreed_coordinates(path: &Path, says: &Statements, cell: &Content) -> Result<Option<Coordinates>, FormatError> {
     match (says.coordinates, cell.coordinates) {
         (Some(found), Some(expected)) if found != expected => Err(FormatError::Contradiction {
@@ -332,16 +295,16 @@ fn agreed_coordinates(path: &Path, says: &Statements, cell: &Content) -> Result<
     }
 }
 
-fn agreed_unit(path: &Path, says: &Statements, cell: &Content) -> Result<f64, FormatError> {
-    match says.unit_mm {
-        Some(found) if found != cell.unit_mm => Err(FormatError::Contradiction {
+fn agreed_unit(path: &Path, says: &Statements, cell: &Content) -> Result<Unit, FormatError> {
+    match says.unit {
+        Some(found) if found != cell.unit => Err(FormatError::Contradiction {
             path: path.to_owned(),
             key: "the unit",
-            found: format!("{found} mm"),
+            found: found.to_string(),
             by: "cell file",
-            expected: format!("{} mm", cell.unit_mm),
+            expected: cell.unit.to_string(),
         }),
-        _ => Ok(cell.unit_mm),
+        _ => Ok(cell.unit),
     }
 }
 
@@ -360,7 +323,7 @@ fn agreed_radius(path: &Path, stated: Option<f64>, column: Option<f64>) -> Resul
 
 /// What stands beside the coordinates.
 #[derive(Default)]
-struct Columns {
+struct OtherColumns {
     indices: Option<Vec<u32>>,
     names: Option<Vec<String>>,
     /// Empty if nothing is switched off.
@@ -380,12 +343,17 @@ fn beside(names: &[String]) -> [Option<usize>; 5] {
     wanted.map(|wanted| names.iter().position(|name| wanted.contains(&name.trim())))
 }
 
-impl Columns {
+impl OtherColumns {
     /// Goes through the lines again for the columns that the header names; the points have been read from the same lines.
-    fn read(path: &Path, text: &[u8], points: usize, decimal: Option<Decimal>) -> Result<Self, FormatError> {
+    fn read(
+        path: &Path,
+        text: &[u8],
+        points: usize,
+        decimal: Option<Decimal>,
+        table: &Table,
+    ) -> Result<Self, FormatError> {
         let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text);
-        let table = Table::default();
-        let mut preamble = Preamble::new(path, false, &table);
+        let mut preamble = Preamble::new(path, false, table);
         let mut lines = text.split(|&b| b == b'\n').map(|l| l.strip_suffix(b"\r").unwrap_or(l)).zip(1..);
         let (first, mut layout) = loop {
             let Some((line, number)) = lines.next() else { return Ok(Self::default()) };
@@ -506,8 +474,8 @@ mod tests {
     fn a_probe_has_the_decimal_mark_of_its_file() {
         let text = "# a comment\nname;x;y;z;probe\na;1,5;2,5;3,5;38,1\nb;4;5;6;38,1\n";
         let comma = Content { decimal: DecimalMark::Comma, ..Content::default() };
-        for content in [Content::default(), comma] {
-            assert_eq!(parse(text, &content).unwrap().probe_radius_mm, Some(19.05));
+        for content in [&Content::default(), &comma] {
+            assert_eq!(parse(text, content).unwrap().probe_radius_mm, Some(19.05));
         }
         // Whole coordinates do not tell the mark; the cell does.
         let whole = "name;x;y;z;probe\na;1;2;3;1.500,5\n";
@@ -546,11 +514,25 @@ mod tests {
     fn inches_are_converted_only_where_the_cell_says_so() {
         let text = "# units: inch\n1,2,4\n";
         assert!(matches!(parse(text, &Content::default()), Err(FormatError::Contradiction { key: "the unit", .. })));
-        let inch = Content { unit_mm: INCH_MM, ..Content::default() };
+        let inch = Content { unit: Unit::Inch, ..Content::default() };
         assert_eq!(parse(text, &inch).unwrap().points, [Point::new(25.4, 50.8, 101.6)]);
         assert_eq!(parse("1,2,4\n", &inch).unwrap().points, [Point::new(25.4, 50.8, 101.6)]);
         assert!(matches!(parse("# units: mm\n1,2,3\n", &inch), Err(FormatError::Contradiction { .. })));
         assert!(parse("x_inch,y_inch,z_inch\n1,2,3\n", &Content::default()).is_err());
+    }
+
+    #[test]
+    fn the_cell_says_which_columns_are_read_and_in_which_unit() {
+        let text = "index,X_nom,Y_nom,Z_nom,X_act,Y_act,Z_act\n4,1,2,3,1.5,2.5,3.5\n9,4,5,6,4.5,5.5,6.5\n";
+        assert!(matches!(parse(text, &Content::default()), Err(FormatError::HeaderNames { line: 1, .. })));
+        let columns = "x=X_act,y=Y_act,z=Z_act".parse().ok();
+        let found = parse(text, &Content { columns, unit: Unit::Micrometre, ..Content::default() }).unwrap();
+        assert_eq!(found.points, [Point::new(1.5e-3, 2.5e-3, 3.5e-3), Point::new(4.5e-3, 5.5e-3, 6.5e-3)]);
+        assert_eq!(found.indices.unwrap(), [4, 9]);
+        let ply = "ply\nformat ascii 1.0\ncomment units: inch\nelement vertex 1\nproperty double x\nproperty double y\nproperty double z\nend_header\n1 2 4\n";
+        let inch = Content { unit: Unit::Inch, ..Content::default() };
+        assert_eq!(parse(ply, &inch).unwrap().points, [Point::new(25.4, 50.8, 101.6)]);
+        assert!(parse(ply, &Content::default()).is_err());
     }
 
     #[test]

@@ -52,8 +52,13 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
         return None;
     }
     let Some(file) = &written.file else {
-        if written.projection.is_some() {
-            document.report("nominal.projection", "is for points of a file", "", "leave it out");
+        let of_points = [
+            ("projection", written.projection.is_some()),
+            ("columns", written.columns.is_some()),
+            ("unit", written.unit.is_some()),
+        ];
+        for (key, _) in of_points.into_iter().filter(|(_, there)| *there) {
+            document.report(&format!("nominal.{key}"), "is for points of a file", "", "leave it out");
         }
         return formula(written, document);
     };
@@ -66,6 +71,8 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
     let aperture = written.aperture.clone().and_then(|table| aperture(table, document));
     Some(NominalSource::File {
         path: beside(folder, file),
+        columns: written.columns.clone(),
+        unit: written.unit.clone(),
         projection: written.projection.unwrap_or_default(),
         aperture,
     })

@@ -67,6 +67,10 @@ pub enum NominalSource {
     File {
         /// The file; relative paths of a recipe are relative to the recipe.
         path: PathBuf,
+        /// Which columns of a table of points are x, y and z, where its header leaves it open.
+        columns: Option<String>,
+        /// The unit of a table of points; without it mm.
+        unit: Option<String>,
         /// What scattered points are projected onto.
         projection: Projection,
         /// The outline of the part, if it is smaller than the points.

@@ -90,6 +90,12 @@ pub(super) struct NominalTable {
     /// File of points (CSV, XYZ, PLY), of a mesh (STL, PLY) or of a surface definition (TOML), in mm.
     #[schemars(length(min = 1, max = 400), example = "mirror.csv")]
     pub file: Option<String>,
+    /// Which columns of a table of points are x, y and z, where its header leaves it open: `x=NAME,y=NAME,z=NAME`, names or numbers from 1.
+    #[schemars(length(min = 5, max = 200), example = &"x=X_nom,y=Y_nom,z=Z_nom")]
+    pub columns: Option<String>,
+    /// Unit of length of a table of points: mm, um, nm, cm, m or inch; without it mm.
+    #[schemars(length(min = 1, max = 12), example = &"inch")]
+    pub unit: Option<String>,
     /// What scattered points of a file are projected onto.
     pub projection: Option<Projection>,
     /// A formula z(x, y).

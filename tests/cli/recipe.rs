@@ -189,7 +189,7 @@ fn the_telescope_holds_what_it_cannot_see() {
     let (y, z) = (p.y, p.z - 3600.0);
     assert!((back - Point::new(p.x, cosine * y - sine * z, sine * y + cosine * z)).norm() < 1e-9);
     let Wire::FileExchange(files) = &cell.cmm.link.wire else { panic!("files") };
-    assert_eq!((files.stations.len(), files.unit.mm()), (1, 1.0));
+    assert_eq!((files.stations.len(), files.unit.in_mm()), (1, 1.0));
     assert_eq!(files.inbox, "../exchange/cmm/in");
     assert_eq!((files.what, files.reference_limit_mm), (Some(Coordinates::Centres), 1.0));
     assert_eq!((files.take_earlier, files.probe_tolerance_mm), (false, 1e-3));
@@ -281,7 +281,7 @@ const BAD_CELL_VALUES: &[BadValue] = &[
     (FILES, "cell.simulated", "true", "simulated = false"),
     (FILES, "cmm.wire.inbox", "\"../exchange/cmm/out\"", "told apart"),
     (FILES, "cmm.wire.reference_limit_mm", "0", "100"),
-    (FILES, "cmm.wire.unit", "\"cm\"", "inch"),
+    (FILES, "cmm.wire.unit", "\"furlong\"", "inch"),
     (TCP, "cmm.registers.status", "50", "overlaps"),
     (TCP, "cmm.registers.in_force", "65500", "65535"),
     (TCP, "cmm.registers.word_order", "\"middle\"", "little"),

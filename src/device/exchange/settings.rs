@@ -15,7 +15,8 @@ use crate::place::Place;
 use crate::wiring::{Making, MakingError, Wired};
 use regrind_document::Document;
 use regrind_formats::references::read_references;
-use regrind_formats::result::{Content, Coordinates, DecimalMark, LengthUnit};
+use regrind_formats::result::{Content, Coordinates, DecimalMark};
+use regrind_formats::{Columns, Unit};
 
 /// A folder, perhaps on another computer, answers within this, a large file read included.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(30);
@@ -38,7 +39,10 @@ pub struct ExchangeWire {
     /// Decimal mark of results.
     pub decimal: DecimalMark,
     /// Unit of length of results.
-    pub unit: LengthUnit,
+    pub unit: Unit,
+    /// Which columns of results are x, y and z, where their headers leave it open: `x=NAME,y=NAME,z=NAME`, names or numbers from 1.
+    #[schemars(length(min = 5, max = 200), example = &"x=X_act,y=Y_act,z=Z_act")]
+    pub columns: Option<Columns>,
     /// Stations of a measurement, each with its own frame.
     #[schemars(length(max = 64))]
     pub stations: Vec<StationTable>,
@@ -74,7 +78,8 @@ impl Default for ExchangeWire {
             stable_for_s: 2.0,
             what: None,
             decimal: DecimalMark::Auto,
-            unit: LengthUnit::Mm,
+            unit: Unit::Millimetre,
+            columns: None,
             stations: Vec::new(),
             reference_points: None,
             reference_group: None,
@@ -130,7 +135,12 @@ impl Wired for ExchangeWire {
         let [outbox, inbox] = self.folders(making, MachineKind::Cmm)?;
         let settings = CmmExchange {
             stable_for: Duration::from_secs_f64(self.stable_for_s),
-            content: Content { coordinates: self.what, decimal: self.decimal, unit_mm: self.unit.mm() },
+            content: Content {
+                coordinates: self.what,
+                decimal: self.decimal,
+                unit: self.unit,
+                columns: self.columns.clone(),
+            },
             result: Pattern::new(&*self.result),
             stations: self.stations(making)?,
             free_count: making.free_points.is_some(),

@@ -16,7 +16,8 @@ use crate::no_machine::NoMachine;
 use crate::place::Place;
 use crate::wiring::{Making, MakingError, Wired};
 use regrind_document::Document;
-use regrind_formats::result::{Coordinates, LengthUnit};
+use regrind_formats::Unit;
+use regrind_formats::result::Coordinates;
 
 /// The device of a simulated cell that stands for a pseudo-terminal, which is made at the start.
 const AUTO: &str = "auto";
@@ -58,7 +59,7 @@ pub struct HitLinesWire {
     /// What stands between two values.
     pub separator: Separator,
     /// Unit of coordinates with a decimal mark; whole numbers are micrometres.
-    pub unit: LengthUnit,
+    pub unit: Unit,
     /// Which axis of the machine the first, second and third value are.
     pub axes: Axes,
     /// Where a rotary table has to stand, by its angle in the line.
@@ -152,7 +153,7 @@ impl Default for HitLinesWire {
             decimals: 3,
             decimal: Mark::Point,
             separator: Separator::Comma,
-            unit: LengthUnit::Mm,
+            unit: Unit::Millimetre,
             axes: Axes::Xyz,
             rotary_deg: 0.0,
             rotary_tolerance_deg: 0.05,
@@ -317,7 +318,7 @@ impl HitLinesWire {
             separator: self.separator,
             mark: if self.decimal == Mark::Comma { ',' } else { '.' },
             decimals: usize::from(self.decimals),
-            unit_mm: self.unit.mm(),
+            unit_mm: self.unit.in_mm(),
             axes: self.axes.order(),
         }
     }
@@ -351,7 +352,7 @@ impl HitLinesWire {
 
     fn check_format(&self, document: &mut Document) {
         let Some(format) = self.format else { return };
-        if format.is_integer() && self.unit == LengthUnit::Inch {
+        if format.is_integer() && self.unit == Unit::Inch {
             let found = "is inch, and the format has whole numbers";
             let allowed = "whole numbers are micrometres";
             document.report("cmm.wire.unit", found, allowed, "leave it out, or have the machine print decimals");

@@ -6,7 +6,8 @@ use serde::Deserialize;
 use super::{ManualMachine, ManualSettings};
 use crate::MachineKind;
 use crate::wiring::{Making, MakingError, Wired};
-use regrind_formats::result::{Content, Coordinates, DecimalMark, LengthUnit};
+use regrind_formats::result::{Content, Coordinates, DecimalMark};
+use regrind_formats::{Columns, Unit};
 
 /// A person, step by step.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
@@ -17,7 +18,10 @@ pub struct ManualWire {
     /// Decimal mark of measurements.
     pub decimal: DecimalMark,
     /// Unit of length of measurements.
-    pub unit: LengthUnit,
+    pub unit: Unit,
+    /// Which columns of measurements are x, y and z, where their headers leave it open: `x=NAME,y=NAME,z=NAME`, names or numbers from 1.
+    #[schemars(length(min = 5, max = 200), example = &"x=X_act,y=Y_act,z=Z_act")]
+    pub columns: Option<Columns>,
     /// By how much the probe radius that a file states may differ from the recipe's.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub probe_tolerance_mm: f64,
@@ -25,7 +29,13 @@ pub struct ManualWire {
 
 impl Default for ManualWire {
     fn default() -> Self {
-        Self { what: None, decimal: DecimalMark::Auto, unit: LengthUnit::Mm, probe_tolerance_mm: 0.001 }
+        Self {
+            what: None,
+            decimal: DecimalMark::Auto,
+            unit: Unit::Millimetre,
+            columns: None,
+            probe_tolerance_mm: 0.001,
+        }
     }
 }
 
@@ -53,7 +63,12 @@ impl ManualWire {
         ManualSettings {
             part: making.part.to_owned(),
             folder: making.run_folder.to_owned(),
-            content: Content { coordinates: self.what, decimal: self.decimal, unit_mm: self.unit.mm() },
+            content: Content {
+                coordinates: self.what,
+                decimal: self.decimal,
+                unit: self.unit,
+                columns: self.columns.clone(),
+            },
             free_points: making.free_points,
             probe_tolerance_mm: self.probe_tolerance_mm,
         }

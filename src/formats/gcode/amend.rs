@@ -126,10 +126,12 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
             "is it the program of the pass?",
         ));
     }
-    if done.beside_map_mm >= done.feed_mm {
+    if done.beside_map_mm > MOST_BESIDE * done.feed_mm {
+        let over_mm = done.feed_mm - done.beside_map_mm;
+        let what = format!("of {:.3} mm at feed {over_mm:.3} mm lie over the map", done.feed_mm);
         let remedy =
             "give the map in the program's coordinates, and the program in millimetres with points in its numbers";
-        return Err(program("no move at feed lies over the map", remedy));
+        return Err(GcodeError::Program { path: base.to_owned(), what, remedy });
     }
     draft.publish()?;
     Ok(done)

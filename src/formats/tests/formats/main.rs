@@ -2,6 +2,7 @@
 
 #[path = "../../../../tests/common/data.rs"]
 mod data;
+mod headers;
 mod map_files;
 mod points;
 mod real_files;
