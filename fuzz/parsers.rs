@@ -17,6 +17,7 @@ use regrind::config::CellConfig;
 use regrind::device::exchange::Wanted as WantedResult;
 use regrind::document::Problems;
 use regrind::drive::{Reply, Request};
+use regrind::formats::Unit;
 use regrind::formats::gcode::{
     AlongNormals, Amendment, MapBase, MapKind, ProgramMap, correct_program, read_program_map,
 };
