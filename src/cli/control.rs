@@ -132,9 +132,7 @@ fn named_file(arguments: &Confirmation) -> Result<Option<PathBuf>, Failure> {
 
 pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<Outcome, Failure> {
     let folder = run.map_or_else(|| live(Path::new("runs")), |run| Ok(run.to_owned()))?;
-    let asked = |request: &Request| {
-        ask(&folder, request).map_err(|source| Failure::NotRunning { path: folder.clone(), source })
-    };
+    let asked = |request: &Request| ask(&folder, request).map_err(|source| Failure::unreached(&folder, source));
     let reply = match request {
         // Meant for the state in which the cell is now: another terminal may hold it meanwhile, and then the hold stands.
         Request::Resume { reason, seen: None } => {
@@ -144,7 +142,7 @@ pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<
         request => asked(request)?,
     };
     show(&reply, request, &folder, json)?;
-    if reply.accepted { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
+    if reply.taken { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
 }
 
 fn show(reply: &Reply, request: &Request, folder: &Path, json: bool) -> Result<(), Failure> {
@@ -152,7 +150,7 @@ fn show(reply: &Reply, request: &Request, folder: &Path, json: bool) -> Result<(
         return super::print_json(reply);
     }
     if *request != Request::Status {
-        return if reply.accepted { super::print(&format!("{}\n", reply.message)) } else { Ok(()) };
+        return if reply.taken { super::print(&format!("{}\n", reply.message)) } else { Ok(()) };
     }
     super::print(&told(&reply.status, folder))
 }
@@ -239,14 +237,27 @@ pub(super) fn unfinished(runs: &Path) -> Option<PathBuf> {
         let is_run = records.next().is_some_and(|first| first.value()["content"]["recover"] != true);
         is_run && !records.any(|record| record.kind == Kind::End)
     };
-    let made = |folder: &PathBuf| std::fs::metadata(folder).and_then(|m| m.modified()).ok();
     let mut all: Vec<_> = folders(runs).collect();
-    all.sort_by_key(made);
+    all.sort_by_cached_key(|folder| began(folder));
     all.into_iter().rev().find(is_open).or_else(|| newest(runs))
 }
 
-/// Returns the run folder that was made last.
+/// Returns the folder of the run that began last.
 fn newest(runs: &Path) -> Option<PathBuf> {
-    let made = |folder: &PathBuf| std::fs::metadata(folder).and_then(|m| m.modified()).ok();
-    folders(runs).max_by_key(made)
+    folders(runs).max_by_key(|folder| began(folder))
+}
+
+/// When a run began, by its first record, or else by its name; text that sorts as time does. Whoever touches a folder does not make it newer.
+fn began(folder: &Path) -> Option<String> {
+    let by_record = || {
+        let reader = Reader::open(folder).ok()?;
+        let first = reader.records(0).next()?.ok()?;
+        Some(first.utc.chars().filter(char::is_ascii_alphanumeric).collect::<String>())
+    };
+    let by_name = || {
+        let name = folder.file_name()?.to_str()?;
+        let is_time = |part: &&str| part.len() == 16 && part.as_bytes()[8] == b'T' && part.ends_with('Z');
+        name.split('-').find(is_time).map(|time| time.trim_end_matches('Z').to_owned())
+    };
+    by_record().or_else(by_name)
 }

@@ -89,6 +89,10 @@ pub(super) enum Failure {
     NoRun { path: PathBuf },
     #[error("{path}: no cell runs there ({source}); `regrind audit show` tells how the run ended")]
     NotRunning { path: PathBuf, source: io::Error },
+    #[error(
+        "{path}: whether a cell runs there is not known: this user may not ask it ({source}); ask as the user who runs the cell"
+    )]
+    MayNotAsk { path: PathBuf, source: io::Error },
     #[error("{} runs go on: name one of {}", .runs.len(), .runs.iter().map(|run| run.display().to_string()).collect::<Vec<_>>().join(", "))]
     SeveralRuns { runs: Vec<PathBuf> },
     #[error("{}: the run is over, there is nothing to go on with; `regrind report` tells how it ended", .run.display())]
@@ -189,6 +193,15 @@ impl From<PlantError> for Failure {
 }
 
 impl Failure {
+    /// A cell that could not be asked: where this user may not ask, nobody knows whether one runs there.
+    pub(super) fn unreached(folder: &std::path::Path, source: io::Error) -> Self {
+        let path = folder.to_owned();
+        match source.kind() {
+            io::ErrorKind::PermissionDenied => Self::MayNotAsk { path, source },
+            _ => Self::NotRunning { path, source },
+        }
+    }
+
     /// Returns the exit code of the program.
     pub(super) fn exit_code(&self) -> u8 {
         match self {

@@ -279,7 +279,7 @@ async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
     // A run that does not answer holds up nothing but this.
     let recorded = tokio::task::spawn_blocking(move || {
         let run = control::live_runs(&runs).next()?;
-        Some(regrind_control::ask_for(&run, &remark, Some(by)).is_ok_and(|reply| reply.accepted))
+        Some(regrind_control::ask_for(&run, &remark, Some(by)).is_ok_and(|reply| reply.taken))
     });
     if recorded.await.ok().flatten() == Some(false) {
         eprintln!("tell: the run did not take it on record");

@@ -47,7 +47,7 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let folder = arguments.run.clone().map_or_else(|| control::live(Path::new("runs")), Ok)?;
     super::runtime()?.block_on(async {
-        let gone = |source| Failure::NotRunning { path: folder.clone(), source };
+        let gone = |source| Failure::unreached(&folder, source);
         let mut watch = regrind_control::watch(&folder).await.map_err(gone)?;
         let Some(first) = watch.next().await.map_err(gone)? else { return Err(gone(io::ErrorKind::BrokenPipe.into())) };
         if !io::stdout().is_terminal() {
@@ -87,7 +87,7 @@ fn ended(folder: &Path, told: io::Result<Option<Snapshot>>) -> Result<String, Fa
         return Ok(summary.verdict);
     }
     let source = told.err().unwrap_or_else(|| io::ErrorKind::BrokenPipe.into());
-    Err(Failure::NotRunning { path: folder.to_owned(), source })
+    Err(Failure::unreached(folder, source))
 }
 
 /// What is on the terminal.

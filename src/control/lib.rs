@@ -14,5 +14,5 @@ mod snapshot;
 mod socket;
 
 pub use request::{OnBehalf, Reply, Request};
-pub use snapshot::{CycleRow, JobProgress, Next, Snapshot, SoFar};
+pub use snapshot::{CycleRow, JobProgress, Next, PartVerdict, Snapshot, SoFar};
 pub use socket::{Control, Ordered, Watch, ask, ask_for, is_live, watch};

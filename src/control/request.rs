@@ -72,8 +72,9 @@ pub enum Request {
 /// What a running cell answers.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Reply {
-    /// Whether the order was taken.
-    pub accepted: bool,
+    /// Whether the order was taken; of the part it says nothing.
+    #[serde(alias = "accepted")]
+    pub taken: bool,
     /// Why not, or what follows, for the person who asked.
     #[serde(rename = "words")]
     pub message: String,

@@ -27,6 +27,9 @@ pub struct Snapshot {
     /// State and phase, for people.
     #[serde(rename = "words")]
     pub message: String,
+    /// What became of the part by now: an order that is taken says nothing of it.
+    #[serde(default)]
+    pub verdict: PartVerdict,
     /// Counts the states since the run began, so that an order can say which one it is meant for.
     #[serde(default)]
     pub number: u64,
@@ -60,6 +63,30 @@ pub struct Snapshot {
     /// The same as a sentence, with the commands of the terminal.
     #[serde(default)]
     pub next: String,
+}
+
+/// What became of a part.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PartVerdict {
+    /// The run goes on.
+    #[default]
+    Open,
+    /// It is accepted.
+    Accepted,
+    /// The run has ended without.
+    NotAccepted,
+}
+
+impl PartVerdict {
+    /// Only a part that is accepted completes a run.
+    pub fn at(state: StateName) -> Self {
+        match state {
+            StateName::Complete => Self::Accepted,
+            StateName::Stopped | StateName::Aborted => Self::NotAccepted,
+            _ => Self::Open,
+        }
+    }
 }
 
 /// What a person does next.

@@ -114,7 +114,7 @@ async fn answer(
     status: &watch::Receiver<Snapshot>,
 ) -> Reply {
     if request == Request::Status {
-        return Reply { accepted: true, message: String::new(), status: status.borrow().clone() };
+        return Reply { taken: true, message: String::new(), status: status.borrow().clone() };
     }
     let over = || refusal("the run is over".into(), status);
     let (answer, answered) = oneshot::channel();
@@ -129,14 +129,14 @@ async fn answer(
 }
 
 fn refusal(message: String, status: &watch::Receiver<Snapshot>) -> Reply {
-    Reply { accepted: false, message, status: status.borrow().clone() }
+    Reply { taken: false, message, status: status.borrow().clone() }
 }
 
 /// Tells how the cell is after every change, and at least so often that silence means that nobody is there.
 async fn told_on(write: &mut TellCaller, status: &mut watch::Receiver<Snapshot>) -> io::Result<()> {
     loop {
         let now = status.borrow_and_update().clone();
-        tell(write, &Reply { accepted: true, message: String::new(), status: now }).await?;
+        tell(write, &Reply { taken: true, message: String::new(), status: now }).await?;
         tokio::time::sleep(LEAST_BETWEEN_LINES).await;
         // Silence is as good a reason to tell it again as a change.
         if let Ok(Err(_)) = tokio::time::timeout(MOST_BETWEEN_LINES, status.changed()).await {
@@ -210,7 +210,7 @@ impl Watch {
     /// A cell that says nothing for too long, what nobody understands, or that it is watched by too many.
     pub async fn next(&mut self) -> io::Result<Option<Snapshot>> {
         let Some(text) = tokio::time::timeout(SILENCE, self.lines.next_line()).await?? else { return Ok(None) };
-        let Reply { accepted, message, status } = serde_json::from_str(&text)?;
-        if accepted { Ok(Some(status)) } else { Err(io::Error::other(message)) }
+        let Reply { taken, message, status } = serde_json::from_str(&text)?;
+        if taken { Ok(Some(status)) } else { Err(io::Error::other(message)) }
     }
 }

@@ -22,6 +22,7 @@
 //! its answer forgotten, the connection stays in order (but a `start` that is dropped has to be reconciled). To break off a long transfer
 //! politely raise its [`Interrupt`].
 
+mod beside_plan;
 mod error;
 pub mod exchange;
 pub mod hit_lines;
@@ -38,6 +39,7 @@ mod table;
 mod wiring;
 mod words;
 
+pub use beside_plan::BesidePlan;
 use error::Answered;
 pub use error::DeviceError;
 pub use hit_lines::{HitLine, HitLinesCmm, HitLinesSettings, HitLinesWire};

@@ -420,7 +420,7 @@ impl Drive {
                     Then::Execute(command) => self.not_carried_out(*command).await,
                     Then::Answer { answer, message, .. } => {
                         let message = format!("{message}; it is not on record, {reason}");
-                        drop(answer.send(Reply { accepted: false, message, status: self.snapshot() }));
+                        drop(answer.send(Reply { taken: false, message, status: self.snapshot() }));
                     }
                     Then::Confirm { answer, .. } => drop(answer.send(Err(format!("it is not on record: {reason}")))),
                     Then::Nothing => {}
@@ -434,7 +434,7 @@ impl Drive {
             Then::Execute(command) => self.not_carried_out(*command).await,
             // Who asked may have gone.
             Then::Answer { answer, accepted, message } => {
-                drop(answer.send(Reply { accepted, message, status: self.snapshot() }))
+                drop(answer.send(Reply { taken: accepted, message, status: self.snapshot() }))
             }
             Then::Confirm { device, word, answer } => self.ask(device, Ask::Confirm { word, answer }).await,
         }
@@ -471,7 +471,7 @@ impl Drive {
                         "{message}; what makes safe was carried out, and nothing else is: it is not on record, {why}"
                     );
                     // Who asked may have gone.
-                    drop(answer.send(Reply { accepted: false, message, status: status.clone() }));
+                    drop(answer.send(Reply { taken: false, message, status: status.clone() }));
                 }
                 then => waiting.then = then,
             }
@@ -518,7 +518,7 @@ impl Drive {
             let message = format!("the cell has changed since you saw it; now it is {}", self.cell.in_words());
             // Who asked may have gone.
             if let Some(answer) = answer {
-                drop(answer.send(Reply { accepted: false, message, status: self.snapshot() }));
+                drop(answer.send(Reply { taken: false, message, status: self.snapshot() }));
             }
             return;
         }
@@ -579,7 +579,7 @@ impl Drive {
                 Err(why) => Err(why),
             };
             let message = told.as_ref().err().unwrap_or(&status.message).clone();
-            let reply = Reply { accepted: told.is_ok(), message, status };
+            let reply = Reply { taken: told.is_ok(), message, status };
             if let Some(answer) = answer {
                 let _ = answer.send(reply);
             }

@@ -1,6 +1,6 @@
 //! Tells how the cell is: where it stands, what it waits for, and what a person does next.
 
-use regrind_control::{Next, Snapshot};
+use regrind_control::{Next, PartVerdict, Snapshot};
 
 use super::Drive;
 use crate::cell::{Cell, Phase, State};
@@ -22,6 +22,7 @@ impl Drive {
             phase: state.phase(),
             unconfirmed: self.cell.unconfirmed(),
             message: self.cell.in_words(),
+            verdict: PartVerdict::at(state.name()),
             number: self.states,
             cycle: self.cell.cycle(),
             max_cycles: self.cell.plan().max_cycles,

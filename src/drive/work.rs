@@ -14,7 +14,7 @@ use crate::cell::{
     LeftOut, ParameterTold, Response, TouchOn,
 };
 use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassError, Seen, Sense, error_map, response};
-use crate::device::{Coordinates, Identified, Measurement, Plan, PointStatus, TargetKind};
+use crate::device::{BesidePlan, Coordinates, Identified, Measurement, Plan, PointStatus, TargetKind};
 use crate::form::pv_of_most;
 use crate::formats::{
     FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_form, save_registration,
@@ -228,8 +228,14 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
         return Some(GateFailure::Broken(format!("point {} is of target {found}, and target {planned} is due", k + 1)));
     }
     let touched = |p: &&crate::device::MeasuredPoint| p.status == PointStatus::Touched;
-    let wrong = measurement.points.iter().filter(touched).find(|p| !p.at_mm.iter().all(|v| v.is_finite()))?;
-    Some(GateFailure::Broken(format!("the coordinates of target {} are not finite numbers", wrong.index)))
+    if let Some(wrong) = measurement.points.iter().filter(touched).find(|p| !p.at_mm.iter().all(|v| v.is_finite())) {
+        let message = format!("the coordinates of target {} are not finite numbers", wrong.index);
+        return Some(GateFailure::Broken(message));
+    }
+    match plan.check(measurement).err()? {
+        given_back @ BesidePlan::GivenBack => Some(GateFailure::Foreign(given_back.to_string())),
+        elsewhere => Some(GateFailure::Broken(elsewhere.to_string())),
+    }
 }
 
 /// A temperature outside the recipe's window, or one that is not told where there is a window.

@@ -116,7 +116,7 @@ pub(crate) async fn take_control(
 
 fn answered(reply: std::io::Result<Reply>) -> Response {
     match reply {
-        Ok(Reply { accepted, message, .. }) => Json(Answer { accepted, message }).into_response(),
+        Ok(Reply { taken, message, .. }) => Json(Answer { accepted: taken, message }).into_response(),
         Err(error) => {
             let message = format!("the program of the cell does not answer: {error}");
             (StatusCode::BAD_GATEWAY, Json(Answer { accepted: false, message })).into_response()

@@ -216,7 +216,6 @@ fn ran(program: &str) -> String {
 
 #[test]
 fn a_dmis_program_is_handed_over_and_what_a_machine_makes_of_it_is_taken() {
-    use regrind::formats::Unit;
     use regrind::formats::result::{Content, Coordinates as Said};
     let shop = Shop::new();
     let content = Content { coordinates: Some(Said::Centres), ..Content::default() };
@@ -346,8 +345,12 @@ fn two_files_at_once_are_neither_taken() {
 fn the_cell_may_say_what_the_file_does_not() {
     use regrind::formats::result::{Content, Coordinates as Said, DecimalMark};
     let shop = Shop::new();
-    let content =
-        Content { coordinates: Some(Said::Contacts), decimal: DecimalMark::Comma, unit: Unit::Inch, columns: None };
+    let content = Content {
+        coordinates: Some(Said::Contacts),
+        decimal: DecimalMark::Comma,
+        unit: regrind::formats::Unit::Inch,
+        columns: None,
+    };
     let mut bench = Bench::new(CmmExchange { content, ..shop.cmm() });
     shop.put("SN_7_c2.csv", &three());
     bench.refused("the file says that coordinates is centres, the cell file says contacts");

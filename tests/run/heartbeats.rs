@@ -101,7 +101,7 @@ async fn beats_and_orders_stay_on_time_while_451_401_points_are_computed() {
     order(&folder, Request::Resume { reason: String::new(), seen: None }).await;
     // Judged at once; now the map is made of 451,401 deviations.
     let (reply, asked, _) = order(&folder, Request::Abort { reason: "while it computes".into() }).await;
-    assert!(reply.accepted, "{reply:?}");
+    assert!(reply.taken, "{reply:?}");
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
     for machine in [CMM, GRINDER] {

@@ -187,7 +187,21 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
                 if cycle == 1 {
                     let whole = fs::read_to_string(&measured).unwrap();
                     fs::write(person.home.path().join("half.csv"), &whole[..whole.len() / 2]).unwrap();
-                    for (command, why) in [("confirm done --file half.csv", "half.csv"), ("confirm done", "--file")] {
+                    // The plan itself is no measurement, and neither are its points in another order.
+                    let (head, body) = whole.split_once('\n').unwrap();
+                    let mut rows: Vec<&str> = body.lines().map(|row| row.split_once(',').unwrap().1).collect();
+                    rows.reverse();
+                    let turned: String = rows.iter().map(|row| format!("{row}\n")).collect();
+                    let head = head.strip_prefix("index,").unwrap();
+                    fs::write(person.home.path().join("turned.csv"), format!("{head}\n{turned}")).unwrap();
+                    let given_back = format!("confirm done --file {}", plan.display());
+                    let refused = [
+                        ("confirm done --file half.csv", "half.csv"),
+                        ("confirm done", "--file"),
+                        (&given_back, "the plan itself"),
+                        ("confirm done --file turned.csv", "order of the plan"),
+                    ];
+                    for (command, why) in refused {
                         let (code, told) = person.types(command);
                         assert!(code == 3 && told.contains(why), "{told}");
                     }
@@ -216,9 +230,9 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
         records.iter().filter(is).filter(by_a_person).count()
     };
     let cycles = usize::from(cycle - 1);
-    // The three that were refused are on record too.
+    // The five that were refused are on record too.
     assert_eq!((count("grinder", "started"), count("grinder", "still")), (cycles, 1));
-    assert_eq!((count("grinder", "done"), count("cmm", "done")), (2 * cycles, cycles + 2));
+    assert_eq!((count("grinder", "done"), count("cmm", "done")), (2 * cycles, cycles + 4));
     let loaded = |r: &&Record| r.value()["event"] == "load_confirmed" && r.value()["actor"].is_object();
     assert_eq!(records.iter().filter(loaded).filter(by_a_person).count(), 1);
     // The files that came are kept as they came, by their hashes; what nobody told is not there.

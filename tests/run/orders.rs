@@ -177,7 +177,7 @@ async fn an_abort_is_given_while_another_process_has_the_journal_and_answered_wh
     drop(other);
     // Who had to wait too long was told that it is not on record; nobody that it is before it was.
     let reply = ordered.await.unwrap();
-    assert!(if reply.accepted { on_record(&folder) } else { reply.message.contains("not on record") }, "{reply:?}");
+    assert!(if reply.taken { on_record(&folder) } else { reply.message.contains("not on record") }, "{reply:?}");
     let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
     assert!(on_record(&folder) && verify(&folder).unwrap().closed);

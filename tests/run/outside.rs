@@ -99,14 +99,11 @@ fn the_door_takes_no_text_that_misleads_and_no_more_watchers_than_it_has_places_
         "{\"order\":\"abort\",\"by\":{\"name\":\"A\\u202e\",\"station\":\"page\"}}\n",
     ] {
         let (reply, _) = says(line);
-        assert!(
-            reply["accepted"] == false && reply["words"].as_str().unwrap().contains("not an order"),
-            "{line} {reply}"
-        );
+        assert!(reply["taken"] == false && reply["words"].as_str().unwrap().contains("not an order"), "{line} {reply}");
         assert_eq!(reply["status"]["state"], "Execute", "{line}");
     }
     let watchers: Vec<_> = (0..17).map(|_| says("{\"order\":\"watch\"}\n")).collect();
-    let taken = watchers.iter().filter(|(reply, _)| reply["accepted"] == true).count();
+    let taken = watchers.iter().filter(|(reply, _)| reply["taken"] == true).count();
     assert_eq!(taken, 16);
     assert_eq!(run(&["stop"], home.path()).0, 0);
     drop(watchers);

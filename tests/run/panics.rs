@@ -71,7 +71,7 @@ async fn a_driver_that_panics_is_told_as_a_fault_of_the_program_and_its_machine_
     };
     tokio::time::timeout(PATIENCE, held).await.expect("the machine holds itself");
     let (reply, asked, _) = order(&folder, Request::Abort { reason: "no way on".into() }).await;
-    assert!(reply.accepted, "{reply:?}");
+    assert!(reply.taken, "{reply:?}");
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: false, .. }), "{ending:?}");
     assert!(rig.command_at(CMM, 7, asked).is_some(), "the other machine hears the abort");

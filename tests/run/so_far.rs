@@ -51,11 +51,11 @@ async fn touches_are_shown_while_they_are_measured_and_are_gone_with_the_end() {
     assert!(touched <= 90 && rms_um > 0.0 && rms_um <= least_um.abs().max(most_um.abs()), "{told:?}");
     // Held they stay to be seen; an order is obeyed as ever.
     let (reply, ..) = order(&folder, Request::Hold { reason: "to look".into() }).await;
-    assert!(reply.accepted, "{reply:?}");
+    assert!(reply.taken, "{reply:?}");
     until(&folder, |words| words.starts_with("Held (Measure, Run)")).await;
     assert!(seen(&folder, |status| status.so_far).await.touched >= touched);
     let (reply, ..) = order(&folder, Request::Resume { reason: String::new(), seen: None }).await;
-    assert!(reply.accepted, "{reply:?}");
+    assert!(reply.taken, "{reply:?}");
     cmm(&rig, |machine| machine.set_speed(5000.0));
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Accepted { .. }), "{ending:?}");

@@ -49,7 +49,7 @@ impl Watched {
         loop {
             let (reply, ..) = order(&self.folder, Request::Resume { reason: String::new(), seen: None }).await;
             let said = first.get_or_insert(reply.message).clone();
-            if reply.accepted {
+            if reply.taken {
                 return said;
             }
             assert!(began.elapsed() < PATIENCE, "{said}");
@@ -80,7 +80,7 @@ async fn the_key_of_the_idle_machine_holds_the_one_that_moves() {
     until(&run.folder, |words| words.starts_with("Held (Grind, Run)")).await;
     assert!(rig.command_at(GRINDER, HOLD, turned).is_some());
     let (reply, ..) = order(&run.folder, Request::Resume { reason: String::new(), seen: None }).await;
-    assert!(!reply.accepted && reply.message.contains("the CMM is in manual mode"), "{reply:?}");
+    assert!(!reply.taken && reply.message.contains("the CMM is in manual mode"), "{reply:?}");
     turn(&rig, CMM, Mode::Automatic);
     run.resume().await;
     until(&run.folder, |words| words.starts_with("Execute (Grind, Run)")).await;

@@ -121,7 +121,7 @@ pub async fn give(
     let moved = [0, 1].map(|k: usize| plants[k].moves());
     let reply = orders.ask(request(reason.clone()), actor()).await;
     let Some(reply) = reply.filter(|_| !life.is_dead()) else { return };
-    let accepted = reply.accepted;
+    let accepted = reply.taken;
     let done = accepted || reply.message.contains("what makes safe was carried out");
     given.lock().unwrap().push(Given { at, answered: Instant::now(), what, reason, accepted, done, moved });
 }

@@ -316,7 +316,12 @@ fn measured(
     if let Some(expected) = settings.free_points.filter(|least| points.len() < *least) {
         return Err(ExchangeError::Count { path: path.to_owned(), found: points.len(), expected });
     }
-    Ok(measurement(points, &[file], job, identity, done))
+    let measurement = measurement(points, &[file], job, identity, done);
+    if settings.free_points.is_none() {
+        let why = |beside: crate::BesidePlan| ExchangeError::Foreign { path: path.to_owned(), why: beside.to_string() };
+        plan.check(&measurement).map_err(why)?;
+    }
+    Ok(measurement)
 }
 
 /// Writes the plan for the person who measures.

@@ -1,0 +1,195 @@
+//! A measurement beside its plan: points that nobody can have touched by it.
+
+use thiserror::Error;
+
+use crate::{Coordinates, Measurement, Plan, PointStatus, TargetKind};
+use regrind_core::geometry::{Point, Vector, fit_rigid};
+
+/// Why a measurement cannot be one by the plan.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum BesidePlan {
+    /// The points are those of the plan.
+    #[error("it is the plan itself, to its last digit, and no measurement; export what was measured")]
+    GivenBack,
+    /// Points that lie elsewhere than their targets, whatever pose the part has in its fixture.
+    #[error(
+        "touched point {number} lies {off_mm:.3} mm from its target when all are laid on the plan, turned by {turned_deg:.1} degrees; at most {limit_mm:.1} mm \
+         and {MOST_TURNED_DEG:.0} degrees can be: are the rows in the order of the plan, and is it the plan of this part?"
+    )]
+    Elsewhere {
+        /// Which of the touched points of the part, from 1.
+        number: usize,
+        /// How far it is from its target.
+        off_mm: f64,
+        /// The most that can be.
+        limit_mm: f64,
+        /// The turn by which the plan fits the points best.
+        turned_deg: f64,
+    },
+}
+
+/// The part lies in its fixture: a plan that fits only when it is turned farther than this was measured in another order.
+const MOST_TURNED_DEG: f64 = 30.0;
+/// What a touch may be aside of its approach and search, in millimetres.
+const ASIDE_MM: f64 = 1.0;
+/// Points in another order have the size of the plan.
+const OTHER_SIZE: f64 = 0.02;
+
+impl Plan {
+    /// Holds a measurement by this plan against it, point by point.
+    ///
+    /// The points are laid on the plan by the rigid motion that fits best, so that it does not matter where the part lies.
+    ///
+    /// # Errors
+    /// Points that are the planned ones to the last digit that they have, and points that are not where their targets are.
+    pub fn check(&self, measurement: &Measurement) -> Result<(), BesidePlan> {
+        let pairs = measurement.points.iter().zip(&self.targets);
+        let part = pairs.filter(|(p, t)| p.status == PointStatus::Touched && t.what == TargetKind::Part);
+        let radius_mm = if measurement.coordinates == Coordinates::Centres { self.probe_radius_mm } else { 0.0 };
+        let (mut found, mut contacts, mut wanted) = (Vec::new(), Vec::new(), Vec::new());
+        for (point, target) in part {
+            found.push(Point::from(point.at_mm));
+            contacts.push(Point::from(target.point_mm));
+            wanted.push(Point::from(target.point_mm) + Vector::from(target.normal) * radius_mm);
+        }
+        if is_given_back(&found, &contacts) || is_given_back(&found, &wanted) {
+            return Err(BesidePlan::GivenBack);
+        }
+        // Points of another size are in another unit or of another part, which others tell better.
+        if (size(&found) / size(&wanted) - 1.0).abs() > OTHER_SIZE {
+            return Ok(());
+        }
+        // Of fewer, or of those on a line, nothing can be said.
+        let Ok(fit) = fit_rigid(&wanted, &found) else { return Ok(()) };
+        let off_mm = fit.residuals_mm.iter().map(Vector::norm).enumerate();
+        let Some((worst, off_mm)) = off_mm.max_by(|a, b| a.1.total_cmp(&b.1)) else { return Ok(()) };
+        let limit_mm = self.search_mm + self.approach_mm + ASIDE_MM;
+        let turned_deg = fit.pose.angle_rad().to_degrees();
+        if off_mm <= limit_mm && turned_deg <= MOST_TURNED_DEG {
+            return Ok(());
+        }
+        Err(BesidePlan::Elsewhere { number: worst + 1, off_mm, limit_mm, turned_deg })
+    }
+}
+
+/// How far points lie from their middle, by root mean square.
+fn size(points: &[Point]) -> f64 {
+    let count = points.len().max(1) as f64;
+    let middle = points.iter().map(|p| p.coords).sum::<Vector>() / count;
+    (points.iter().map(|p| (p.coords - middle).norm_squared()).sum::<f64>() / count).sqrt()
+}
+
+/// Whether points are the planned ones, rounded to the digits that they have: no touch ends where it was planned in all of them.
+fn is_given_back(found: &[Point], planned: &[Point]) -> bool {
+    /// Fewer may be alike by chance; points of fewer digits too.
+    const LEAST: usize = 3;
+    const DIGITS: std::ops::RangeInclusive<i32> = 3..=9;
+    let has_digits = |digits: i32| {
+        let scale = 10f64.powi(digits);
+        found.iter().flat_map(|p| p.iter()).all(|v| (v * scale - (v * scale).round()).abs() < 1e-3)
+    };
+    let digits = DIGITS.into_iter().find(|digits| has_digits(*digits)).unwrap_or(*DIGITS.end());
+    let within_mm = 0.51 * 10f64.powi(-digits);
+    found.len() >= LEAST && found.iter().zip(planned).all(|(p, q)| (p - q).iter().all(|v| v.abs() <= within_mm))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{MeasuredPoint, Target};
+
+    /// 5 by 4 targets of a bowl, 8 mm apart.
+    fn plan() -> Plan {
+        let target = |k: u32| {
+            let (x, y) = (8.0 * f64::from(k % 5) - 16.0, 8.0 * f64::from(k / 5) - 12.0);
+            let normal = Vector::new(-x / 100.0, -y / 100.0, 1.0).normalize();
+            let point_mm = [x, y, (x * x + y * y) / 200.0];
+            Target { index: k, what: TargetKind::Part, point_mm, normal: normal.into() }
+        };
+        Plan {
+            targets: (0..20).map(target).collect(),
+            probe_radius_mm: 1.5,
+            approach_mm: 2.0,
+            search_mm: 2.0,
+            speed_mm_s: 5.0,
+            safe_height_mm: 50.0,
+            careful: None,
+        }
+    }
+
+    fn measurement(points: Vec<MeasuredPoint>, coordinates: Coordinates) -> Measurement {
+        let (probe_radius_mm, temperature_c, duration_s, plan_identity) = (None, None, None, [0; 32]);
+        Measurement {
+            points,
+            coordinates,
+            probe_radius_mm,
+            temperature_c,
+            duration_s,
+            plan_identity,
+            job: 1,
+            cycle: 1,
+            done: 1,
+        }
+    }
+
+    /// What is touched at a plan's targets: `error_mm` of each along its normal, then moved.
+    fn measured(
+        plan: &Plan,
+        digits: i32,
+        error_mm: impl Fn(usize) -> f64,
+        order: impl Fn(usize) -> usize,
+    ) -> Measurement {
+        let scale = 10f64.powi(digits);
+        let touch = |k: usize| {
+            let target = &plan.targets[order(k)];
+            let centre = Point::from(target.point_mm) + Vector::from(target.normal) * (1.5 + error_mm(k));
+            let at_mm = [centre.x, centre.y, centre.z].map(|v| (v * scale).round() / scale);
+            MeasuredPoint { index: k as u32, status: PointStatus::Touched, quality: 0, at_mm }
+        };
+        measurement((0..plan.targets.len()).map(touch).collect(), Coordinates::Centres)
+    }
+
+    #[test]
+    fn the_plan_given_back_is_no_measurement_in_any_number_of_digits() {
+        let plan = plan();
+        for digits in [3, 4, 6, 9] {
+            assert_eq!(plan.check(&measured(&plan, digits, |_| 0.0, |k| k)), Err(BesidePlan::GivenBack), "{digits}");
+            // A part that is off by a few of its digits somewhere was touched.
+            let part = |k: usize| if k == 7 { 5.0 * 10f64.powi(-digits) } else { 0.0 };
+            assert_eq!(plan.check(&measured(&plan, digits, part, |k| k)), Ok(()), "{digits}");
+        }
+        let contacts = |target: &Target| MeasuredPoint {
+            index: target.index,
+            status: PointStatus::Touched,
+            quality: 0,
+            at_mm: target.point_mm,
+        };
+        let given_back = measurement(plan.targets.iter().map(contacts).collect(), Coordinates::Contacts);
+        assert_eq!(plan.check(&given_back), Err(BesidePlan::GivenBack));
+    }
+
+    #[test]
+    fn points_in_another_order_are_not_those_of_the_plan() {
+        let plan = plan();
+        let form = |k: usize| 1e-3 * (k as f64).sin();
+        assert_eq!(plan.check(&measured(&plan, 6, form, |k| k)), Ok(()));
+        // A row that is missing moves all behind it, a file that was turned over has the last point first, and two rows were exchanged.
+        let orders: [&dyn Fn(usize) -> usize; 3] = [&|k| (k + 1) % 20, &|k| 19 - k, &|k| {
+            if k == 3 {
+                12
+            } else if k == 12 {
+                3
+            } else {
+                k
+            }
+        }];
+        for order in orders {
+            let found = plan.check(&measured(&plan, 6, form, order));
+            assert!(matches!(found, Err(BesidePlan::Elsewhere { .. })), "{found:?}");
+        }
+        // Inches are told by what is measured of a sphere or by the fit.
+        let mut inches = measured(&plan, 6, form, |k| k);
+        inches.points.iter_mut().for_each(|point| point.at_mm = point.at_mm.map(|v| v / 25.4));
+        assert_eq!(plan.check(&inches), Ok(()));
+    }
+}
