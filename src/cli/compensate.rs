@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use clap::Args;
 use regrind::compensation::Correction;
 use regrind::compensation::path::{Wanted, height_of, spline_of};
-use regrind::formats::Table;
 use regrind::formats::gcode::{
-    AlongNormals, Amended, Amendment, GcodeError, MapKind, correct_program, is_same_file, read_program_map,
+    AlongNormals, Amended, Amendment, GcodeError, MapKind, correct_program, read_program_map,
 };
+use regrind::formats::{Table, is_same_file};
 use regrind::geometry::Grid;
 use regrind::surface::Projection;
 use serde::Serialize;

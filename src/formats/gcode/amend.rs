@@ -21,6 +21,7 @@ use super::number::{push_fixed, rounded};
 use super::read::{Block, Refusal, Word, block};
 use super::write::UNCORRECTED;
 use super::{GcodeError, hex};
+use crate::is_same_file;
 use crate::registration::Draft;
 use crate::whole::read_whole;
 use regrind_core::compensation::path::{Field, Wanted, displaced};
@@ -173,21 +174,6 @@ fn states_unit_first(text: &str) -> bool {
         }
     }
     true
-}
-
-/// Returns whether two names are those of one file that is there.
-pub fn is_same_file(one: &Path, other: &Path) -> bool {
-    let Ok((a, b)) = std::fs::metadata(one).and_then(|a| Ok((a, std::fs::metadata(other)?))) else { return false };
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::MetadataExt;
-        (a.dev(), a.ino()) == (b.dev(), b.ino())
-    }
-    #[cfg(not(unix))]
-    {
-        let _ = (a, b);
-        one.canonicalize().ok() == other.canonicalize().ok()
-    }
 }
 
 /// Refuses a program that has the map in it, that belongs to another part than the map, or to another correction.

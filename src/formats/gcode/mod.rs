@@ -17,7 +17,7 @@ mod read;
 mod table;
 mod write;
 
-pub use amend::{AlongNormals, Amended, Amendment, correct_program, is_same_file};
+pub use amend::{AlongNormals, Amended, Amendment, correct_program};
 pub use dialect::{ArcWords, CentreWords, Dialect, DialectError, Exactness, Fault, LINUXCNC, Tilting, Turning};
 pub use error::GcodeError;
 pub use map::{MapBase, MapKind, ProgramMap, read_program_map};

@@ -30,3 +30,8 @@ pub struct OpenToOthers {
 pub fn readable_by_others(path: &Path) -> std::io::Result<Option<OpenToOthers>> {
     here::readable_by_others(path)
 }
+
+/// Returns whether two names are those of one file that is there.
+pub fn is_same_file(one: &Path, other: &Path) -> bool {
+    here::is_same_file(one, other).unwrap_or(false)
+}

@@ -18,6 +18,11 @@ pub(super) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>
     Ok((mode & 0o077 != 0).then(open))
 }
 
+pub(super) fn is_same_file(one: &Path, other: &Path) -> io::Result<bool> {
+    let identity = |path: &Path| fs::metadata(path).map(|there| (there.dev(), there.ino()));
+    Ok(identity(one)? == identity(other)?)
+}
+
 /// Whether what is at a path, itself and not what it links to, is a socket.
 pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
     Ok(fs::symlink_metadata(path)?.file_type().is_socket())

@@ -11,6 +11,11 @@ pub(crate) fn create_owners(path: &Path) -> io::Result<File> {
     regrind_windows::create_owners_file(path)
 }
 
+/// By their full names: a second name of one file, a hard link, is not told.
+pub(super) fn is_same_file(one: &Path, other: &Path) -> io::Result<bool> {
+    Ok(one.canonicalize()? == other.canonicalize()?)
+}
+
 pub(super) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>> {
     let others = regrind_windows::others_who_read(&File::open(path)?)?;
     let own_name = regrind_windows::own_name().unwrap_or_else(|_| "%USERNAME%".into());
