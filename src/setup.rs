@@ -322,7 +322,11 @@ pub fn surface(path: &Path, file: NominalFile, projection: Projection) -> Result
     let of_surface = |source| SetupError::Nominal { path: path.to_owned(), source };
     match file {
         NominalFile::Points(points) => Nominal::from_points(points, projection).map_err(of_surface),
-        NominalFile::Mesh { points, triangles } => Nominal::from_mesh(points, triangles).map_err(of_surface),
+        NominalFile::Mesh { points, triangles } => {
+            let nominal = Nominal::from_mesh(points, triangles).map_err(of_surface)?;
+            nominal.check_is_open().map_err(of_surface)?;
+            Ok(nominal)
+        }
         NominalFile::Definition(text) => match DefinedSurface::from_toml(&text) {
             Ok(surface) => sampled(path, &surface),
             Err(source) => Err(SetupError::Definition { path: path.to_owned(), source }),

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::formats::NominalFile;
-use regrind::surface::Projection;
 use regrind::surface::accuracy::{Accuracy, Estimate, Figures, Samples, Trust, accuracy};
+use regrind::surface::{Nominal, Projection};
 use serde::Serialize;
 
 use super::choice::word_of;
@@ -94,8 +94,12 @@ fn judge(arguments: &Arguments) -> Result<Accuracy, Failure> {
     let path = &arguments.nominal;
     let projection = arguments.projection;
     match nominal::read(path, arguments.projection, &arguments.table.table())? {
-        NominalFile::Points(points) | NominalFile::Mesh { points, .. } => {
-            accuracy(Samples::Points { points: &points, projection })
+        NominalFile::Points(points) => accuracy(Samples::Points { points: &points, projection }),
+        NominalFile::Mesh { points, triangles } => {
+            // What is wrong with it is said as every command says it.
+            Nominal::from_mesh(points.clone(), triangles)
+                .and_then(|mesh| mesh.check_is_open())
+                .and_then(|()| accuracy(Samples::Points { points: &points, projection }))
         }
         NominalFile::Definition(text) => {
             let grid = nominal::sampled(path, &text)?;

@@ -70,6 +70,9 @@ refused. Refused too, with their line: a word that has no meaning in its line, v
 compensation, G92 and other moved zeros, inverse time, axes that turn away from 0, a change of the work coordinates on
 the way. Comments are kept, line numbers are not.
 
+Between its nodes a map is a cubic spline, which swings by a tenth of a step beside it. Nodes with 0 in a column `valid`
+are taken as they are of a map of Regrind; of another one the nearest valid value stands there.
+
 A program without a move at feed is refused, one of whose moves at feed hardly any lie over the map, and a correction of more
 than --largest-correction-um. Lengths beside the map are told: there its outermost values are levelled off within five
 nodes. Before the new program gets its name its lines are read again by other means and held against base and map.

@@ -156,7 +156,8 @@ fn save_pictures(task: &Task, files: &mut Files, map: &ErrorMap) -> Result<(), R
         picture = picture.with_tolerance(tolerance_mm)?;
     }
     picture.save_svg(&files.place("error_map.svg"))?;
-    picture.save_png(&files.place("error_map.png"))
+    let pixels = files.place("error_map.png");
+    if task.simulation { picture.save_simulated_png(&pixels) } else { picture.save_png(&pixels) }
 }
 
 fn save_points(task: &Task, files: &mut Files, found: &Registration) -> Result<(), ReportError> {

@@ -11,6 +11,7 @@ use regrind_formats::write_atomic;
 
 use super::axis::{Ruler, Scale, grouped, three_digits};
 use super::colour::{ColourMap, Tones};
+use super::marked::marked;
 use super::raster::Raster;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
 use super::{ReportError, range};
@@ -320,6 +321,33 @@ impl HeatMap {
     /// A file that cannot be written.
     pub fn save_png(&self, path: &Path) -> Result<(), ReportError> {
         Ok(write_atomic(path, &self.to_png()?)?)
+    }
+
+    /// Saves the pixels under the word SIMULATION, enlarged where there are too few for it.
+    ///
+    /// # Errors
+    /// What the encoder says, and a file that cannot be written.
+    pub fn save_simulated_png(&self, path: &Path) -> Result<(), ReportError> {
+        let columns = self.raster.grid.columns;
+        let tone = |value: &f64| {
+            let [red, green, blue] = self.tones.at(*value);
+            if value.is_nan() { [0; 4] } else { [red, green, blue, 255] }
+        };
+        let pixels: Vec<[u8; 4]> = self.raster.values.chunks(columns).rev().flatten().map(tone).collect();
+        let picture = marked(&pixels, columns);
+        let encoded = || {
+            let mut bytes = Vec::new();
+            let mut encoder = png::Encoder::new(&mut bytes, picture.width as u32, picture.height as u32);
+            encoder.set_color(png::ColorType::Rgba);
+            encoder.set_depth(png::BitDepth::Eight);
+            encoder.set_compression(png::Compression::High);
+            let mut writer = encoder.write_header()?;
+            writer.write_image_data(&picture.rgba)?;
+            writer.finish()?;
+            Ok(bytes)
+        };
+        let bytes = encoded().map_err(|source| ReportError::Encoding { figure: self.title.clone(), source })?;
+        Ok(write_atomic(path, &bytes)?)
     }
 }
 

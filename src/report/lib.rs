@@ -21,6 +21,7 @@ mod dfq;
 mod form;
 mod heat_map;
 mod maps;
+mod marked;
 mod means;
 mod plot;
 mod ply;

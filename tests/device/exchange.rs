@@ -313,7 +313,7 @@ fn what_is_wrong_with_a_result_is_said_with_the_remedy() {
             THREE.to_owned(),
             "neither the file nor the cell says whether the coordinates are probe centres or contact points",
         ),
-        (format!("# units: inch\n{}", three()), "the file says that the unit is 25.4 mm, the cell file says 1 mm"),
+        (format!("# units: inch\n{}", three()), "the file says that the unit is inch, the cell file says mm"),
         (format!("# probe radius mm: 1.49\n{}", three()), "probe radius of 1.49 mm, the recipe says 1.5 mm"),
         (with("index,x,y,z\n10,1,2,3\n99,4,5,6\n"), "index `99` is not a target of the plan"),
         (with("index,x,y,z\n10,1,2,3\n10,4,5,6\n"), "index `10` came before"),

@@ -196,6 +196,7 @@ fn what_moves_the_tool_and_is_not_told_is_refused_with_its_line() {
         ("G1 X1 H2", "H2 has no meaning"),
         ("G0 G1 X2", "only one"),
         ("G1 X2 G90 G91", "only one"),
+        ("G2 X9 I4 P2", "P lets"),
         ("M3 M5", "only one"),
         ("G1 X1 F100 F200", "F stands twice"),
         ("G1 X1\nA0", "turns the part"),
@@ -221,6 +222,25 @@ fn what_is_in_force_is_written_and_nothing_is_lost() {
         text
     };
     let begin = "G21 G90\nG0 X10 Y0 Z1\nG1 Z0 F300\n";
+    // Lines that many programs begin with, and that change nothing.
+    kept(
+        "\n%\nN10 G00G21G17G90G40G49G80\nG92.1\nX10Y10Z5\nG1Z0F100\nX20\n%\nnotes: &c.\n",
+        &["G1 X20.000000 Y10.000000 Z-0.004000"],
+    );
+    let first = kept(&format!("\n%\n{begin}X20\n%\n"), &[]);
+    assert!(first.starts_with("\n%\n(Regrind"), "{first}");
+    // The same zero again, an output that is set, one turn, and a spindle that stops with the move.
+    kept(
+        &format!("G54\n{begin}G0 Z5\nG54 X30\nM67 E0 Q3\nG1 Z0\nG2 X30 I-5 P1\nG1 X40 M19 R90\nM2\n"),
+        &["M67 E0 Q3", "M19 R90"],
+    );
+    // The remark of an older program.
+    let old = Shop::new(|_, _| 0.004, "");
+    fs::write(old.path("base.ngc"), [b"(T1 Fr\xe4ser)\n", begin.as_bytes(), b"X20\nM2\n"].concat()).unwrap();
+    assert!(old.compensate(&[]).unwrap().contains("(T1 Fr\u{e4}ser)"));
+    // A circle where the map is all but zero begins where it ends.
+    let hardly = Shop::new(|_, _| 0.000_04, "G21 G90 G18\nG0 X10 Y10 Z5\nG0 X20 Y20 Z0\nG2 I5 K0 F100\nM2\n");
+    assert_eq!(hardly.compensate(&[]).unwrap().matches("\nG2 ").count(), 1);
     // A whole circle under a G3 in force, without an axis.
     let circle = kept(
         &format!("{begin}G3 X0 Y10 I-10 J0\nJ-10\nM2\n"),
@@ -298,6 +318,13 @@ fn a_foreign_map_is_used_where_it_is_valid_and_within_reason() {
     };
     // To the right nothing was measured, and the number there means nothing.
     map(&|i| if i < 2 { "0.004,1".into() } else { "NaN,0".into() });
+    let points = feeds(&bench.compensate(&[]).unwrap());
+    assert!(points.iter().all(|point| (point[2] + 0.004).abs() < 1e-6 || point[2] > 0.5), "{points:?}");
+    // So it is in a map that names its part, with a mark of Excel's and words of others before it.
+    let text =
+        fs::read_to_string(bench.path("map.csv")).unwrap().replace(",valid\n", ",Valid\n").replace(",1\n", ",True\n");
+    let named = format!("\u{feff}# part: sha256 {}\n{text}", "ab".repeat(32));
+    fs::write(bench.path("map.csv"), named).unwrap();
     let points = feeds(&bench.compensate(&[]).unwrap());
     assert!(points.iter().all(|point| (point[2] + 0.004).abs() < 1e-6 || point[2] > 0.5), "{points:?}");
     map(&|_| "5.0,1".into());

@@ -42,6 +42,15 @@ pub enum SurfaceError {
     )]
     NonManifold { at: [f64; 3], triangles: usize },
     #[error(
+        "{count} triangles of the nominal mesh are there twice, the first at ({:.6}, {:.6}, {:.6}) mm; remove the doubles",
+        at[0], at[1], at[2]
+    )]
+    DoubledTriangles { count: usize, at: [f64; 3] },
+    #[error(
+        "the nominal mesh of {triangles} triangles is a closed solid, and which of its faces is ground it does not say; export that face alone"
+    )]
+    ClosedSolid { triangles: usize },
+    #[error(
         "neighbouring triangles of the nominal mesh turn opposite ways at ({:.6}, {:.6}, {:.6}) mm; orient them alike",
         at[0], at[1], at[2]
     )]

@@ -35,7 +35,8 @@ impl MeshLattice {
         if let Some(&vertex) = corners.iter().flatten().find(|&&c| c as usize >= points.len()) {
             return Err(SurfaceError::VertexOutOfRange { vertex, points: points.len() });
         }
-        let neighbours = neighbours(&corners, points)?;
+        // A doubled triangle breaks a rule of edges; what it is helps more.
+        let neighbours = neighbours(&corners, points).map_err(|error| doubled(&corners, points).unwrap_or(error))?;
         Self::from_parts(points, corners, neighbours)
     }
 
@@ -61,6 +62,11 @@ impl MeshLattice {
             },
         );
         Ok(Self { corners, neighbours, facet_of, starts, start_facets })
+    }
+
+    /// Whether no triangle has a border: the mesh goes around a whole solid.
+    pub(crate) fn is_closed(&self) -> bool {
+        self.neighbours.iter().flatten().all(|neighbour| *neighbour != BORDER)
     }
 
     pub(crate) fn facet_count(&self) -> u32 {
@@ -211,6 +217,17 @@ fn neighbours(corners: &[[u32; 3]], points: &[Point]) -> Result<Vec<[u32; 3]>, S
     Ok(neighbours)
 }
 
+/// Tells triangles that are there twice.
+fn doubled(corners: &[[u32; 3]], points: &[Point]) -> Option<SurfaceError> {
+    let mut sorted: Vec<[u32; 3]> = corners.to_vec();
+    sorted.iter_mut().for_each(|corners| corners.sort_unstable());
+    sorted.sort_unstable();
+    let twice = sorted.windows(2).filter(|pair| pair[0] == pair[1]);
+    let count = twice.clone().count();
+    let first = twice.map(|pair| pair[0][0]).next()?;
+    Some(SurfaceError::DoubledTriangles { count, at: points[first as usize].into() })
+}
+
 /// One facet at each vertex; at a border the one from which going counter-clockwise meets all the others.
 fn first_facets(vertices: usize, corners: &[[u32; 3]], neighbours: &[[u32; 3]]) -> Vec<u32> {
     let mut first = vec![BORDER; vertices];
@@ -269,13 +286,27 @@ mod tests {
     }
 
     #[test]
+    fn a_solid_has_no_border() {
+        let (points, corners) = fan();
+        assert!(!MeshLattice::new(&points, corners).unwrap().is_closed());
+        let corner = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(Point::from);
+        let solid = vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]];
+        assert!(MeshLattice::new(&corner, solid).unwrap().is_closed());
+    }
+
+    #[test]
     fn meshes_that_are_no_surface_are_refused() {
         let (points, mut corners) = fan();
         corners[1] = [2, 1, 4];
         assert!(matches!(MeshLattice::new(&points, corners.clone()), Err(SurfaceError::Orientation { .. })));
-        corners[1] = [0, 1, 4];
-        corners[2] = [1, 0, 4];
-        assert!(matches!(MeshLattice::new(&points, corners), Err(SurfaceError::NonManifold { .. })));
+        let one_edge = vec![[0, 1, 4], [1, 0, 3], [0, 1, 2]];
+        assert!(matches!(MeshLattice::new(&points, one_edge), Err(SurfaceError::NonManifold { .. })));
+        let (_, once) = fan();
+        // Whichever corner it begins with, and whichever way it turns.
+        for again in [[0, 1, 4], [4, 0, 1], [1, 0, 4]] {
+            let twice = MeshLattice::new(&points, [&once[..], &[again]].concat());
+            assert!(matches!(twice, Err(SurfaceError::DoubledTriangles { count: 1, .. })), "{again:?}");
+        }
         assert!(matches!(MeshLattice::new(&points, vec![[0, 1, 9]]), Err(SurfaceError::VertexOutOfRange { .. })));
         assert!(matches!(MeshLattice::new(&points, Vec::new()), Err(SurfaceError::NoTriangles)));
     }

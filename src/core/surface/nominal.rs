@@ -179,6 +179,17 @@ impl Nominal {
         }
     }
 
+    /// Refuses a mesh that goes around a whole solid: a part's face has a border.
+    ///
+    /// # Errors
+    /// A closed solid.
+    pub fn check_is_open(&self) -> Result<(), SurfaceError> {
+        match self.patches.iter().find_map(Patch::closed_triangles) {
+            Some(triangles) => Err(SurfaceError::ClosedSolid { triangles }),
+            None => Ok(()),
+        }
+    }
+
     /// Returns what the surface was made from.
     pub fn kind(&self) -> NominalKind {
         self.kind

@@ -44,6 +44,14 @@ impl Patch {
         Self { lattice: Lattice::Grid(lattice), vertices: Vertices::Ready(nodes) }
     }
 
+    /// Returns how many triangles a mesh has, if it has no border.
+    pub(crate) fn closed_triangles(&self) -> Option<usize> {
+        match &self.lattice {
+            Lattice::Mesh(mesh) if mesh.is_closed() => Some(mesh.facet_count() as usize),
+            _ => None,
+        }
+    }
+
     /// Joins a mesh with normals that are fitted when a triangle is first touched.
     pub(crate) fn mesh(points: Vec<Point>, lattice: MeshLattice) -> Self {
         let cells = points.par_iter().map(|_| NormalCell::unknown()).collect();

@@ -35,6 +35,11 @@ const MOST_POINTS: f64 = 2e6;
 /// A program of which more than this share lies beside the map is not that of the map, or in another unit.
 const MOST_BESIDE: f64 = 0.95;
 
+/// An arc stays one where its ends are moved alike to this.
+const MOST_WOUND_MM: f64 = 1e-3;
+/// What six decimals of three coordinates round.
+const ROUNDING_MM: f64 = 2e-6;
+
 /// How a program is corrected.
 #[derive(Debug)]
 pub struct Amendment<'a> {
@@ -92,8 +97,9 @@ pub struct Amended {
 pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result<Amended, GcodeError> {
     let bytes = read_whole(base, MOST_BYTES)?;
     let program = |what: &str, remedy| GcodeError::Program { path: base.to_owned(), what: what.into(), remedy };
-    let text = std::str::from_utf8(&bytes)
-        .map_err(|_| program("the program is no plain text", "give the program as the controller reads it"))?;
+    let text = decoded(&bytes)
+        .ok_or_else(|| program("the program is no plain text", "give the program as the controller reads it"))?;
+    let text = &*text;
     if let Some((what, remedy)) = other_control(text) {
         return Err(program(what, remedy));
     }
@@ -109,9 +115,15 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     let mut begun = false;
     for (number, line) in (1..).zip(text.lines()) {
         let refused = |(what, remedy): Refusal| GcodeError::Line { path: base.to_owned(), line: number, what, remedy };
+        if writer.control.ended {
+            // No control reads on.
+            draft.write(format!("{line}\n").as_bytes())?;
+            continue;
+        }
         let block = block(line).map_err(refused)?;
+        let is_blank = block.words.is_empty() && block.comments.is_empty() && !block.percent;
         // The header stands behind the percent sign, if there is one.
-        if !begun && !block.percent {
+        if !begun && !block.percent && !is_blank {
             draft.write(header.as_bytes())?;
             begun = true;
         }
@@ -119,6 +131,7 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
         writer.line(line, &block).map_err(refused)?;
         check.line(line, &writer.text).map_err(refused)?;
         draft.write(&writer.text)?;
+        writer.control.ended |= begun && block.percent;
     }
     let done = writer.done;
     if done.straight + done.arcs == 0 {
@@ -136,6 +149,15 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     }
     draft.publish()?;
     Ok(done)
+}
+
+/// Returns a program as text: UTF-8, or Latin-1, in which older programs have their remarks; none where it is neither.
+fn decoded(bytes: &[u8]) -> Option<std::borrow::Cow<'_, str>> {
+    if bytes.iter().any(|b| *b < b' ' && !b"\t\r\n\x0c".contains(b)) {
+        return None;
+    }
+    let latin = || bytes.iter().map(|b| char::from(*b)).collect::<String>().into();
+    Some(std::str::from_utf8(bytes).map_or_else(|_| latin(), Into::into))
 }
 
 /// Tells a program of another control than LinuxCNC by its first lines.
@@ -254,7 +276,7 @@ impl<'a> Rewriter<'a> {
     /// Takes one line and writes what becomes of it.
     fn line(&mut self, line: &str, block: &Block) -> Result<(), Refusal> {
         self.done.lines += 1;
-        if self.control.ended || block.words.is_empty() {
+        if block.words.is_empty() {
             self.text.extend_from_slice(line.as_bytes());
             self.text.push(b'\n');
             return Ok(());
@@ -333,23 +355,31 @@ impl<'a> Rewriter<'a> {
     ) -> Result<(), Refusal> {
         let tolerance = self.amendment.tolerance_mm;
         let lateral = arc.map_or((to - from).xy().norm(), |_| length);
+        let is_arc = arc.is_some();
         let shifts = self.shifts(way, (lateral, length), arc)?;
         let count = shifts.len() - 1;
         let corrected: Vec<Point> =
             shifts.iter().enumerate().map(|(k, shift)| way(k as f64 / count as f64) + shift).collect();
         self.measure(way, length, &shifts)?;
-        // After a rapid move the tool stands where the base program has it: it is brought to where the corrected path begins.
-        let beside = all(self.actual).is_none_or(|here| (here - corrected[0]).norm() > 0.5 * tolerance);
+        let arc = arc.filter(|_| {
+            // An arc of two radii is refused by controls.
+            let alike = (0.5 * tolerance).min(MOST_WOUND_MM);
+            shifts.iter().all(|shift| (shift - shifts[0]).norm() <= alike)
+        });
+        // After a rapid move the tool stands where the base program has it: it is brought to where the corrected path begins. The centre of an arc
+        // counts from there.
+        let near = if arc.is_some() { ROUNDING_MM } else { 0.5 * tolerance };
+        let beside = all(self.actual).is_none_or(|here| (here - corrected[0]).norm() > near);
         if beside && (lateral > 0.0 || self.amendment.along_normals.is_some()) {
             self.point(&corrected[0]);
         }
         match arc {
-            Some(arc) if shifts.iter().all(|shift| (shift - shifts[0]).norm() <= 0.5 * tolerance) => {
+            Some(arc) => {
                 self.done.arcs_kept += 1;
                 self.arc_to(arc, &corrected[0], &corrected[count]);
             }
-            _ => {
-                let allowed = if arc.is_some() { 0.6 * tolerance } else { 0.85 * tolerance };
+            None => {
+                let allowed = if is_arc { 0.6 * tolerance } else { 0.85 * tolerance };
                 for k in kept(&corrected, allowed) {
                     self.point(&corrected[k]);
                 }
@@ -485,7 +515,7 @@ fn is_of_the_move(word: &Word, act: &Act) -> bool {
     match word.letter {
         b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'N' | b'A' | b'B' | b'C' => true,
         // Of a line that does not move the tool it belongs to another word.
-        b'R' => matches!(act, Act::Feed { .. }),
+        b'R' | b'P' => matches!(act, Act::Feed { arc: Some(_), .. }),
         b'G' => [0.0, 1.0, 2.0, 3.0, 80.0, 90.0, 91.0].contains(&word.value) || is_machine(word),
         _ => false,
     }

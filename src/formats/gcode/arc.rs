@@ -31,7 +31,7 @@ pub(super) enum Centre {
     Radius(f64),
 }
 
-/// How far the radius at the end may be from that at the beginning: in millimetres, as LinuxCNC has it, and as a share of a very small one.
+/// How far the radius at the end may be from that at the beginning: in millimetres, as LinuxCNC documents it, and as a share of a very small one.
 const RADIUS_TOLERANCE: [f64; 2] = [0.0127, 0.1];
 
 impl Arc {

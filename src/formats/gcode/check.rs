@@ -12,6 +12,9 @@ use regrind_core::geometry::{Point, Vector};
 /// More than the last digit that is written: rounding of three coordinates, and of an arc's centre.
 const DIGITS_MM: f64 = 4.0 / PER_MM;
 
+/// Radii at the ends of an arc that differ by more are refused by controls, in millimetres.
+const MOST_WOUND_MM: f64 = 0.0127 + DIGITS_MM;
+
 /// The base and what became of it, side by side.
 pub(super) struct Check<'a> {
     amendment: &'a Amendment<'a>,
@@ -28,6 +31,8 @@ struct Machine {
     centres_absolute: bool,
     /// 0 for XY, 1 for ZX, 2 for YZ.
     plane: usize,
+    /// The zero in force, in tenths of its word.
+    zero: Option<i64>,
     motion: Option<u8>,
     feed: Option<f64>,
     over: bool,
@@ -103,16 +108,20 @@ impl Machine {
         let number = |letter: u8| block.words.iter().find(|w| w.letter == letter).map(|w| w.value);
         let codes: Vec<i64> =
             block.words.iter().filter(|w| w.letter == b'G').map(|w| (w.value * 10.0).round() as i64).collect();
-        let lost = |k: usize| {
-            let tool = |w: &&super::read::Word| w.letter == b'M' && w.value == 6.0;
-            let zero = codes.iter().any(|code| (540..600).contains(code)) || block.words.iter().find(tool).is_some();
-            zero || (k == 2 && codes.iter().any(|code| [430, 490].contains(code)))
-        };
-        (0..3).filter(|&k| lost(k)).for_each(|k| self.at[k] = None);
+        let is_zero = |code: &&i64| (540..600).contains(*code);
+        let other_zero = codes.iter().find(is_zero).is_some_and(|code| self.zero.replace(*code) != Some(*code));
+        let tool = block.words.iter().any(|w| w.letter == b'M' && w.value == 6.0);
+        if other_zero || tool || codes.contains(&921) {
+            self.at = [None; 3];
+        }
+        if codes.iter().any(|code| [430, 490].contains(code)) {
+            self.at[2] = None;
+        }
+        let moves = codes.iter().any(|code| [0, 10, 20, 30].contains(code));
         for code in &codes {
             match code {
                 0 | 10 | 20 | 30 => self.motion = Some((code / 10) as u8),
-                800 => self.motion = None,
+                800 if !moves => self.motion = None,
                 170 | 180 | 190 => self.plane = ((code - 170) / 10) as usize,
                 200 | 210 => self.inches = *code == 200,
                 900 | 910 => self.by_distance = *code == 910,
@@ -191,6 +200,9 @@ impl Machine {
         }
         if begin.norm() == 0.0 {
             return Err("an arc about its own beginning".into());
+        }
+        if (begin.norm() - end.norm()).abs() > MOST_WOUND_MM {
+            return Err(format!("an arc of two radii, {:.4} and {:.4} mm", begin.norm(), end.norm()));
         }
         Ok(Round { from, to, centre: [centre.x, centre.y], axes, angle })
     }
@@ -329,6 +341,14 @@ fn beside(from: Point, to: Point, point: Point) -> f64 {
     (arm - along * share).norm()
 }
 
+/// Whether a line has an arc whose turns P counts.
+fn is_turn(block: &Block) -> bool {
+    let has = |letter: u8, of: &[f64]| block.words.iter().any(|w| w.letter == letter && of.contains(&w.value));
+    block.words.iter().any(|w| matches!(w.letter, b'I' | b'J' | b'K' | b'R'))
+        && !has(b'M', &[19.0])
+        && !has(b'G', &[4.0, 64.0])
+}
+
 /// Counts the words that neither move the tool nor number a line.
 fn count_words(block: &Block, counts: &mut BTreeMap<String, i32>, by: i32) {
     for word in &block.words {
@@ -337,6 +357,8 @@ fn count_words(block: &Block, counts: &mut BTreeMap<String, i32>, by: i32) {
             b'G' => [0.0, 1.0, 2.0, 3.0, 80.0, 90.0, 91.0].contains(&word.value),
             // The radius of an arc becomes its centre.
             b'R' => !block.words.iter().any(|w| w.letter == b'M' && w.value == 19.0),
+            // One turn, as without it.
+            b'P' => is_turn(block),
             _ => false,
         };
         if !moves {

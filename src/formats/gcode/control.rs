@@ -14,7 +14,7 @@ const TURNING: [u8; 3] = *b"ABC";
 
 /// G words of which one line may have one, in tenths.
 const GROUPS: [&[i64]; 12] = [
-    &[0, 10, 20, 30, 800],
+    &[0, 10, 20, 30],
     &[40, 280, 300, 530],
     &[170, 180, 190],
     &[200, 210],
@@ -142,12 +142,16 @@ impl Control {
     /// Takes in what a line puts in force; refuses what moves the tool otherwise.
     fn states(&mut self, block: &Block) -> Result<Asked, Refusal> {
         let mut asked = Asked::default();
+        let is_move = |word: &&Word| word.letter == b'G' && [0.0, 1.0, 2.0, 3.0].contains(&word.value);
+        asked.motion = block.words.iter().find(is_move).map(|word| word.value as u8);
         for word in &block.words {
             match word.letter {
                 b'G' => self.g(word, &mut asked)?,
                 b'M' => self.m(word, &mut asked)?,
                 b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'R' | b'F' | b'S' | b'T' | b'H' | b'D' | b'P' | b'Q'
                 | b'N' | b'A' | b'B' | b'C' => {}
+                // Of inputs and outputs alone.
+                b'E' | b'L' if has_io(block) => {}
                 b'U' | b'V' | b'W' => return Err(axis_refused(word)),
                 _ => return Err((format!("{} is not known", word.text), "remove it, if it does not move the tool")),
             }
@@ -174,7 +178,9 @@ impl Control {
             280 | 300 => asked.reference = true,
             530 => asked.machine = true,
             code @ (540 | 550 | 560 | 570 | 580 | 590 | 591 | 592 | 593) => self.choose_system(code, word, asked)?,
-            800 => self.motion = None,
+            // Beside a move in its line it changes nothing: the move is in force.
+            800 if asked.motion.is_none() => self.motion = None,
+            800 => {}
             // Another length of the tool is another Z under the same place.
             430 | 490 => {
                 asked.forgets[2] = true;
@@ -183,6 +189,8 @@ impl Control {
             640 => asked.takes.extend(b"PQ"),
             960 => asked.takes.push(b'D'),
             400 | 610 | 611 | 940 | 950 | 970 | 980 | 990 => {}
+            // Takes back zeros that were moved; where the tool is under those of the program is not known then.
+            921 if !self.moved => asked.forgets = [true; 3],
             930 => {
                 let remedy = "let the CAM system write feeds a minute (G94)";
                 return Err((
@@ -224,8 +232,9 @@ impl Control {
             // The tool goes where the machine changes it.
             6.0 => asked.forgets = [true; 3],
             19.0 => asked.takes.extend(b"RPQ"),
-            v if v.fract() == 0.0 && (matches!(v as i64, 61..=68)) => asked.takes.extend(b"PQ"),
-            v if v.fract() == 0.0 && (matches!(v as i64, 0..=9 | 48..=53 | 60)) => {}
+            v if v.fract() == 0.0 && (matches!(v as i64, 61..=68)) => asked.takes.extend(b"PQEL"),
+            v if v.fract() == 0.0 && (matches!(v as i64, 50..=53)) => asked.takes.push(b'P'),
+            v if v.fract() == 0.0 && (matches!(v as i64, 0..=9 | 48 | 49 | 60)) => {}
             _ => {
                 let found = format!("{} is a subprogram, a state of the controller, or the machine's own", word.text);
                 return Err((found, "remove it, or write out what it does"));
@@ -294,7 +303,7 @@ impl Control {
 
     fn arc(&self, block: &Block, from: Point, to: Point, clockwise: bool) -> Result<Arc, Refusal> {
         let value = |letter: u8| value(block, letter).map(|value| value * self.unit_mm);
-        if value(b'P').is_some() {
+        if block.words.iter().any(|word| word.letter == b'P' && word.value != 1.0) {
             return Err(("P lets the arc turn several times".into(), "write a line for every turn"));
         }
         let [a, b, c] = self.plane.0;
@@ -315,6 +324,11 @@ impl Control {
         }
         Arc::new(self.plane, from, to, clockwise, centre)
     }
+}
+
+/// Whether a line reads inputs or sets outputs (M62 to M68).
+fn has_io(block: &Block) -> bool {
+    block.words.iter().any(|word| word.letter == b'M' && (62.0..=68.0).contains(&word.value))
 }
 
 pub(super) fn value(block: &Block, letter: u8) -> Option<f64> {
@@ -374,7 +388,7 @@ fn check_uses(block: &Block, asked: &Asked, moves: bool, is_arc: bool) -> Result
             b'X' | b'Y' | b'Z' => (moves || asked.machine || asked.reference) && !asked.dwell,
             b'I' | b'J' | b'K' => is_arc,
             b'R' | b'P' => is_arc || asked.takes.contains(&word.letter),
-            b'Q' | b'H' | b'D' => asked.takes.contains(&word.letter),
+            b'Q' | b'H' | b'D' | b'E' | b'L' => asked.takes.contains(&word.letter),
             _ => true,
         };
         if !used {

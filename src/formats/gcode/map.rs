@@ -114,7 +114,7 @@ impl MapLines {
     /// Takes one line; the error says what is wrong with it.
     fn take(&mut self, line: &[u8]) -> Result<(), String> {
         self.hash.update(line);
-        let text = std::str::from_utf8(line).map_err(|_| "the line is no text")?.trim();
+        let text = std::str::from_utf8(line).map_err(|_| "the line is no text")?.trim_start_matches('\u{feff}').trim();
         if let Some(comment) = text.strip_prefix('#') {
             self.simulation |= comment.trim() == "SIMULATION";
             self.part = self.part.or(identity_in(comment, "part:"));
@@ -122,13 +122,13 @@ impl MapLines {
             self.ground_with = self.ground_with.or(identity_in(comment, "ground with:"));
         } else if !text.is_empty() && self.kind.is_none() {
             self.kind = Some(columns(text).ok_or_else(|| format!("the columns are {text:?}"))?);
-            self.valid_column = text.split(',').position(|name| name.trim() == "valid");
+            self.valid_column = text.split(',').position(|name| name.trim().eq_ignore_ascii_case("valid"));
         } else if !text.is_empty() {
             let cell = self.valid_column.map(|column| text.split(',').nth(column).map(str::trim));
-            let valid = match cell {
-                None | Some(Some("1" | "true")) => true,
-                Some(Some("0" | "false")) => false,
-                Some(other) => return Err(format!("{:?} says neither 1 nor 0 of a node", other.unwrap_or_default())),
+            let valid = match cell.map(|cell| cell.unwrap_or_default().to_lowercase()).as_deref() {
+                None | Some("1" | "1.0" | "true") => true,
+                Some("0" | "0.0" | "false") => false,
+                Some(other) => return Err(format!("{other:?} says neither 1 nor 0 of a node")),
             };
             self.nodes.push(node(text, valid).ok_or_else(|| format!("{text:?} is no node of a map"))?);
             self.valid.push(valid);
@@ -138,7 +138,7 @@ impl MapLines {
 
     /// Lays the nodes on their grid once all lines are told.
     fn into_map(self, path: &Path) -> Result<ProgramMap, GcodeError> {
-        let remedy = "every node of a regular grid needs its row";
+        let remedy = "every node of a regular grid of three rows and three columns at least needs its row";
         let no_grid = |what: String| GcodeError::Program { path: path.to_owned(), what, remedy };
         let kind = self.kind.ok_or_else(|| no_grid("the map is empty".into()))?;
         let (grid, order) =
@@ -148,9 +148,11 @@ impl MapLines {
         if !valid.contains(&true) {
             return Err(no_grid("none of its nodes is valid".into()));
         }
-        if self.stated.is_none() && self.part.is_none() {
-            level_off(&mut values_mm, &valid, grid.columns);
-        }
+        // A map of ours is levelled off; of another one what stands at a node that is not valid means nothing.
+        let is_ours = self.stated.is_some() || self.part.is_some();
+        let is_known = |(value, valid): (&f64, &bool)| *valid || (is_ours && value.is_finite());
+        let known: Vec<bool> = values_mm.iter().zip(&valid).map(is_known).collect();
+        level_off(&mut values_mm, &known, grid.columns);
         Ok(ProgramMap {
             grid,
             values_mm,
@@ -180,7 +182,7 @@ fn columns(header: &str) -> Option<MapKind> {
 /// Reads the node of a row; the value of one that is not valid may be anything.
 fn node(row: &str, valid: bool) -> Option<Point> {
     let mut cells = row.split(',').map(|cell| cell.trim().parse::<f64>().ok().filter(|v| v.abs() < 1e7));
-    Some(Point::new(cells.next()??, cells.next()??, cells.next()?.or((!valid).then_some(0.0))?))
+    Some(Point::new(cells.next()??, cells.next()??, cells.next()?.or((!valid).then_some(f64::NAN))?))
 }
 
 /// The grid of the nodes, and which of them stands at each of its places.
@@ -196,10 +198,10 @@ fn grid(points: &[Point]) -> Option<(Grid, Vec<usize>)> {
     Some((grid, (0..grid.len()).map(|k| order.point_at[k] as usize).collect()))
 }
 
-/// Gives nodes that are not valid the value of the nearest one that is, by steps along rows and columns.
-fn level_off(values_mm: &mut [f64], valid: &[bool], columns: usize) {
-    let mut known = valid.to_vec();
-    let mut next: std::collections::VecDeque<usize> = (0..valid.len()).filter(|&k| valid[k]).collect();
+/// Gives nodes whose value is not known that of the nearest one whose is, by steps along rows and columns.
+fn level_off(values_mm: &mut [f64], known: &[bool], columns: usize) {
+    let mut known = known.to_vec();
+    let mut next: std::collections::VecDeque<usize> = (0..known.len()).filter(|&k| known[k]).collect();
     while let Some(from) = next.pop_front() {
         let column = from % columns;
         let beside = [
