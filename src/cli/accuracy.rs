@@ -96,7 +96,7 @@ fn judge(arguments: &Arguments) -> Result<Accuracy, Failure> {
     match nominal::read(path, arguments.projection, &arguments.table.table())? {
         NominalFile::Points(points) => accuracy(Samples::Points { points: &points, projection }),
         NominalFile::Mesh { points, triangles } => {
-            // What is wrong with it is said as every command says it.
+            // Every command says the same of a bad mesh.
             Nominal::from_mesh(points.clone(), triangles)
                 .and_then(|mesh| mesh.check_is_open())
                 .and_then(|()| accuracy(Samples::Points { points: &points, projection }))

@@ -126,7 +126,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// What became of the program, in lines.
+/// Summarises the corrected program in lines.
 fn summary(amended: &Amended) -> String {
     let mut text = format!(
         "{} straight moves and {} arcs became {} moves, {} arcs among them; no point moved by more than {} um\n",

@@ -10,7 +10,7 @@ use regrind::surface::{DefinedSurface, Nominal, NominalKind, Projection, Sampled
 use super::failure::Failure;
 use super::words::count;
 
-/// What a person says of a nominal table.
+/// Columns and unit of a nominal table, given by a person.
 #[derive(Args, Clone, Debug, Default)]
 pub(super) struct NominalTable {
     /// Columns of the nominal table, by name or by number from 1, where its header does not tell

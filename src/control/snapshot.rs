@@ -27,7 +27,7 @@ pub struct Snapshot {
     /// State and phase, for people.
     #[serde(rename = "words")]
     pub message: String,
-    /// What became of the part by now: an order that is taken says nothing of it.
+    /// The verdict on the part by now: an order that is taken says nothing of it.
     #[serde(default)]
     pub verdict: PartVerdict,
     /// Counts the states since the run began, so that an order can say which one it is meant for.
@@ -65,7 +65,7 @@ pub struct Snapshot {
     pub next: String,
 }
 
-/// What became of a part.
+/// The verdict on a part.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PartVerdict {

@@ -36,7 +36,7 @@ const SHARE_OF_HEIGHT: f64 = 0.25;
 const AROUND: usize = 48;
 /// What is within so many distances of neighbours along both axes is a neighbour: eight are, on a grid.
 const NEIGHBOUR: f64 = 1.5;
-/// What is nearer than so many distances along both axes is the same place, touched again: it says nothing of what is around.
+/// Readings nearer than so many distances along both axes are one place, touched again: they say nothing of the places around.
 const SAME_PLACE: f64 = 0.25;
 
 /// The robust filter's result.
