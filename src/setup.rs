@@ -23,7 +23,7 @@ use crate::formats::gcode::DialectError;
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Aperture, Grid, Point, Vector};
 use crate::measuring::{Expansion, Layout, PatternError, Target, targets};
-use crate::recipe::{Leaning, Mode, NominalSource, Pattern, Recipe, SpindleAxis, StartAt, Tilt, Um, Wheel};
+use crate::recipe::{Leaning, Mode, NominalSource, Pattern, Recipe, SpindleAxis, StartAt, TableWords, Tilt, Um, Wheel};
 use crate::registration::{Coordinate, MapLimits};
 use crate::surface::{DefinedSurface, DefinitionError, Nominal, Projection, Side, SurfaceError};
 
@@ -166,10 +166,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         simulation: cell.simulated,
     };
     let mut plan = plan(recipe, cell);
-    if task.adaptive.is_some() {
-        // One of the first touches may miss; the gate that counts them all is the task's.
-        plan.gates.least_found *= Adaptive::ONE_MAY_MISS;
-    }
+    plan.gates.least_found = least_found(recipe);
     let [map, targets] = [8 * task.first_correction().grid.len(), LARGEST_TARGET * task.targets.len()];
     for (link, bytes) in [(&cell.grinder.link, map), (&cell.cmm.link, targets)] {
         plan.deadlines.transfer = plan.deadlines.transfer.max(transfer_within(link, bytes));
@@ -208,6 +205,13 @@ fn datum(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
 fn adaptive(recipe: &Recipe) -> Option<Adaptive> {
     let accepted_risk = recipe.measuring.accepted_risk.filter(|_| recipe.measuring.mode == Mode::Adaptive)?;
     Some(Adaptive { tolerance: tolerance(recipe), accepted_risk, most_cycles: u32::from(recipe.cycle.most_cycles) })
+}
+
+/// The share of a plan's targets that must be found.
+fn least_found(recipe: &Recipe) -> f64 {
+    // One of the first touches may miss; the gate that counts them all is the task's.
+    let share = if recipe.measuring.mode == Mode::Adaptive { Adaptive::ONE_MAY_MISS } else { 1.0 };
+    share * recipe.measure.minimum_coverage
 }
 
 /// What is accepted.
@@ -289,9 +293,12 @@ fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> 
             let identity = identity_of(&nominal);
             Ok((nominal, recipe.path().to_owned(), identity))
         }
-        NominalSource::File { path, columns, unit, projection, aperture } => {
-            let table = nominal_table(columns.as_deref(), unit.as_deref())
-                .map_err(|(key, what)| SetupError::Table { path: recipe.path().to_owned(), key, what })?;
+        NominalSource::File { path, table, projection, aperture } => {
+            let table = nominal_table(table).map_err(|(key, what)| SetupError::Table {
+                path: recipe.path().to_owned(),
+                key,
+                what,
+            })?;
             let (file, identity) = formats::read_nominal_with_identity(path, &table)?;
             let nominal = surface(path, file, *projection)?;
             let nominal = match aperture {
@@ -307,10 +314,24 @@ fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> 
 ///
 /// # Errors
 /// The key whose words cannot be understood, and why.
-pub fn nominal_table(columns: Option<&str>, unit: Option<&str>) -> Result<formats::Table, (&'static str, String)> {
+pub fn nominal_table(words: &TableWords) -> Result<formats::Table, (&'static str, String)> {
+    table(words, ["nominal.columns", "nominal.unit", "nominal.height_unit"])
+}
+
+/// Reads what a recipe says of its table of places that are measured.
+///
+/// # Errors
+/// The key whose words cannot be understood, and why.
+pub fn plan_table(words: &TableWords) -> Result<formats::Table, (&'static str, String)> {
+    table(words, ["measure.file_columns", "measure.file_unit", "measure.file_height_unit"])
+}
+
+fn table(words: &TableWords, keys: [&'static str; 3]) -> Result<formats::Table, (&'static str, String)> {
+    let unit = |word: &Option<String>, key| word.as_deref().map(str::parse).transpose().map_err(|what| (key, what));
     Ok(formats::Table {
-        columns: columns.map(str::parse).transpose().map_err(|what| ("nominal.columns", what))?,
-        unit: unit.map(str::parse).transpose().map_err(|what| ("nominal.unit", what))?,
+        columns: words.columns.as_deref().map(str::parse).transpose().map_err(|what| (keys[0], what))?,
+        unit: unit(&words.unit, keys[1])?,
+        height_unit: unit(&words.height_unit, keys[2])?,
     })
 }
 
@@ -357,7 +378,14 @@ fn identity_of(nominal: &Nominal) -> [u8; 32] {
 fn lay(recipe: &Recipe, nominal: &Nominal, side: Side) -> Result<Vec<Target>, SetupError> {
     let layout = match &recipe.pattern {
         Pattern::Laid(layout) => layout,
-        Pattern::File(path) => &Layout::Points(formats::read_measured(path)?),
+        Pattern::File { path, table } => {
+            let table = plan_table(table).map_err(|(key, what)| SetupError::Table {
+                path: recipe.path().to_owned(),
+                key,
+                what,
+            })?;
+            &Layout::Points(formats::read_plan(path, &table)?)
+        }
         Pattern::Free { .. } => return Ok(Vec::new()),
     };
     targets(nominal, side, layout, recipe.measure.edge_margin_mm)
@@ -680,6 +708,7 @@ pub fn machines(
             Pattern::Free { least_points } => Some(usize::try_from(*least_points).unwrap_or(usize::MAX)),
             _ => None,
         },
+        least_found: least_found(recipe),
         volume_mm: volume_mm(cell),
         ..making(link, cell.simulated, [owner, epoch])
     };
@@ -749,6 +778,7 @@ fn making(link: &Link, simulated: bool, [owner, epoch]: [u32; 2]) -> Making<'_> 
         owner,
         epoch,
         free_points: None,
+        least_found: 0.0,
         timing: &link.timing,
         registers: &link.registers,
         signals: &link.signals,

@@ -11,7 +11,7 @@ use console::Term;
 use regrind::config::{CellConfig, read_dialect};
 use regrind::document::{Problem, Problems};
 use regrind::recipe::{NominalSource, Pattern, Recipe};
-use regrind::setup::nominal_table;
+use regrind::setup::{nominal_table, plan_table};
 use regrind::surface::Projection;
 use regrind_sim::spec::WorldSpec;
 use serde::Serialize;
@@ -139,8 +139,8 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
             Some(problems) => problems.problems.extend(more.problems),
         }
     };
-    if let NominalSource::File { path, columns, unit, .. } = &recipe.nominal {
-        match nominal_table(columns.as_deref(), unit.as_deref()) {
+    if let NominalSource::File { path, table, .. } = &recipe.nominal {
+        match nominal_table(table) {
             Err((key, what)) => add(key, &what),
             Ok(table) => {
                 if let Err(failure) = nominal::read(path, Projection::Auto, &table) {
@@ -149,10 +149,15 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
             }
         }
     }
-    if let Pattern::File(path) = &recipe.pattern
-        && let Err(failure) = regrind::formats::read_points(path)
-    {
-        add("measure.file", &failure);
+    if let Pattern::File { path, table } = &recipe.pattern {
+        match plan_table(table) {
+            Err((key, what)) => add(key, &what),
+            Ok(table) => {
+                if let Err(failure) = regrind::formats::read_plan(path, &table) {
+                    add("measure.file", &failure);
+                }
+            }
+        }
     }
     problems.map_or(Ok(()), Err)
 }

@@ -19,11 +19,14 @@ pub(super) struct NominalTable {
     /// Unit of the nominal table: mm, um, nm, cm, m or inch
     #[arg(long, value_name = "UNIT")]
     nominal_unit: Option<Unit>,
+    /// Unit of z in the nominal table, where it is another one than that of x and y
+    #[arg(long, value_name = "UNIT")]
+    nominal_height_unit: Option<Unit>,
 }
 
 impl NominalTable {
     pub(super) fn table(&self) -> Table {
-        Table { columns: self.nominal_columns.clone(), unit: self.nominal_unit }
+        Table { columns: self.nominal_columns.clone(), unit: self.nominal_unit, height_unit: self.nominal_height_unit }
     }
 }
 

@@ -37,6 +37,9 @@ pub(super) struct Arguments {
     /// Unit of the measured table: mm, um, nm, cm, m or inch
     #[arg(long)]
     unit: Option<Unit>,
+    /// Unit of z in the measured table, where it is another one than that of x and y
+    #[arg(long, value_name = "UNIT")]
+    height_unit: Option<Unit>,
     #[command(flatten)]
     of_nominal: NominalTable,
     /// Radius of the probe in mm; 0 for one without a ball, such as an optical one. Not needed with --method contact
@@ -168,7 +171,8 @@ fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure>
         return Err(Failure::MapOfContacts { path: arguments.measured.clone() });
     }
     let of_nominal = arguments.of_nominal.table();
-    let of_measured = Table { columns: arguments.columns.clone(), unit: arguments.unit };
+    let of_measured =
+        Table { columns: arguments.columns.clone(), unit: arguments.unit, height_unit: arguments.height_unit };
     std::thread::scope(|scope| {
         let nominal = scope.spawn(|| nominal::surface(path, projection, &of_nominal));
         let measured = read_measured_with_notes(&arguments.measured, &of_measured);

@@ -48,6 +48,8 @@ pub struct Making<'a> {
     pub epoch: u32,
     /// Where any number of points will do, and not one for each target of a plan: the least of them.
     pub free_points: Option<usize>,
+    /// The share of a plan's targets of which a measurement must have a point.
+    pub least_found: f64,
     /// How long to wait for what.
     pub timing: &'a Timing,
     /// Where the blocks of its Modbus map stand.

@@ -4,8 +4,10 @@
 //! measured stand beside nominal ones in what most machines give out, and reading those for these would make every part a good one. So a header
 //! of two groups of coordinates is a question, and a header that names no group at all is not taken for one in the usual order.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
+use std::ops::Range;
 use std::path::Path;
 use std::str::FromStr;
 
@@ -13,6 +15,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::error::{FormatError, excerpt};
+use regrind_core::geometry::{Point, Vector};
 
 /// How a table is read where it does not say so itself, or says more than one thing.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -21,6 +24,25 @@ pub struct Table {
     pub columns: Option<Columns>,
     /// The unit of the coordinates; without it the millimetre, and a table that states another one is refused.
     pub unit: Option<Unit>,
+    /// The unit of z, where it is another one than that of x and y.
+    pub height_unit: Option<Unit>,
+}
+
+impl Table {
+    /// Returns the units of x, y and z.
+    pub(super) fn units(&self) -> [Unit; 3] {
+        let unit = self.unit.unwrap_or_default();
+        [unit, unit, self.height_unit.unwrap_or(unit)]
+    }
+
+    /// Takes coordinates in its units to millimetres.
+    pub(super) fn to_mm(&self, points: &mut [Point]) {
+        let units_mm = self.units().map(Unit::in_mm);
+        if units_mm != [1.0; 3] {
+            let units_mm = Vector::from(units_mm);
+            points.iter_mut().for_each(|point| point.coords.component_mul_assign(&units_mm));
+        }
+    }
 }
 
 /// Which columns of a table are x, y and z: `x=X_act,y=Y_act,z=Z_act` by their names, or `x=4,y=5,z=6` by their numbers from 1.
@@ -413,6 +435,14 @@ impl Axes {
     }
 }
 
+/// Returns words of a file: as UTF-8, or else as Latin-1, in which many instruments write the sign of micro.
+pub(super) fn text_of(bytes: &[u8]) -> Cow<'_, str> {
+    match std::str::from_utf8(bytes) {
+        Ok(text) => Cow::Borrowed(text),
+        Err(_) => Cow::Owned(bytes.iter().map(|&byte| char::from(byte)).collect()),
+    }
+}
+
 /// Splits a column's name in lower case into the name proper and the unit it states.
 pub(super) fn split_unit(name: &str) -> (&str, Option<String>) {
     let name = name.trim();
@@ -450,13 +480,55 @@ pub(super) fn is_unit(word: &str) -> bool {
 /// Returns the unit that a title or a comment states: "units: inch", "UNITS/INCH", "all dimensions in inches".
 ///
 /// A statement counts before a word. Short words may mean anything in a sentence: only those of four letters are taken for units there.
-pub(super) fn stated_unit(text: &str) -> Option<String> {
+fn stated_unit(text: &str) -> Option<String> {
     const SHORTEST: usize = 4;
-    let text = text.to_lowercase();
-    unit_statement(&text).or_else(|| {
+    unit_statement(text).or_else(|| {
         let words = text.split(|c: char| !c.is_alphanumeric());
         let mut long = words.filter(|word| word.chars().count() >= SHORTEST);
         long.find(|word| is_unit(word) && !is_millimetre(word)).map(str::to_owned)
+    })
+}
+
+/// Units that a title or a comment states: of the heights alone ("height in um", "z: nm", "Heights (waves)"), and of everything.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct StatedUnits {
+    pub(super) of_heights: Option<String>,
+    pub(super) of_all: Option<String>,
+}
+
+impl StatedUnits {
+    pub(super) fn of(text: &str) -> Self {
+        let text = text.to_lowercase();
+        match height_unit(&text) {
+            Some(word) => {
+                let rest = format!("{}{}", &text[..word.start], &text[word.end..]);
+                Self { of_heights: Some(text[word].to_owned()), of_all: stated_unit(&rest) }
+            }
+            None => Self { of_heights: None, of_all: stated_unit(&text) },
+        }
+    }
+}
+
+/// Returns where the unit of the heights stands in a text in lower case.
+fn height_unit(text: &str) -> Option<Range<usize>> {
+    const HEIGHTS: [&str; 10] =
+        ["z", "height", "heights", "höhe", "höhen", "hoehe", "sag", "hauteur", "hauteurs", "altura"];
+    const NO_LENGTHS: [&str; 6] = ["wave", "waves", "fringe", "fringes", "lambda", "radians"];
+    /// A letter or two beside a name may be another name.
+    const SHORTEST: usize = 2;
+    let mut words: Vec<Range<usize>> = Vec::new();
+    for (at, c) in text.char_indices().filter(|(_, c)| c.is_alphanumeric()) {
+        match words.last_mut().filter(|word| word.end == at) {
+            Some(word) => word.end += c.len_utf8(),
+            None => words.push(at..at + c.len_utf8()),
+        }
+    }
+    let word = |k: usize| words.get(k).map_or("", |word| &text[word.clone()]);
+    let is_one = |word: &str| is_unit(word) || NO_LENGTHS.contains(&word);
+    (0..words.len()).filter(|k| HEIGHTS.contains(&word(*k))).find_map(|k| match (word(k + 1), word(k + 2)) {
+        ("in" | "en" | "is" | "are", unit) if is_one(unit) => Some(words[k + 2].clone()),
+        (unit, _) if is_one(unit) && unit.chars().count() >= SHORTEST && unit != "in" => Some(words[k + 1].clone()),
+        _ => None,
     })
 }
 
@@ -480,7 +552,8 @@ fn unit_statement(text: &str) -> Option<String> {
 
 /// Refuses a file whose header states another unit than the one it is read in.
 pub(super) fn check_stated_unit(path: &Path, line: u64, header: &[u8], unit: Unit) -> Result<(), FormatError> {
-    match stated_unit(&String::from_utf8_lossy(header)) {
+    let StatedUnits { of_heights, of_all } = StatedUnits::of(&text_of(header));
+    match of_all.or(of_heights) {
         Some(found) if !unit.is(&found) => Err(FormatError::Unit { path: path.to_owned(), line, found, unit }),
         _ => Ok(()),
     }
@@ -514,9 +587,28 @@ mod tests {
             ("unit in use since May", None),
             ("unity", None),
             ("x in mm", None),
+            ("x y z m", None),
+            ("heights from the sphere", None),
         ];
         for (text, unit) in cases {
-            assert_eq!(stated_unit(text).as_deref(), unit, "{text}");
+            let of_all = unit.map(str::to_owned);
+            assert_eq!(StatedUnits::of(text), StatedUnits { of_heights: None, of_all }, "{text}");
+        }
+    }
+
+    #[test]
+    fn a_comment_states_the_unit_of_the_heights() {
+        for (text, of_heights, of_all) in [
+            ("height in um", "um", None),
+            ("Heights: microns", "microns", None),
+            ("Z (\u{b5}m)", "\u{b5}m", None),
+            ("x, y in inches, z in um", "um", Some("inches")),
+            ("units: mm, height in waves", "waves", Some("mm")),
+            ("Höhe [nm]", "nm", None),
+            ("sag is m", "m", None),
+        ] {
+            let stated = StatedUnits { of_heights: Some(of_heights.to_owned()), of_all: of_all.map(str::to_owned) };
+            assert_eq!(StatedUnits::of(text), stated, "{text}");
         }
     }
 

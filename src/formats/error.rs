@@ -100,7 +100,7 @@ pub enum FormatError {
     UnnamedColumns { path: PathBuf, line: u64, columns: usize },
     /// A unit other than the one that the table is read in.
     #[error(
-        "{path}, line {line}: expected coordinates in {unit}, found the unit {}; convert the file to {unit}, or give --unit where a command takes it",
+        "{path}, line {line}: expected coordinates in {unit}, found the unit {}; convert the file to {unit}, or give --unit, or --height-unit for z alone, where a command takes it",
         quoted(found)
     )]
     Unit { path: PathBuf, line: u64, found: String, unit: Unit },

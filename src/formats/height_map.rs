@@ -119,6 +119,42 @@ pub(super) struct MapFormat {
     pub(super) parse: fn(&Path, &[u8]) -> Result<MapPoints, FormatError>,
 }
 
+impl MapFormat {
+    /// Reads the points of a file.
+    pub(super) fn read_points(&self, path: &Path) -> Result<MapPoints, FormatError> {
+        let map = (self.read)(path)?;
+        check_marks(path, map.points.iter().map(|point| point.z)).map(|()| map)
+    }
+
+    /// Parses the points in the bytes of a file.
+    pub(super) fn parse_points(&self, path: &Path, bytes: &[u8]) -> Result<MapPoints, FormatError> {
+        let map = (self.parse)(path, bytes)?;
+        check_marks(path, map.points.iter().map(|point| point.z)).map(|()| map)
+    }
+}
+
+/// Refuses heights of which several far from all others are exactly the same: -9999 and the like, which some programs write where
+/// nothing was measured. A surface that is as far off has more than one height.
+fn check_marks(path: &Path, heights_mm: impl Iterator<Item = f64> + Clone) -> Result<(), FormatError> {
+    const FAR: f64 = 10.0;
+    let (low, high) = heights_mm.clone().fold((f64::MAX, f64::MIN), |(low, high), z| (low.min(z), high.max(z)));
+    for mark in [low, high] {
+        let others = heights_mm.clone().filter(|z| *z != mark);
+        let (least, most) = others.fold((f64::MAX, f64::MIN), |(low, high), z| (low.min(z), high.max(z)));
+        let apart_mm = (least - mark).max(mark - most);
+        let count = heights_mm.clone().filter(|z| *z == mark).count();
+        if count > 1 && least < most && apart_mm > FAR * (most - least) {
+            return Err(FormatError::Unexpected {
+                path: path.to_owned(),
+                place: "heights".to_owned(),
+                expected: "a sample that was not measured to have the mark of the format".to_owned(),
+                found: format!("{count} samples of exactly {mark} mm, {apart_mm} mm from all others"),
+            });
+        }
+    }
+    Ok(())
+}
+
 /// The measured points of a map, and what the reader had to decide about it.
 pub(super) struct MapPoints {
     pub(super) points: Vec<Point>,
@@ -165,6 +201,21 @@ mod tests {
         assert_eq!((map.pv_mm(), map.heights_mm[4]), (5.0, 0.0));
         // 0 1 2 3 5: mean 2.2, squares about it 4.84 1.44 0.04 0.64 7.84.
         assert!((map.rms_mm() - (14.8f64 / 5.0).sqrt()).abs() < 1e-15);
+    }
+
+    #[test]
+    fn one_height_far_from_all_others_is_a_mark() {
+        let told = |heights: &[f64]| check_marks(Path::new("m"), heights.iter().copied()).map_err(|e| e.to_string());
+        let form = [0.0, 1e-3, 2e-3, 0.5e-3, 1e-3];
+        for mark in [-9.999, 9.999, -0.05] {
+            let refused = told(&[&form[..], &[mark, mark]].concat()).unwrap_err();
+            assert!(refused.contains("2 samples of exactly"), "{refused}");
+            assert_eq!(told(&[&form[..], &[mark]].concat()), Ok(()), "a lone one may be a spike");
+            assert_eq!(told(&[&form[..], &[mark, mark * 1.0001]].concat()), Ok(()), "a pit has a form");
+        }
+        for heights in [&form[..], &[1.0, 1.0, 1.0], &[0.0, 1e-3, 1e-2, 1e-2], &[0.0, 0.0, 5.0, 5.0], &[]] {
+            assert_eq!(told(heights), Ok(()), "{heights:?}");
+        }
     }
 
     #[test]

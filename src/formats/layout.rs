@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::path::Path;
 
-use super::columns::{Axes, Table, Unit, is_unit, split_unit, stated_unit};
+use super::columns::{Axes, StatedUnits, Table, Unit, is_unit, split_unit, text_of};
 use super::error::{FormatError, excerpt};
 use super::number::{Decimal, Evidence, evidence, looks_numeric, without_blanks};
 
@@ -165,13 +165,15 @@ pub(super) struct Preamble<'p> {
     /// The last comment that names x, y and z: many programs comment their header out.
     comment: Option<(u64, Vec<u8>)>,
     header: Option<(u64, Vec<u8>)>,
+    /// The line of units below the header.
+    units: Option<(u64, Vec<String>)>,
     /// A line of words and numbers that is a title, if a header follows it.
     title: Option<FormatError>,
 }
 
 impl<'p> Preamble<'p> {
     pub(super) fn new(path: &'p Path, of_nominal: bool, table: &'p Table) -> Self {
-        Self { path, of_nominal, table, comment: None, header: None, title: None }
+        Self { path, of_nominal, table, comment: None, header: None, units: None, title: None }
     }
 
     /// Returns the names of the columns in lower case, if a header gives each of them one.
@@ -198,6 +200,7 @@ impl<'p> Preamble<'p> {
         }
         let count = Fields::of(line, separator).count();
         let columns = self.columns(separator, (line, count), number)?;
+        self.check_unit_line(columns, count)?;
         Ok(Some(Layout { separator, columns, count, decimal: Decimal::Point, first_line: number }))
     }
 
@@ -206,7 +209,7 @@ impl<'p> Preamble<'p> {
         let likely = likely_separator(line);
         let fields: Vec<&[u8]> = Fields::of(line, likely).collect();
         let has_header = self.header.as_ref().is_some_and(|(_, header)| self.is_understood(header));
-        if has_header && self.take_units(&fields, number)? {
+        if has_header && self.take_units(&fields, number) {
             return Ok(());
         }
         if !has_header && !self.is_understood(line) {
@@ -261,33 +264,60 @@ impl<'p> Preamble<'p> {
     }
 
     /// Refuses a unit that a table states, unless it is the one that it is read in.
-    fn check_unit(&self, line: u64, found: String) -> Result<(), FormatError> {
-        let unit = self.table.unit.unwrap_or(Unit::Millimetre);
+    fn check_unit(&self, line: u64, found: String, unit: Unit) -> Result<(), FormatError> {
         if unit.is(&found) { Ok(()) } else { Err(FormatError::Unit { path: self.path.to_owned(), line, found, unit }) }
+    }
+
+    /// Refuses a text that speaks of other units.
+    fn check_stated(&self, line: u64, text: &[u8]) -> Result<(), FormatError> {
+        let [unit, _, height_unit] = self.table.units();
+        let StatedUnits { of_heights, of_all } = StatedUnits::of(&text_of(text));
+        of_heights.map_or(Ok(()), |found| self.check_unit(line, found, height_unit))?;
+        of_all.map_or(Ok(()), |found| self.check_unit(line, found, unit))
     }
 
     /// Refuses a title that speaks of another unit, unless a person gave the unit.
     fn check_title(&self, title: &[u8], number: u64) -> Result<(), FormatError> {
-        match stated_unit(&String::from_utf8_lossy(title)) {
-            Some(unit) if self.table.unit.is_none() => self.check_unit(number, unit),
-            _ => Ok(()),
-        }
+        let is_given = self.table.unit.is_some() || self.table.height_unit.is_some();
+        if is_given { Ok(()) } else { self.check_stated(number, title) }
     }
 
-    /// The same of the units that a header states of some columns.
+    /// Refuses other units that a header states of x, y and z.
     fn check_units(&self, line: u64, columns: [usize; 3], names: &[String]) -> Result<(), FormatError> {
-        let units = columns.iter().filter_map(|&column| split_unit(names.get(column)?).1);
-        units.into_iter().try_for_each(|unit| self.check_unit(line, unit))
+        let stated = |column: usize| split_unit(names.get(column)?).1;
+        let pairs = columns.into_iter().zip(self.table.units());
+        pairs
+            .filter_map(|(column, unit)| Some((stated(column)?, unit)))
+            .try_for_each(|(found, unit)| self.check_unit(line, found, unit))
+    }
+
+    /// Refuses other units in the line below the header; where that has no unit for each column, all are those of x and y.
+    fn check_unit_line(&self, columns: [usize; 3], count: usize) -> Result<(), FormatError> {
+        let Some((line, units)) = &self.units else { return Ok(()) };
+        let of_axes = self.table.units();
+        let unit_of = |column: usize| match columns.iter().position(|of| *of == column) {
+            Some(axis) if units.len() == count => Some(of_axes[axis]),
+            Some(_) => Some(of_axes[0]),
+            // Whatever stands beside the coordinates has units of its own.
+            None => (units.len() != count).then_some(of_axes[0]),
+        };
+        let stated = units.iter().enumerate().filter(|(_, found)| !found.is_empty());
+        stated
+            .filter_map(|(column, found)| Some((found, unit_of(column)?)))
+            .try_for_each(|(found, unit)| self.check_unit(*line, found.clone(), unit))
     }
 
     /// Takes a line of units below a header; false where it is none.
-    fn take_units(&self, fields: &[&[u8]], number: u64) -> Result<bool, FormatError> {
-        let unit = |field: &[u8]| String::from_utf8_lossy(field).trim_matches(['[', ']', '(', ')', ' ']).to_lowercase();
-        let units: Vec<String> = fields.iter().map(|field| unit(field)).filter(|unit| !unit.is_empty()).collect();
-        if units.is_empty() || !units.iter().all(|unit| is_unit(unit)) {
-            return Ok(false);
+    fn take_units(&mut self, fields: &[&[u8]], number: u64) -> bool {
+        let unit = |field: &&[u8]| text_of(field).trim_matches(['[', ']', '(', ')', ' ']).to_lowercase();
+        let units: Vec<String> = fields.iter().map(unit).collect();
+        let is_one = self.units.is_none()
+            && units.iter().any(|unit| !unit.is_empty())
+            && units.iter().all(|unit| unit.is_empty() || is_unit(unit));
+        if is_one {
+            self.units = Some((number, units));
         }
-        units.into_iter().try_for_each(|unit| self.check_unit(number, unit)).map(|()| true)
+        is_one
     }
 
     fn take_comment(&mut self, comment: &[u8], number: u64) -> Result<(), FormatError> {
@@ -295,9 +325,7 @@ impl<'p> Preamble<'p> {
         let text = text.strip_prefix(b"//").unwrap_or(text).trim_ascii_start();
         let start = text.iter().position(|&b| b != b'#').unwrap_or(text.len());
         let text = text[start..].trim_ascii();
-        if let Some(unit) = stated_unit(&String::from_utf8_lossy(text)) {
-            self.check_unit(number, unit)?;
-        }
+        self.check_stated(number, text)?;
         if self.is_understood(text) {
             self.comment = Some((number, text.to_vec()));
         }
@@ -389,7 +417,7 @@ fn likely_separator(line: &[u8]) -> Separator {
 fn names(header: &[u8], separator: Separator) -> Vec<String> {
     let mut names: Vec<String> = Vec::new();
     for field in Fields::of(header, separator) {
-        let name = String::from_utf8_lossy(field).to_lowercase();
+        let name = text_of(field).to_lowercase();
         match names.last_mut() {
             Some(last) if separator == Separator::Blank && name.starts_with(['[', '(']) => *last += &name,
             _ => names.push(name),

@@ -121,7 +121,8 @@ pub fn read_nominal_with_identity(
             0 => {
                 let columns = table.columns.as_ref().map(ToString::to_string);
                 let unit = table.unit.map(|unit| unit.to_string());
-                for said in [columns, unit].into_iter().flatten() {
+                let height_unit = table.height_unit.map(|unit| format!("height {unit}"));
+                for said in [columns, unit, height_unit].into_iter().flatten() {
                     hash.update(said);
                 }
                 return Ok((nominal, hash.finalize().into()));
@@ -199,7 +200,19 @@ pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result
         Kind::Ply => read_ply(path).map(|file| file.points.into()),
         Kind::Stl => wrong("an STL mesh", "export the points, or give the mesh as the nominal"),
         Kind::Toml => wrong("a TOML file", "give the definition as the nominal"),
-        Kind::Map(format) => (format.read)(path).map(|map| map.points.into()),
+        Kind::Map(format) => format.read_points(path).map(|map| map.points.into()),
+    }
+}
+
+/// Reads the places of a measuring plan, in millimetres, as [`read_measured`] reads points; the columns of a table may be called nominal, as a plan's are.
+///
+/// # Errors
+/// Those of [`read_measured_with_notes`].
+pub fn read_plan(path: impl AsRef<Path>, table: &Table) -> Result<Vec<Point>, FormatError> {
+    let path = path.as_ref();
+    match kind(path)? {
+        Kind::Text => read_nominal_points(path, table),
+        _ => read_measured_with_notes(path, table).map(|read| read.points),
     }
 }
 
@@ -212,7 +225,7 @@ fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatE
         path: path.to_owned(),
         expected: "a table of points, of which columns and a unit can be given",
         found: "a file that says both itself",
-        remedy: "leave --columns and --unit out",
+        remedy: "leave columns and units out",
     })
 }
 

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
-use super::columns::{Table, Unit};
+use super::columns::Table;
 use super::error::{FormatError, excerpt};
 use super::foreign::{check_is_ours, is_utf16};
 use super::layout::{Fields, Layout, Preamble, Separator, are_empty_rows, is_comment};
@@ -98,8 +98,7 @@ struct Cloud<'p> {
     path: &'p Path,
     /// The decimal mark, where it need not be told from the file.
     decimal: Option<Decimal>,
-    /// Millimetres in its unit.
-    unit_mm: f64,
+    table: &'p Table,
     /// Expected length of the file, for reserving memory only.
     length: u64,
     preamble: Preamble<'p>,
@@ -174,19 +173,7 @@ struct Share {
 impl<'p> Cloud<'p> {
     fn new(path: &'p Path, length: u64, table: &'p Table) -> Self {
         let (preamble, points, grouped) = (Preamble::new(path, false, table), Vec::new(), Grouped::default());
-        let unit_mm = table.unit.map_or(1.0, Unit::in_mm);
-        Self {
-            path,
-            unit_mm,
-            decimal: None,
-            length,
-            preamble,
-            layout: None,
-            lines: 0,
-            empty_from: None,
-            points,
-            grouped,
-        }
+        Self { path, table, decimal: None, length, preamble, layout: None, lines: 0, empty_from: None, points, grouped }
     }
 
     fn read(mut self, mut reader: impl Read + Send) -> Result<NotedPoints, FormatError> {
@@ -323,9 +310,7 @@ impl<'p> Cloud<'p> {
 
     fn finish(mut self) -> Result<Vec<Point>, FormatError> {
         if !self.points.is_empty() {
-            if self.unit_mm != 1.0 {
-                self.points.iter_mut().for_each(|point| point.coords *= self.unit_mm);
-            }
+            self.table.to_mm(&mut self.points);
             return Ok(self.points);
         }
         Err(self.preamble.without_points())

@@ -76,6 +76,8 @@ pub struct Content {
     pub decimal: DecimalMark,
     /// The unit of length of the files: mm, but for a machine that is known to write another one.
     pub unit: Unit,
+    /// The unit of z, where it is another one.
+    pub height_unit: Option<Unit>,
     /// Which columns of the files are x, y and z, where their headers do not say so.
     pub columns: Option<Columns>,
 }
@@ -237,7 +239,7 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     let statements = read_statements(path, text)?;
     let coordinates = agreed_coordinates(path, &statements, content)?;
     if let Some(format) = map_format(text) {
-        let MapPoints { points, notes } = (format.parse)(path, text)?;
+        let MapPoints { points, notes } = format.parse_points(path, text)?;
         return Ok(ResultFile { points, coordinates, notes, statements, ..ResultFile::default() });
     }
     // Both say their unit themselves.
@@ -254,10 +256,12 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
         DecimalMark::Point => Some(Decimal::Point),
         DecimalMark::Comma => Some(Decimal::Comma),
     };
-    let table = Table { columns: content.columns.clone(), unit: (unit != Unit::Millimetre).then_some(unit) };
+    let height_unit = content.height_unit;
+    let table =
+        Table { columns: content.columns.clone(), unit: (unit != Unit::Millimetre).then_some(unit), height_unit };
     let (points, columns) = if is_ply {
         let mut points = ply::parse_ply_in(path, text, unit)?.points;
-        points.iter_mut().for_each(|point| point.coords *= unit.in_mm());
+        table.to_mm(&mut points);
         (points, OtherColumns::default())
     } else {
         let points = parse_points_with(path, text, decimal, &table)?;
@@ -530,6 +534,8 @@ mod tests {
         let wanted = [Point::new(1.5e-3, 2.5e-3, 3.5e-3), Point::new(4.5e-3, 5.5e-3, 6.5e-3)];
         assert!(found.points.iter().zip(&wanted).all(|(a, b)| (a - b).norm() < 1e-15), "{:?}", found.points);
         assert_eq!(found.indices.unwrap(), [4, 9]);
+        let heights = Content { height_unit: Some(Unit::Nanometre), ..Content::default() };
+        assert_eq!(parse("x,y,z [nm]\n1,2,5e5\n", &heights).unwrap().points, [Point::new(1.0, 2.0, 0.5)]);
         let ply = "ply\nformat ascii 1.0\ncomment units: inch\nelement vertex 1\nproperty double x\nproperty double y\nproperty double z\nend_header\n1 2 4\n";
         let inch = Content { unit: Unit::Inch, ..Content::default() };
         assert_eq!(parse(ply, &inch).unwrap().points, [Point::new(25.4, 50.8, 101.6)]);

@@ -9,7 +9,7 @@ use super::tables::{
     Acceptance, Compensation, Grinding, Leaning, Measure, Mode, NominalTable, PatternWord, RecipeFile,
     RegistrationSettings, StartAt, Um, Wheel,
 };
-use super::{NominalSource, Pattern};
+use super::{NominalSource, Pattern, TableWords};
 use crate::cell::Beginning;
 use crate::compensation::path::Pattern as TrackPattern;
 use crate::document::Document;
@@ -56,6 +56,7 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
             ("projection", written.projection.is_some()),
             ("columns", written.columns.is_some()),
             ("unit", written.unit.is_some()),
+            ("height_unit", written.height_unit.is_some()),
         ];
         for (key, _) in of_points.into_iter().filter(|(_, there)| *there) {
             document.report(&format!("nominal.{key}"), "is for points of a file", "", "leave it out");
@@ -71,8 +72,11 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
     let aperture = written.aperture.clone().and_then(|table| aperture(table, document));
     Some(NominalSource::File {
         path: beside(folder, file),
-        columns: written.columns.clone(),
-        unit: written.unit.clone(),
+        table: TableWords {
+            columns: written.columns.clone(),
+            unit: written.unit.clone(),
+            height_unit: written.height_unit.clone(),
+        },
         projection: written.projection.unwrap_or_default(),
         aperture,
     })
@@ -217,11 +221,14 @@ fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<
         ("rows", written.rows.is_some()),
         ("points", written.points.is_some()),
         ("file", written.file.is_some()),
+        ("file_columns", written.file_columns.is_some()),
+        ("file_unit", written.file_unit.is_some()),
+        ("file_height_unit", written.file_height_unit.is_some()),
     ];
     let (name, takes, needs) = match written.pattern {
         PatternWord::Grid => ("grid", &["spacing_mm", "columns", "rows"][..], "`spacing_mm`, or `columns` and `rows`"),
         PatternWord::Spiral => ("spiral", &["spacing_mm", "points"][..], "`spacing_mm` or `points`"),
-        PatternWord::File => ("file", &["file"][..], "`file`"),
+        PatternWord::File => ("file", &["file", "file_columns", "file_unit", "file_height_unit"][..], "`file`"),
         PatternWord::Free => ("free", &["points"][..], "`points`, the least number of them"),
     };
     let allowed = format!("the pattern \"{name}\" takes {needs}");
@@ -240,7 +247,14 @@ fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<
         }
         (PatternWord::Spiral, Some(spacing), _, None) => Some(Pattern::Laid(Layout::SpiralSpacing(spacing))),
         (PatternWord::Spiral, None, _, Some(points)) => Some(Pattern::Laid(Layout::SpiralPoints(points))),
-        (PatternWord::File, ..) => written.file.as_ref().map(|file| Pattern::File(beside(folder, file))),
+        (PatternWord::File, ..) => written.file.as_ref().map(|file| Pattern::File {
+            path: beside(folder, file),
+            table: TableWords {
+                columns: written.file_columns.clone(),
+                unit: written.file_unit.clone(),
+                height_unit: written.file_height_unit.clone(),
+            },
+        }),
         (PatternWord::Free, _, _, Some(least_points)) => Some(Pattern::Free { least_points }),
         _ => None,
     };

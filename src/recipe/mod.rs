@@ -60,6 +60,17 @@ pub struct Recipe {
     source_sha256: [u8; 32],
 }
 
+/// How a table of points is read where it does not say so itself, in the words of the recipe.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct TableWords {
+    /// Which columns are x, y and z.
+    pub columns: Option<String>,
+    /// The unit; without it mm.
+    pub unit: Option<String>,
+    /// The unit of z, where it is another one.
+    pub height_unit: Option<String>,
+}
+
 /// Where the nominal surface comes from.
 #[derive(Clone, Debug, PartialEq)]
 pub enum NominalSource {
@@ -67,10 +78,8 @@ pub enum NominalSource {
     File {
         /// The file; relative paths of a recipe are relative to the recipe.
         path: PathBuf,
-        /// Which columns of a table of points are x, y and z, where its header leaves it open.
-        columns: Option<String>,
-        /// The unit of a table of points; without it mm.
-        unit: Option<String>,
+        /// How a table of points is read.
+        table: TableWords,
         /// What scattered points are projected onto.
         projection: Projection,
         /// The outline of the part, if it is smaller than the points.
@@ -86,7 +95,12 @@ pub enum Pattern {
     /// Where Regrind lays them.
     Laid(Layout),
     /// At the points of a file, in the model frame.
-    File(PathBuf),
+    File {
+        /// The file; relative paths of a recipe are relative to the recipe.
+        path: PathBuf,
+        /// How a table of points is read.
+        table: TableWords,
+    },
     /// Where the operator takes them; the machine gets no plan.
     Free {
         /// How many there must be at least.
@@ -118,7 +132,7 @@ impl Recipe {
             NominalSource::Surface(_) => None,
         };
         let pattern = match &self.pattern {
-            Pattern::File(path) => Some(path.as_path()),
+            Pattern::File { path, .. } => Some(path.as_path()),
             Pattern::Laid(_) | Pattern::Free { .. } => None,
         };
         nominal.into_iter().chain(pattern).collect()

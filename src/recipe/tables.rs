@@ -96,6 +96,9 @@ pub(super) struct NominalTable {
     /// Unit of length of a table of points: mm, um, nm, cm, m or inch; without it mm.
     #[schemars(length(min = 1, max = 12), example = &"inch")]
     pub unit: Option<String>,
+    /// Unit of length of z in a table of points, where it is another one than that of x and y.
+    #[schemars(length(min = 1, max = 12), example = &"um")]
+    pub height_unit: Option<String>,
     /// What scattered points of a file are projected onto.
     pub projection: Option<Projection>,
     /// A formula z(x, y).
@@ -173,6 +176,15 @@ pub struct Measure {
     /// File of points in the model frame, in mm.
     #[schemars(length(min = 1, max = 400))]
     pub(super) file: Option<String>,
+    /// Which columns of that file are x, y and z, where its header leaves it open: `x=NAME,y=NAME,z=NAME`, names or numbers from 1.
+    #[schemars(length(min = 5, max = 200), example = &"x=X_nom,y=Y_nom,z=Z_nom")]
+    pub(super) file_columns: Option<String>,
+    /// Unit of length of that file, a table: mm, um, nm, cm, m or inch; without it mm.
+    #[schemars(length(min = 1, max = 12), example = &"inch")]
+    pub(super) file_unit: Option<String>,
+    /// Unit of length of z in that file, where it is another one than that of x and y.
+    #[schemars(length(min = 1, max = 12), example = &"um")]
+    pub(super) file_height_unit: Option<String>,
     /// Distance kept from the edge of the part.
     #[schemars(range(min = 0.0, max = 10000.0))]
     pub edge_margin_mm: f64,
@@ -529,6 +541,9 @@ impl Default for Measure {
             rows: None,
             points: None,
             file: None,
+            file_columns: None,
+            file_unit: None,
+            file_height_unit: None,
             edge_margin_mm: 0.5,
             approach_mm: 2.0,
             search_mm: 2.0,

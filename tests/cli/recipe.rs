@@ -15,6 +15,7 @@ use regrind::geometry::{Point, Pose};
 use regrind::measuring::Layout;
 use regrind::recipe::{NominalSource, Pattern, Recipe, StartAt, Um, Wheel};
 use regrind::registration::{Coordinate, ProbeSide, Start};
+use regrind::setup::SetupError;
 use regrind::surface::DefinedSurface;
 use serde_json::Value;
 
@@ -173,6 +174,38 @@ fn the_points_of_the_biconic_are_its_formula() {
     let shape = &recipe.simulation.as_ref().unwrap()["part"]["shape"];
     assert_eq!(shape["radius_mm"].as_array().unwrap(), &[140.0.into(), 90.0.into()]);
     assert_eq!(shape["conic"].as_array().unwrap(), &[(-0.5).into(), 0.3.into()]);
+}
+
+/// The places of a measuring plan as another program wrote them: in inches, heights in micrometres, beside what was measured before.
+#[test]
+fn places_to_measure_are_read_by_the_columns_and_units_that_the_recipe_gives() {
+    let home = tempfile::tempdir().unwrap();
+    let path = home.path().join("part.toml");
+    let surface = "columns = 60                # 1,800 points\nrows = 30\n";
+    let text = fs::read_to_string(root().join("recipes/freeform-mirror.toml")).unwrap();
+    assert!(text.contains(surface));
+    let given = |keys: &str| {
+        let of_file = format!("file = \"plan.csv\"\n{keys}");
+        fs::write(&path, text.replace(surface, &of_file).replace("pattern = \"grid\"", "pattern = \"file\"")).unwrap();
+        let recipe = Recipe::read(&path).unwrap_or_else(|problems| panic!("{problems}"));
+        regrind::setup::prepare(&recipe, &cell(SIM).unwrap()).map(|(task, _)| task.targets.len())
+    };
+    let row = |k: i32| {
+        let (x, y) = (f64::from(k % 10) * 0.25 - 1.125, f64::from(k / 10) * 0.25 - 0.5);
+        format!("{k},{x},{y},{},9,9,9\n", 100 * k)
+    };
+    let rows: String = (0..50).map(row).collect();
+    fs::write(home.path().join("plan.csv"), format!("Nr,X_nom [in],Y_nom [in],Z_nom [um],X_act,Y_act,Z_act\n{rows}"))
+        .unwrap();
+    let columns = "file_columns = \"x=X_nom,y=Y_nom,z=Z_nom\"\n";
+    assert_eq!(given(&format!("{columns}file_unit = \"inch\"\nfile_height_unit = \"um\"\n")).unwrap(), 50);
+    for missing in ["", columns, &format!("{columns}file_unit = \"inch\"\n")] {
+        assert!(matches!(given(missing), Err(SetupError::File(_))), "{missing}");
+    }
+    assert!(matches!(given("file_columns = \"x,y,z\"\n"), Err(SetupError::Table { key: "measure.file_columns", .. })));
+    // A plan has nominal places, and says so.
+    fs::write(home.path().join("plan.csv"), "X_nom,Y_nom,Z_nom\n1,2,0\n3,4,0\n-8,2,0\n").unwrap();
+    assert_eq!(given("").unwrap(), 3);
 }
 
 #[test]

@@ -5,7 +5,13 @@ use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use crate::program::{Running, regrind, root, run};
+use regrind::recipe::Recipe;
+use regrind_sim::spec::WorldSpec;
+use regrind_sim::world::World;
+use serde::Deserialize as _;
+
+use crate::first_touches::{file_cell, hand_in, measured, open_plan};
+use crate::program::{Running, regrind, replaced, root, run, small_recipe};
 
 /// A folder with all that ships, prepared as the page says; returns the arguments of the run that it begins.
 fn shop() -> (tempfile::TempDir, Vec<String>) {
@@ -70,4 +76,50 @@ fn enter_at_the_terminal_that_asks_confirms_the_part() {
     until_handed_over(&mut running, home.path());
     assert_eq!(run(&["stop"], home.path()).0, 0);
     assert_eq!(running.end().0, 1);
+}
+
+/// Each wrong result is left alone, and the plan stays open for the right one.
+#[test]
+fn a_wrong_or_short_result_uses_up_no_cycle() {
+    let home = tempfile::tempdir().unwrap();
+    let home = home.path();
+    let recipe = small_recipe(home, 3000.0);
+    let text = replaced(&fs::read_to_string(&recipe).unwrap(), "[cycle]\n", "[cycle]\nbegin_with = \"measure\"\n");
+    fs::write(&recipe, replaced(&text, "qualify = true", "qualify = false")).unwrap();
+    file_cell(home);
+    let table = Recipe::read(&recipe).unwrap().simulation.unwrap();
+    let world = World::new(WorldSpec::deserialize(toml::Value::Table(table)).unwrap()).unwrap();
+    let mut running = Running::new(regrind(&["run", "small.toml", "--cell", "cell.toml", "--loaded", "--json"], home));
+
+    // The plan's own places instead of what was found, a file that broke off, the rows in another order.
+    let given_back = |plan: &Path, _: &str| {
+        let rows = fs::read_to_string(plan.join("plan.csv")).unwrap();
+        let rows = rows.lines().filter(|row| !row.starts_with('#')).skip(1);
+        rows.map(|row| row.split(',').take(4).collect::<Vec<_>>().join(",") + "\n").collect()
+    };
+    let broken_off = |_: &Path, rows: &str| rows[..rows.len() / 2].rsplit_once('\n').unwrap().0.to_owned() + "\n";
+    let turned = |_: &Path, rows: &str| {
+        let mut places: Vec<&str> = rows.lines().map(|row| row.split_once(',').unwrap().1).collect();
+        places.reverse();
+        places.iter().zip(0..).map(|(place, index)| format!("{index},{place}\n")).collect()
+    };
+    type Wrong<'a> = &'a dyn Fn(&Path, &str) -> String;
+    let wrong: [(&str, Wrong<'_>); 3] = [("given back", &given_back), ("broken off", &broken_off), ("turned", &turned)];
+    let plan = open_plan(&mut running, home);
+    let right = measured(&plan, &world);
+    let (head, rows) = right.split_once("index,x,y,z\n").unwrap();
+    for (what, make) in wrong {
+        hand_in(home, &format!("{head}index,x,y,z\n{}", make(&plan, rows)));
+        running.line(what, |line| line.contains("not taken: ") && line.contains("result.csv"));
+        assert_eq!(open_plan(&mut running, home), plan, "{what}");
+    }
+    hand_in(home, &right);
+    // It is judged, and the next pass is handed over.
+    let outbox = home.join("exchange/grinder/out");
+    running.until("a pass in the outbox of the grinder", |_| {
+        let mut names = fs::read_dir(&outbox).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        names.any(|name| name.ends_with("_c2")).then_some(())
+    });
+    assert_eq!(run(&["stop"], home).0, 0);
+    running.end();
 }

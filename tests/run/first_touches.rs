@@ -92,7 +92,7 @@ fn by_files() {
 }
 
 /// A cell by files beside the recipe, its machines where those of the simulation stand.
-fn file_cell(home: &Path) {
+pub(crate) fn file_cell(home: &Path) {
     for folder in ["cmm/in", "cmm/out", "grinder/in", "grinder/out"] {
         fs::create_dir_all(home.join("exchange").join(folder)).unwrap();
     }
@@ -115,12 +115,23 @@ fn file_cell(home: &Path) {
 
 /// Does what the person at the measuring machine does: takes the plan, touches, and hands in what was found.
 fn measure_once(running: &mut Running, home: &Path, world: &World) {
+    let handed_over = open_plan(running, home);
+    let result = measured(&handed_over, world);
+    hand_in(home, &result);
+}
+
+/// Waits for a plan in the outbox and returns its folder.
+pub(crate) fn open_plan(running: &mut Running, home: &Path) -> PathBuf {
     let outbox = home.join("exchange/cmm/out");
-    let handed_over = running.until("a plan in the outbox", |_| {
+    running.until("a plan in the outbox", |_| {
         let names = fs::read_dir(&outbox).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
-        // It gets its name when it is whole.
-        names.filter(|name| !name.starts_with('.')).map(|name| outbox.join(name)).next()
-    });
+        // It gets its name when it is whole, and another end of it when it is over.
+        names.filter(|name| !name.contains('.')).map(|name| outbox.join(name)).next()
+    })
+}
+
+/// Touches what a plan asks for and returns the result file: a row a point, index and centre.
+pub(crate) fn measured(handed_over: &Path, world: &World) -> String {
     let told: Value = serde_json::from_slice(&fs::read(handed_over.join("plan.json")).unwrap()).unwrap();
     let rows = fs::read_to_string(handed_over.join("plan.csv")).unwrap();
     let number = |key: &str| told[key].as_f64().unwrap_or_else(|| panic!("{key} in {told}"));
@@ -138,10 +149,12 @@ fn measure_once(running: &mut Running, home: &Path, world: &World) {
         format!("{},{x},{y},{z}\n", found.index)
     };
     let found = touch(world, 1, &plan).into_iter().filter(|found| found.status == Status::Touched);
-    let text =
-        format!("# plan: {}\nindex,x,y,z\n{}", told["plan"].as_str().unwrap(), found.map(row).collect::<String>());
-    // Named when it is whole.
-    fs::write(home.join("result.csv"), text).unwrap();
+    format!("# plan: {}\nindex,x,y,z\n{}", told["plan"].as_str().unwrap(), found.map(row).collect::<String>())
+}
+
+/// Puts a result into the inbox, named when it is whole.
+pub(crate) fn hand_in(home: &Path, result: &str) {
+    fs::write(home.join("result.csv"), result).unwrap();
     fs::rename(home.join("result.csv"), home.join("exchange/cmm/in/result.csv")).unwrap();
 }
 

@@ -6,20 +6,22 @@
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
+use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use super::dmis;
-use super::measured::{Wanted, foreign, measurement};
-use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, unhex};
+use super::measured::{Wanted, check_measurement, foreign, measurement};
+use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, read_json, unhex};
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Watch, WatchedFile};
 use super::{Exchange, ExchangeError, HandOver, Look, MeasureOrder, Pattern, Permit, Standing};
-use crate::{Job, MeasuredPoint, Measurement, Plan, hex};
+use crate::{Job, MeasuredPoint, Measurement, Plan, Target, TargetKind, hex};
 use regrind_formats::FormatError;
 use regrind_formats::references::{References, parse_references, read_references};
-use regrind_formats::result::{Content, Coordinates, ResultFile, parse_result, read_bytes, read_statements};
+use regrind_formats::result::{Content, Coordinates, ResultFile, read_bytes, read_statements};
 
 /// How a measuring machine exchanges files.
 #[derive(Clone, Debug)]
@@ -44,6 +46,8 @@ pub struct CmmExchange {
     pub take_earlier: bool,
     /// With a free count: fewer points than this are waited on.
     pub least_points: usize,
+    /// The share of the targets of which a result must have a point.
+    pub least_found: f64,
     /// By how much the probe radius in a file may differ from the plan's.
     pub probe_tolerance_mm: f64,
     /// The sensor of a DMIS program, where the plan is written as one too.
@@ -63,6 +67,7 @@ impl CmmExchange {
             stations: None,
             free_count: false,
             least_points: 1,
+            least_found: 0.0,
             take_earlier: false,
             probe_tolerance_mm: 1e-3,
             dmis_sensor: None,
@@ -110,8 +115,10 @@ pub struct CmmFolders {
 #[derive(Clone, Debug)]
 struct Expected {
     stored: StoredHandover,
-    /// The numbers of the targets, in the order of the plan.
-    targets: Vec<u32>,
+    /// The plan that was handed over; none where any number of points will do.
+    plan: Option<Arc<Plan>>,
+    /// The numbers of its targets, in its order.
+    targets: Arc<[u32]>,
     since: Option<Duration>,
 }
 
@@ -142,23 +149,23 @@ impl CmmFolders {
             return Ok(expected.clone());
         }
         let stored = self.outbox.handed_over(job)?;
-        // Where any number of points will do the plan may name none.
-        let targets = if self.settings.free_count {
-            Vec::new()
-        } else {
-            let path = stored.path.join("plan.csv");
-            parse_result(&path, &read_bytes(&path)?, &Content::default())?.indices.unwrap_or_default()
-        };
-        let expected = Expected { stored, targets, since: None };
+        let plan = (!self.settings.free_count).then(|| stored_plan(&stored.path).map(Arc::new)).transpose()?;
+        let targets = plan.iter().flat_map(|plan| &plan.targets).map(|target| target.index).collect();
+        let expected = Expected { stored, plan, targets, since: None };
         self.expected = Some(expected.clone());
         Ok(expected)
     }
 
     fn judge(&self, expected: &Expected, found: &[WatchedFile], notes: &mut Vec<String>) -> Judgement {
-        match &self.settings.stations {
+        let accepted = match &self.settings.stations {
             None => self.judge_single(expected, found, notes),
             Some(stations) => self.judge_stations(expected, stations, found, notes),
+        }?;
+        if let Some((accepted, plan)) = accepted.as_ref().zip(expected.plan.as_ref()) {
+            let path = accepted.files.first().map_or_else(PathBuf::new, |(name, _)| self.settings.inbox.join(name));
+            check_measurement(&path, plan, &accepted.measurement, self.settings.least_found)?;
         }
+        Ok(accepted)
     }
 
     /// Returns whether a file may be looked at, and says why not.
@@ -246,7 +253,7 @@ impl CmmFolders {
     /// What a result of a hand-over must fit.
     fn wanted<'a>(&'a self, expected: &'a Expected) -> Wanted<'a> {
         Wanted {
-            targets: (!self.settings.free_count).then_some(&expected.targets),
+            targets: (!self.settings.free_count).then_some(&*expected.targets),
             content: &self.settings.content,
             probe_radius_mm: expected.stored.ticket.tool_radius_mm,
             probe_tolerance_mm: self.settings.probe_tolerance_mm,
@@ -485,6 +492,47 @@ impl Exchange for CmmFolders {
 fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
     let off = result.switched_off;
     (off > 0).then(|| format!("{name}: {off} rows are switched off and were left out"))
+}
+
+/// Reads the plan of a hand-over as it was written.
+fn stored_plan(folder: &Path) -> Result<Plan, ExchangeError> {
+    #[derive(Deserialize)]
+    struct Stored {
+        probe_radius_mm: f64,
+        approach_mm: f64,
+        search_mm: f64,
+        speed_mm_s: f64,
+        safe_height_mm: f64,
+    }
+    let Stored { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm } =
+        read_json(&folder.join("plan.json"))?;
+    let path = folder.join("plan.csv");
+    let bytes = read_bytes(&path)?;
+    let text = String::from_utf8_lossy(&bytes);
+    let rows = text.lines().zip(1..).filter(|(row, _)| !row.starts_with('#')).skip(1);
+    let target = |(row, line): (&str, u64)| {
+        stored_target(row).ok_or_else(|| FormatError::Unexpected {
+            path: path.clone(),
+            place: format!("line {line}"),
+            expected: "a target as it was handed over".to_owned(),
+            found: row.chars().take(40).collect(),
+        })
+    };
+    let targets = rows.map(target).collect::<Result<_, _>>()?;
+    Ok(Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful: None })
+}
+
+/// A row of `plan.csv`; none where it is another row.
+fn stored_target(row: &str) -> Option<Target> {
+    let cells: Vec<&str> = row.split(',').collect();
+    let [index, x, y, z, nx, ny, nz, what] = cells[..] else { return None };
+    let what =
+        [TargetKind::Part, TargetKind::ReferenceSphere].into_iter().find(|kind| what.parse() == Ok(*kind as u16))?;
+    let three = |words: [&str; 3]| -> Option<[f64; 3]> {
+        let [x, y, z] = words.map(|word| word.parse().ok());
+        Some([x?, y?, z?])
+    };
+    Some(Target { index: index.parse().ok()?, what, point_mm: three([x, y, z])?, normal: three([nx, ny, nz])? })
 }
 
 /// The plan as a table, with what it is about above it.

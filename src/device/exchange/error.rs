@@ -29,6 +29,11 @@ pub enum ExchangeError {
          numbers of the plan's targets"
     )]
     Count { path: PathBuf, found: usize, expected: usize },
+    /// Points of too few of the plan's targets.
+    #[error(
+        "{path}: points of {found} of {expected} targets, and {least} are needed; export the whole measurement, or touch what is missing first"
+    )]
+    Short { path: PathBuf, found: usize, expected: usize, least: usize },
     /// The radius of the probe is not the plan's.
     #[error(
         "{path}: measured with a probe radius of {found_mm} mm, the recipe says {expected_mm} mm; they may differ by {limit_mm} mm: \

@@ -38,7 +38,7 @@ pub use error::ExchangeError;
 pub use grinder::{GrinderExchange, GrinderFolders};
 pub use hand_over::{Confirmed, Exchange, HandOver, Look, Permit, Standing};
 pub use machine::ExchangeMachine;
-pub use measured::{Wanted, foreign, measurement};
+pub use measured::{Wanted, check_measurement, foreign, measurement};
 pub use pattern::{Pattern, file_word};
 pub use settings::{ExchangeWire, StationTable};
 pub use stations::{PlacedStation, place_station};

@@ -40,6 +40,8 @@ pub struct ExchangeWire {
     pub decimal: DecimalMark,
     /// Unit of length of results.
     pub unit: Unit,
+    /// Unit of length of z in a table, where it is another one than that of x and y.
+    pub height_unit: Option<Unit>,
     /// Which columns of results are x, y and z, where their headers leave it open: `x=NAME,y=NAME,z=NAME`, names or numbers from 1.
     #[schemars(length(min = 5, max = 200), example = &"x=X_act,y=Y_act,z=Z_act")]
     pub columns: Option<Columns>,
@@ -79,6 +81,7 @@ impl Default for ExchangeWire {
             what: None,
             decimal: DecimalMark::Auto,
             unit: Unit::Millimetre,
+            height_unit: None,
             columns: None,
             stations: Vec::new(),
             reference_points: None,
@@ -139,12 +142,14 @@ impl Wired for ExchangeWire {
                 coordinates: self.what,
                 decimal: self.decimal,
                 unit: self.unit,
+                height_unit: self.height_unit,
                 columns: self.columns.clone(),
             },
             result: Pattern::new(&*self.result),
             stations: self.stations(making)?,
             free_count: making.free_points.is_some(),
             least_points: making.free_points.unwrap_or(1),
+            least_found: making.least_found,
             take_earlier: self.take_earlier,
             probe_tolerance_mm: self.probe_tolerance_mm,
             dmis_sensor: self.dmis_sensor.clone(),

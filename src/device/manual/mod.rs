@@ -18,7 +18,7 @@ use std::sync::Arc;
 use sha2::{Digest, Sha256};
 use tokio::time::Instant;
 
-use super::exchange::{ExchangeError, Wanted, file_word, foreign, measurement, plan_csv};
+use super::exchange::{ExchangeError, Wanted, check_measurement, file_word, foreign, measurement, plan_csv};
 use super::{
     Answer, Answered, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Identity, Interrupt, Job,
     Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status, Word,
@@ -40,6 +40,8 @@ pub struct ManualSettings {
     pub content: Content,
     /// Where any number of points will do: the least number of them.
     pub free_points: Option<usize>,
+    /// The share of the targets of which a measurement must have a point.
+    pub least_found: f64,
     /// By how much the probe radius in a file may differ from the plan's.
     pub probe_tolerance_mm: f64,
 }
@@ -318,8 +320,7 @@ fn measured(
     }
     let measurement = measurement(points, &[file], job, identity, done);
     if settings.free_points.is_none() {
-        let why = |beside: crate::BesidePlan| ExchangeError::Foreign { path: path.to_owned(), why: beside.to_string() };
-        plan.check(&measurement).map_err(why)?;
+        check_measurement(path, plan, &measurement, settings.least_found)?;
     }
     Ok(measurement)
 }
@@ -506,6 +507,7 @@ mod tests {
             folder: PathBuf::new(),
             content: Content::default(),
             free_points: None,
+            least_found: 0.0,
             probe_tolerance_mm: 0.1,
         };
         let mut machine = ManualMachine::new(MachineKind::Grinder, settings);

@@ -19,6 +19,8 @@ pub struct ManualWire {
     pub decimal: DecimalMark,
     /// Unit of length of measurements.
     pub unit: Unit,
+    /// Unit of length of z in a table, where it is another one than that of x and y.
+    pub height_unit: Option<Unit>,
     /// Which columns of measurements are x, y and z, where their headers leave it open: `x=NAME,y=NAME,z=NAME`, names or numbers from 1.
     #[schemars(length(min = 5, max = 200), example = &"x=X_act,y=Y_act,z=Z_act")]
     pub columns: Option<Columns>,
@@ -33,6 +35,7 @@ impl Default for ManualWire {
             what: None,
             decimal: DecimalMark::Auto,
             unit: Unit::Millimetre,
+            height_unit: None,
             columns: None,
             probe_tolerance_mm: 0.001,
         }
@@ -67,9 +70,11 @@ impl ManualWire {
                 coordinates: self.what,
                 decimal: self.decimal,
                 unit: self.unit,
+                height_unit: self.height_unit,
                 columns: self.columns.clone(),
             },
             free_points: making.free_points,
+            least_found: making.least_found,
             probe_tolerance_mm: self.probe_tolerance_mm,
         }
     }

@@ -156,7 +156,8 @@ fn a_fault_is_named_with_place_finding_and_remedy() {
         ("a title 1\nfoo bar baz\n1 2 3\n", "line 1, column 1: expected a number in millimetres, found `a`"),
         ("1D0,2D0,3D0\n1,2,3\n", "line 1: the header names none of x, y and z"),
         ("left;right;up\n1;2;3\n", "line 1: the header names none of x, y and z"),
-        ("x,y,height in um\n1,2,3\n", "line 1: the header names 0 columns z"),
+        ("x,y,height in um\n1,2,3\n", "line 1: expected coordinates in mm, found the unit `um`"),
+        ("x,y,height\n1,2,3\n", "line 1: the header names 0 columns z"),
         ("X_nom,Y_nom,Z_nom\n1,2,3\n", "line 1: the header names nominal columns alone"),
         ("X_nom,Y_nom,Z_nom,X_act,Y_act,Z_act\n1,2,3,1,2,3\n", "line 1: the header names measured and nominal columns"),
         ("x,y,z,x_act,y_act,z_act\n1,2,3,1,2,3\n", "line 1: the header names plain and measured columns"),
@@ -683,7 +684,7 @@ fn a_person_says_which_columns_are_read_and_in_which_unit() {
     let path = folder.path().join("table.csv");
     let read = |content: &str, columns: Option<&str>, unit: Option<Unit>| {
         std::fs::write(&path, content).unwrap();
-        let table = Table { columns: columns.map(|columns| columns.parse().unwrap()), unit };
+        let table = Table { columns: columns.map(|columns| columns.parse().unwrap()), unit, ..Table::default() };
         read_measured_with_notes(&path, &table).map(|read| read.points)
     };
     let both = "Nr,X_nom,Y_nom,Z_nom,X_act,Y_act,Z_act\n1,9,9,9,1.5,-2.25,3\n2,9,9,9,4,5.5,-1200.125\n";
@@ -721,4 +722,49 @@ fn a_person_says_which_columns_are_read_and_in_which_unit() {
     // A file that says both itself.
     let ply = "ply\nformat ascii 1.0\nelement vertex 1\nproperty double x\nproperty double y\nproperty double z\nend_header\n1 2 3\n";
     assert!(matches!(read(ply, None, Some(Unit::Inch)), Err(FormatError::WrongKind { .. })));
+}
+
+#[test]
+fn heights_have_a_unit_of_their_own_where_a_person_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("table.csv");
+    let read = |content: &[u8], unit: Option<Unit>, height_unit: Option<Unit>| {
+        std::fs::write(&path, content).unwrap();
+        read_measured_with_notes(&path, &Table { columns: None, unit, height_unit }).map(|read| read.points)
+    };
+    let one = [Point::new(1.0, -2.0, 0.5)];
+    let forms: &[&[u8]] = &[
+        b"x [mm],y [mm],z [um]\n1,-2,500\n",
+        // The sign of micro in Latin-1, and its two in UTF-8.
+        b"X (mm);Y (mm);Z (\xb5m)\n1;-2;500\n",
+        "X (mm);Y (mm);Z (\u{b5}m)\n1;-2;500\n".as_bytes(),
+        "z [\u{3bc}m]\tx\ty\n500\t1\t-2\n".as_bytes(),
+        b"x,y,z\nmm,mm,um\n1,-2,500\n",
+        b"# height in um\nx,y,z\n1,-2,500\n",
+        b"heights: microns\nx,y,z\n1,-2,500\n",
+        b"x,y,z\n1,-2,500\n",
+    ];
+    for (k, form) in forms.iter().enumerate() {
+        let text = String::from_utf8_lossy(form);
+        assert_eq!(read(form, None, Some(Unit::Micrometre)).expect(&text), one, "{text}");
+        // One that nothing but a person can tell is in mm.
+        let is_silent = k + 1 == forms.len();
+        let refused = matches!(read(form, None, None), Err(FormatError::Unit { .. }));
+        assert_eq!(refused, !is_silent, "{text} {:?}", read(form, None, None));
+    }
+    let centimetres = read(b"x [cm],y [cm],z [um]\n0.1,-0.2,500\n", Some(Unit::Centimetre), Some(Unit::Micrometre));
+    assert_eq!(centimetres.unwrap(), one);
+    for (form, height_unit) in [
+        (&b"x [um],y [mm],z [um]\n1,-2,500\n"[..], Unit::Micrometre),
+        (b"x,y,z\num,um,um\n1,-2,500\n", Unit::Micrometre),
+        (b"x_mm,y_mm,z_mm\n1,-2,0.5\n", Unit::Micrometre),
+        (b"# height in nm\nx,y,z\n1,-2,0.5\n", Unit::Micrometre),
+        (b"# units: um\nx,y,z\n1,-2,0.5\n", Unit::Micrometre),
+    ] {
+        let found = read(form, None, Some(height_unit));
+        assert!(matches!(found, Err(FormatError::Unit { .. })), "{} {found:?}", String::from_utf8_lossy(form));
+    }
+    for waves in ["x,y,z (waves)\n1,-2,0.5\n", "x,y,z [waves]\n1,-2,0.5\n", "# height in waves\nx,y,z\n1,-2,0.5\n"] {
+        assert!(read(waves.as_bytes(), None, None).is_err(), "{waves}");
+    }
 }
