@@ -71,6 +71,7 @@ class Chain:
     def __init__(self, folder=None, trusted=()):
         self.folder, self.trusted = folder, trusted
         self.records, self.head, self.ended, self.run, self.key = 0, "0" * 64, None, "", None
+        self.no_author = None
         self.keys, self.seals, self.signed, self.files, self.last_intent, self.intents = [], 0, 0, 0, -1, set()
 
     def take(self, r):
@@ -108,12 +109,14 @@ class Chain:
     def take_begin(self, payload, hold):
         self.run = payload.get("run") if isinstance(payload.get("run"), str) else ""
         self.take_reopen(payload, hold)
-        hold(self.key or not self.trusted, "the run is not signed, and a key is given")
 
     def take_reopen(self, payload, hold):
         self.key = payload.get("key")
         hold(self.key is None or is_hex(self.key, 64), "it names a key that is none")
-        hold(self.key is None or not self.trusted or self.key in self.trusted, f"its key {self.key} is none of those given")
+        if self.trusted and self.key not in self.trusted and not self.no_author:
+            at = self.records + 1
+            unsigned = "the run is not signed" if at == 1 else f"it was gone on with at record {at} without a key"
+            self.no_author = f"record {at} names the key {self.key}, which is none of those given" if self.key else unsigned
         if self.key and self.key not in self.keys:
             self.keys.append(self.key)
 
@@ -264,6 +267,8 @@ def verify(path, kept, trusted):
         anchored = walk(path, chain, [read_anchor(p) for p in beside + kept], under_way)
     except Broken as broken:
         return {"run": str(path), "sound": False, "record": broken.record, "what": broken.what}
+    if chain.no_author:
+        return {"run": str(path), "sound": False, "record": None, "what": chain.no_author}
     closed = chain.ended is not None
     lacks = None
     if chain.keys and closed and not under_way and chain.signed != chain.ended:
@@ -280,6 +285,8 @@ def verify(path, kept, trusted):
 
 
 def in_words(found):
+    if not found["sound"] and found["record"] is None:
+        return f"{found['run']}: WHOLE, and who wrote it is not proven: {found['what']}"
     if not found["sound"]:
         return f"{found['run']}: BROKEN at record {found['record']}: {found['what']}"
     signed = f"signed up to record {found['signed']} by {', '.join(found['keys'])}" if found["keys"] else "not signed"

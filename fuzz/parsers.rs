@@ -126,12 +126,12 @@ pub fn metropro(bytes: &[u8]) -> bool {
 pub fn result(bytes: &[u8]) -> bool {
     let _ = check_ended(path(), bytes);
     let mut is_read = false;
-    for (coordinates, decimal, unit) in [
-        (None, DecimalMark::Auto, Unit::Millimetre),
-        (Some(Coordinates::Centres), DecimalMark::Comma, Unit::Millimetre),
-        (Some(Coordinates::Contacts), DecimalMark::Point, Unit::Inch),
+    for (coordinates, decimal, unit, height_unit) in [
+        (None, DecimalMark::Auto, Unit::Millimetre, None),
+        (Some(Coordinates::Centres), DecimalMark::Comma, Unit::Millimetre, Some(Unit::Micrometre)),
+        (Some(Coordinates::Contacts), DecimalMark::Point, Unit::Inch, None),
     ] {
-        let content = Content { coordinates, decimal, unit, columns: None };
+        let content = Content { coordinates, decimal, unit, height_unit, columns: None };
         let Ok(file) = parse_result(path(), bytes, &content) else { continue };
         is_read = true;
         assert!(file.points.iter().all(|p| p.iter().all(|v| v.abs() <= LIMIT_MM * content.unit.in_mm())));

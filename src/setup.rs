@@ -163,7 +163,8 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         machine: cell.cmm.uncertainty,
         tolerance: tolerance(recipe),
         adaptive: adaptive(recipe),
-        simulation: cell.simulated,
+        simulation: cell.is_marked(),
+        rehearsal: cell.rehearsal,
     };
     let mut plan = plan(recipe, cell);
     plan.gates.least_found = least_found(recipe);
@@ -709,6 +710,7 @@ pub fn machines(
             _ => None,
         },
         least_found: least_found(recipe),
+        rehearsal: cell.rehearsal,
         volume_mm: volume_mm(cell),
         ..making(link, cell.simulated, [owner, epoch])
     };
@@ -779,6 +781,7 @@ fn making(link: &Link, simulated: bool, [owner, epoch]: [u32; 2]) -> Making<'_> 
         epoch,
         free_points: None,
         least_found: 0.0,
+        rehearsal: false,
         timing: &link.timing,
         registers: &link.registers,
         signals: &link.signals,

@@ -149,7 +149,7 @@ fn export(arguments: &ToExport) -> Result<Outcome, Failure> {
 
 fn failure(error: JournalError) -> Failure {
     match error {
-        JournalError::Broken { .. } => Failure::Broken(error),
+        JournalError::Broken { .. } | JournalError::NoAuthor { .. } => Failure::Broken(error),
         other => Failure::Journal(other),
     }
 }
@@ -168,8 +168,13 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     let folder = folder_of(arguments.run.as_deref())?;
     let anchor = arguments.anchor.as_deref().map(read_anchor).transpose()?;
     let found = verify_against(&folder, &Against { anchor, keys: arguments.key.clone() });
-    if let (Err(JournalError::Broken { seq, what, .. }), true) = (&found, arguments.json) {
-        super::print_json(&json!({ "run": folder, "sound": false, "record": seq, "what": what }))?;
+    let not_sound = match &found {
+        Err(JournalError::Broken { seq, what, .. }) => Some((Some(seq), what)),
+        Err(JournalError::NoAuthor { what, .. }) => Some((None, what)),
+        _ => None,
+    };
+    if let (Some((record, what)), true) = (not_sound, arguments.json) {
+        super::print_json(&json!({ "run": folder, "sound": false, "record": record, "what": what }))?;
     }
     let verified = found.map_err(failure)?;
     let begin = first(&folder)?;

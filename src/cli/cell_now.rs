@@ -114,6 +114,8 @@ impl Look {
                 self.told = Told { now: Now::NoRun, last: Some(Ended { run: name(run), verdict, accepted }) };
             }
             Ok(_) if is_driven(run) => return self.does_not_answer(run.clone()),
+            // Its machines have gone with it.
+            Ok(RunSummary { machines_within: true, .. }) => self.told.now = Now::NoRun,
             Ok(_) => self.told.now = Now::Gone { run: name(run) },
             // It cannot be read just now.
             Err(_) => return,

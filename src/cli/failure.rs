@@ -133,6 +133,12 @@ pub(super) enum Failure {
     NotAlike,
     #[error("{}: its program ended before anything was asked of a machine; begin a new run", .run.display())]
     NotBegun { run: PathBuf },
+    #[error(
+        "{}: a rehearsal is played at machines that people serve, and a wire reaches one of this cell; write `simulated = true` into the cell file and \
+         simulate it, or leave --rehearsal out",
+        .cell.display()
+    )]
+    NoRehearsal { cell: PathBuf },
     #[error("{}: its simulated machines ended with the program that ran it; begin a new run", .run.display())]
     WorldGone { run: PathBuf },
     #[error(
@@ -227,7 +233,11 @@ impl Failure {
             Self::Plant(error) if error.may_pass() => FAULT,
             #[cfg(feature = "plant")]
             Self::Plant(error)
-                if matches!(**error, PlantError::Differs { .. } | PlantError::Journal(JournalError::Broken { .. })) =>
+                if matches!(
+                    **error,
+                    PlantError::Differs { .. }
+                        | PlantError::Journal(JournalError::Broken { .. } | JournalError::NoAuthor { .. })
+                ) =>
             {
                 NOT_AS_IT_SHOULD_BE
             }

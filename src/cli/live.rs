@@ -66,7 +66,7 @@ impl Live<'_> {
         let (cell, actor) = (self.cell, self.actor);
         let (notices, shown) = mpsc::unbounded_channel();
         let showing = tokio::spawn(
-            Show::new(self.json, cell.simulated, self.recipe, work.plan.tolerance, self.folder).follow(shown),
+            Show::new(self.json, cell.is_marked(), self.recipe, work.plan.tolerance, self.folder).follow(shown),
         );
         let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
         let Work { task, plan, journal, loaded, interrupted } = work;

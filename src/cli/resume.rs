@@ -70,14 +70,15 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     // Where it is gone, a recipe that names no file from there needs none of it, and any other says which one is missing.
     let _ = std::env::set_current_dir(&begun.working_folder);
     let recipe = check::or_show(Recipe::parse(&begun.recipe, &text(folder, "recipe.toml")?))?;
-    let cell = check::or_show(CellConfig::parse(&begun.cell, &text(folder, "cell.toml")?))?;
+    let mut cell = check::or_show(CellConfig::parse(&begun.cell, &text(folder, "cell.toml")?))?;
+    cell.rehearsal = begun.rehearsal;
     if within(&cell) {
         return Err(Failure::WorldGone { run: folder.to_owned() });
     }
     let (task, plan) = begun.prepared(folder, &recipe, &cell)?;
     let interrupted = Interrupted::read(folder, plan.clone(), &task).map_err(Failure::Replay)?;
     if !arguments.json {
-        let marked = if cell.simulated { "SIMULATION  " } else { "" };
+        let marked = if cell.is_marked() { "SIMULATION  " } else { "" };
         let state = interrupted.state();
         super::print(&format!("{marked}broke off in {state}\nthe record is whole, and done again nothing differs\n"))?;
     }
@@ -112,6 +113,8 @@ struct Begun {
     seed: Option<u64>,
     plan: Value,
     table_version: u32,
+    #[serde(default)]
+    rehearsal: bool,
 }
 
 impl Begun {

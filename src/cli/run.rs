@@ -53,6 +53,10 @@ pub(super) struct Arguments {
     /// The right part is loaded and clamped already, wheel and probe are clear of it: do not ask
     #[arg(long)]
     pub(super) loaded: bool,
+    /// Play it through without a part, at machines that people serve: everything is marked SIMULATION, and the plan itself may be given back as what was
+    /// measured
+    #[arg(long)]
+    pub(super) rehearsal: bool,
     /// Draw another simulated part and run from this number
     #[arg(long, value_name = "N")]
     pub(super) seed: Option<u64>,
@@ -78,7 +82,11 @@ pub(super) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let recipe = check::or_show(Recipe::read(&arguments.recipe))?;
-    let cell = check::or_show(CellConfig::read(&arguments.cell))?;
+    let mut cell = check::or_show(CellConfig::read(&arguments.cell))?;
+    if arguments.rehearsal && !cell.is_by_person() {
+        return Err(Failure::NoRehearsal { cell: arguments.cell.clone() });
+    }
+    cell.rehearsal = arguments.rehearsal;
     let (mut task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
     if let Some(seed) = arguments.seed {
         task.setting.push_str(&format!(", seed {seed}"));
@@ -128,7 +136,7 @@ async fn carry_out(
     let job = epoch(began);
     // Before the record begins: a folder that is not there, or a line that is in use, is no run.
     let part = arguments.part.clone().unwrap_or_else(|| recipe_name(recipe));
-    let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.simulated);
+    let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.is_marked());
     let (free, needed) = (free_bytes(&folder).unwrap_or(u64::MAX), task.cycle_bytes());
     if free < needed {
         return Err(Failure::NoSpace { path: arguments.runs.clone(), free, needed });
@@ -282,12 +290,14 @@ fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), 
         earlier.and_then(|earlier| earlier.learned.as_ref()).and_then(|(learned, _)| learned.taught_by.as_ref());
     let left_alone = earlier.iter().flat_map(|earlier| &earlier.left_alone).map(ToString::to_string);
     let left_alone: Vec<String> = left_alone.chain(earlier.iter().flat_map(|earlier| earlier.told.clone())).collect();
+    // The ports are taken by now; its text says whether they were open.
+    let machines_within = CellConfig::parse(cell.path(), cell.text()).is_ok_and(|cell| within(&cell));
     Header {
         run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
         part: arguments.part.clone().unwrap_or_else(|| "unnamed".into()),
         actor: actor.name.clone(),
         station: actor.station.clone(),
-        simulation: cell.simulated,
+        simulation: cell.is_marked(),
         first_command_id: 1,
         content: json!({
             "recipe": recipe.path(), "recipe_sha256": hex(recipe.source_sha256()),
@@ -295,7 +305,7 @@ fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), 
             "working_folder": std::env::current_dir().unwrap_or_default().to_string_lossy(),
             "nominal_sha256": hex(&task.part_identity), "setting": task.setting,
             "part_name": recipe.part.name, "part_in_files": live.part, "job": live.job, "seed": arguments.seed,
-            "plan": plan, "table_version": TABLE_VERSION,
+            "plan": plan, "table_version": TABLE_VERSION, "machines_within": machines_within, "rehearsal": cell.rehearsal,
             "learned_from": learned_from, "taught_by": taught_by, "left_alone": left_alone,
         }),
     }

@@ -66,7 +66,11 @@ fn in_words(run: &Listed) -> String {
     let measured = figures.map_or(String::new(), |[[pv, _], [rms, _]]| format!(", PV {pv:.2} um, RMS {rms:.3} um"));
     let cycles = summary.cycles.len();
     let counted = format!("{cycles} cycle{}", if cycles == 1 { "" } else { "s" });
-    let ended = if *is_live { "on now" } else { word(summary.result) };
+    let ended = match summary.result {
+        _ if *is_live => "on now",
+        RunResult::Open if summary.machines_within => "broke off, and its simulated machines with it",
+        result => word(result),
+    };
     format!("{}\n    {}  {}, {counted}{measured}\n", folder.display(), ended, summary.part)
 }
 
@@ -110,6 +114,6 @@ fn as_json(run: &Listed) -> Value {
     json!({
         "folder": run.folder, "run": id, "live": run.is_live, "part": part, "part_name": name, "recipe": recipe, "operator": operator,
         "began": began, "ended": ended, "simulation": simulation, "result": format!("{result:?}"), "words": verdict,
-        "alarms": alarms, "cycles": cycles,
+        "alarms": alarms.len(), "cycles": cycles,
     })
 }

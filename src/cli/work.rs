@@ -116,6 +116,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             Next::GivenBack => return Ok(Outcome::NotInTolerance),
         };
         let outcome = making::run(&making::Arguments {
+            rehearsal: false,
             recipe,
             cell: arguments.cell.clone(),
             part: Some(taken.lease.serial.clone()),

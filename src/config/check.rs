@@ -27,6 +27,7 @@ impl Checked {
         Some(CellConfig {
             name: self.name?,
             simulated: self.simulated?,
+            rehearsal: false,
             cmm: self.cmm?,
             grinder: self.grinder?,
             path: path.to_owned(),

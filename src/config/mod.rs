@@ -33,6 +33,9 @@ pub struct CellConfig {
     pub name: String,
     /// Whether its machines are simulated; everything recorded is marked so.
     pub simulated: bool,
+    /// Whether people only play its machines, with no part: everything recorded is marked as that of simulated machines is, and the plan itself may be
+    /// given back as what was measured. No cell file says it; who begins the run does.
+    pub rehearsal: bool,
     /// The measuring machine.
     pub cmm: Cmm,
     /// The grinder.
@@ -205,6 +208,16 @@ impl CellConfig {
         let mut notes = [self.cmm.link.wire.notes(), self.grinder.link.wire.notes()].concat();
         notes.dedup();
         notes
+    }
+
+    /// Whether everything recorded is marked SIMULATION: its machines are simulated, or people only play them.
+    pub fn is_marked(&self) -> bool {
+        self.simulated || self.rehearsal
+    }
+
+    /// Whether people serve both machines.
+    pub fn is_by_person(&self) -> bool {
+        [&self.cmm.link, &self.grinder.link].iter().all(|link| link.wire.is_by_person())
     }
 
     /// Returns the path that the cell file was read from.

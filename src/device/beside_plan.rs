@@ -95,16 +95,21 @@ fn is_strip(points: &[Point]) -> bool {
 
 /// Whether points are the planned ones, rounded to the digits that they have: no touch ends where it was planned in all of them.
 fn is_given_back(found: &[Point], planned: &[Point]) -> bool {
-    /// Fewer may be alike by chance; points of fewer digits too.
+    /// Fewer may be alike by chance.
     const LEAST: usize = 3;
-    const DIGITS: std::ops::RangeInclusive<i32> = 3..=9;
-    let has_digits = |digits: i32| {
-        let scale = 10f64.powi(digits);
-        found.iter().flat_map(|p| p.iter()).all(|v| (v * scale - (v * scale).round()).abs() < 1e-3)
+    let is_same = |(p, q): (&Point, &Point)| p.iter().zip(q.iter()).all(|(p, q)| (p - q).abs() <= rounding_mm(*p));
+    found.len() >= LEAST && found.iter().zip(planned).all(is_same)
+}
+
+/// By how much a coordinate may have been rounded, by its decimals: a file of so many significant digits has more of them in small values.
+fn rounding_mm(value_mm: f64) -> f64 {
+    const DECIMALS: std::ops::RangeInclusive<i32> = 3..=9;
+    let has = |decimals: &i32| {
+        let scaled = value_mm * 10f64.powi(*decimals);
+        (scaled - scaled.round()).abs() < 1e-3
     };
-    let digits = DIGITS.into_iter().find(|digits| has_digits(*digits)).unwrap_or(*DIGITS.end());
-    let within_mm = 0.51 * 10f64.powi(-digits);
-    found.len() >= LEAST && found.iter().zip(planned).all(|(p, q)| (p - q).iter().all(|v| v.abs() <= within_mm))
+    let decimals = DECIMALS.into_iter().find(has).unwrap_or(*DECIMALS.end());
+    0.51 * 10f64.powi(-decimals)
 }
 
 #[cfg(test)]
@@ -180,6 +185,16 @@ mod tests {
         };
         let given_back = measurement(plan.targets.iter().map(contacts).collect(), Coordinates::Contacts);
         assert_eq!(plan.check(&given_back), Err(BesidePlan::GivenBack));
+        // To seven significant digits, as many programs print: five decimals beside six.
+        let significant = |v: f64| {
+            let decimals = 6 - v.abs().max(1e-6).log10().floor() as i32;
+            (v * 10f64.powi(decimals)).round() / 10f64.powi(decimals)
+        };
+        let mut rounded = measured(&plan, 12, |_| 0.0, |k| k);
+        rounded.points.iter_mut().for_each(|point| point.at_mm = point.at_mm.map(|v| significant(v)));
+        assert_eq!(plan.check(&rounded), Err(BesidePlan::GivenBack));
+        rounded.points[3].at_mm[2] += 2e-5;
+        assert_eq!(plan.check(&rounded), Ok(()));
     }
 
     #[test]

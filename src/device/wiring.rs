@@ -50,6 +50,8 @@ pub struct Making<'a> {
     pub free_points: Option<usize>,
     /// The share of a plan's targets of which a measurement must have a point.
     pub least_found: f64,
+    /// Whether people only play the machines: the plan itself may come back as what was measured.
+    pub rehearsal: bool,
     /// How long to wait for what.
     pub timing: &'a Timing,
     /// Where the blocks of its Modbus map stand.

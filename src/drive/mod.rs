@@ -743,12 +743,15 @@ impl Drive {
         for command in commands.iter().filter(|command| waits_for_nothing(command)) {
             self.execute(command.clone()).await;
         }
-        self.show_event(now, &event);
-        let mut refusal = None;
+        let refusal = commands.iter().find_map(|command| match command {
+            Command::Refuse { why, .. } => Some(why.clone()),
+            _ => None,
+        });
+        // An order that was refused changed nothing: the refusal itself is shown.
+        if refusal.is_none() || !event.is_order() {
+            self.show_event(now, &event);
+        }
         for command in commands {
-            if let Command::Refuse { why, .. } = &command {
-                refusal = Some(why.clone());
-            }
             self.line_up(command);
         }
         self.status.send_replace(self.snapshot());

@@ -96,6 +96,8 @@ pub struct Task {
     pub adaptive: Option<Adaptive>,
     /// Whether the cell is simulated; everything stored is marked so.
     pub simulation: bool,
+    /// Whether people only play the machines: the plan itself may come back as what was measured.
+    pub rehearsal: bool,
 }
 
 /// Which parameters of the machine are taken back.

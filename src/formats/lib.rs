@@ -64,7 +64,7 @@ pub use registration::{
 };
 pub use sdf::{parse_sdf, read_sdf};
 pub use stl::{StlFile, parse_stl, read_stl};
-pub use system::{OpenToOthers, is_same_file, readable_by_others};
+pub use system::{OpenToOthers, is_same_file, readable_by_others, user_name};
 pub use whole::read_whole;
 pub use x3p::{MapRecord, X3pFile, escaped, parse_x3p, read_x3p, write_error_map_x3p, write_x3p};
 

@@ -58,6 +58,12 @@ pub enum JournalError {
         "{path}: the journal is broken at record {seq}: {what}; keep the folder as it is and compare it with its copies"
     )]
     Broken { path: PathBuf, seq: u64, what: String },
+    /// The record is whole, and not signed by whom the given keys belong to.
+    #[error(
+        "{path}: the record is whole, and who wrote it is not proven: {what}; give the keys of all who drove the run, or leave --key out, \
+         which proves no author"
+    )]
+    NoAuthor { path: PathBuf, what: String },
     /// The file of an audit key holds none.
     #[error(
         "{path}: this is no audit key: {what}; bring it back from a copy, or put it away and make another with `regrind audit key`"

@@ -106,7 +106,7 @@ pub fn verify(folder: impl AsRef<Path>) -> Result<Verified, JournalError> {
 /// Verifies a journal as [`verify`] does, and against what was kept elsewhere.
 ///
 /// # Errors
-/// As [`verify`].
+/// Those of [`verify`]; [`JournalError::NoAuthor`] where all of it can be believed but that one of the keys signed it.
 pub fn verify_against(folder: impl AsRef<Path>, against: &Against) -> Result<Verified, JournalError> {
     let folder = folder.as_ref();
     let beside = read_anchor(folder)?;
@@ -143,6 +143,8 @@ struct Seen<'a> {
     run: String,
     /// The key that the newest beginning or reopening names.
     key: Option<PublicKey>,
+    /// Why none of the trusted keys proves it, from the first record that says so.
+    no_author: Option<String>,
     keys: Vec<PublicKey>,
     seals: u64,
     signed: u64,
@@ -176,6 +178,9 @@ fn examine(folder: &Path, anchors: &[&Anchor], trusted: &[PublicKey]) -> Result<
     }
     if let Some(number) = reader.number_before_the_first()? {
         return Err(broken(folder, 0, format!("a record with the number {number} stands before the first")));
+    }
+    if let Some(what) = seen.no_author {
+        return Err(JournalError::NoAuthor { path: folder.to_owned(), what });
     }
     let Seen { records, head, ended, artefacts, names, open, keys, seals, signed, .. } = seen;
     Ok(Verified {
@@ -238,6 +243,7 @@ impl<'a> Seen<'a> {
             ended: None,
             run: String::new(),
             key: None,
+            no_author: None,
             keys: Vec::new(),
             seals: 0,
             signed: 0,
@@ -293,21 +299,16 @@ impl<'a> Seen<'a> {
                 None => return wrong("it names a key that is none".to_owned()),
             },
         };
-        match self.key {
-            Some(key) if self.is_foreign(&key) => {
-                return wrong(format!("it names the key {key}, which is none of those given"));
-            }
-            Some(key) if !self.keys.contains(&key) => self.keys.push(key),
-            None if record.kind == Kind::Begin && !self.trusted.is_empty() => {
-                return wrong("it names no key, and one is given: the run is not signed".to_owned());
-            }
-            _ => {}
-        }
+        let no_author = match self.key {
+            _ if self.trusted.is_empty() => None,
+            Some(key) if self.trusted.contains(&key) => None,
+            Some(key) => Some(format!("record {} names the key {key}, which is none of those given", record.seq)),
+            None if record.kind == Kind::Begin => Some("the run is not signed".to_owned()),
+            None => Some(format!("it was gone on with at record {} without a key", record.seq)),
+        };
+        self.no_author = self.no_author.take().or(no_author);
+        self.keys.extend(self.key.filter(|key| !self.keys.contains(key)));
         Ok(())
-    }
-
-    fn is_foreign(&self, key: &PublicKey) -> bool {
-        !self.trusted.is_empty() && !self.trusted.contains(key)
     }
 
     fn take_seal(&mut self, record: &Record) -> Result<(), JournalError> {

@@ -79,6 +79,11 @@ texts! {
         "Das Programm der Zelle antwortet nicht. Was die Maschinen tun, ist nicht bekannt: bitte nachsehen. Dann: regrind resume",
         "单元程序没有应答。机器的状态未知：请到现场查看。然后执行：regrind resume"
     }
+    SimulationGone {
+        "The program that simulated this cell has ended, and its machines with it. Begin a new run.",
+        "Das Programm, das diese Zelle simuliert hat, ist beendet, und mit ihm ihre Maschinen. Bitte einen neuen Lauf beginnen.",
+        "仿真该单元的程序已结束，其中的机器也随之结束。请开始新的运行。"
+    }
     PageGone {
         "This page has lost its server. What the cell does is not known here: look at it.",
         "Diese Seite hat ihren Server verloren. Was die Zelle tut, ist hier nicht bekannt: bitte nachsehen.",
@@ -113,6 +118,10 @@ texts! {
     ByOperator { "the operator", "den Bediener", "操作员" }
     ByEngineer { "the process engineer", "den Prozessingenieur", "工艺工程师" }
     NoAlarm { "No alarm", "Kein Alarm", "无报警" }
+    NoAlarmRaised { "No alarm was raised", "Kein Alarm wurde ausgelöst", "未触发过报警" }
+    Raised { "raised", "ausgelöst", "触发于" }
+    Withdrawn { "gone", "behoben", "消除于" }
+    StoodAtTheEnd { "stood at the end", "stand am Ende noch an", "结束时仍存在" }
     // Figures.
     Convergence { "Convergence", "Konvergenz", "收敛" }
     Figures { "Figures", "Kennwerte", "数值" }

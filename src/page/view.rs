@@ -9,7 +9,7 @@ use axum::response::{IntoResponse, Redirect, Response};
 use maud::{DOCTYPE, Markup, html};
 use regrind_cell::{Alarm, Device, Role, StateName, Tolerance};
 use regrind_control::{JobProgress, Next, Snapshot, SoFar};
-use regrind_report::{ColourMap, CycleSummary, RUN_REPORT, RunResult, RunSummary};
+use regrind_report::{AlarmStory, ColourMap, CycleSummary, RUN_REPORT, RunResult, RunSummary};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::task::spawn_blocking;
@@ -63,7 +63,7 @@ pub(crate) fn pieces(seen: &Seen, has_control: bool, language: Language) -> [(Pi
         (Piece::About, about(seen, language)),
         (Piece::Next, next(seen, language)),
         (Piece::Job, live.map_or_else(Markup::default, |snapshot| job(snapshot, language))),
-        (Piece::Alarms, alarms(snapshot.map_or(&[], |snapshot| &snapshot.alarms), language)),
+        (Piece::Alarms, alarms(seen, language)),
         (Piece::Figures, figures(&summary.cycles, tolerance, language)),
         (Piece::Convergence, chart(&summary.cycles, tolerance, live.is_some(), language)),
         (Piece::Control, control(live.is_some() && !has_control, language)),
@@ -89,6 +89,8 @@ pub(crate) fn state(seen: &Seen, session: &Session, has_control: bool) -> Value 
     json!({
         "answers": seen.answers,
         "lost": seen.is_lost(),
+        "last": seen.summary.last,
+        "machinesWithin": seen.summary.machines_within,
         "over": seen.summary.ended.is_some() && !seen.answers,
         "number": live.map(|live| live.number),
         "can": live.map_or_else(Vec::new, |live| can(live, session, has_control)),
@@ -149,7 +151,8 @@ fn banner(seen: &Seen, language: Language) -> Markup {
         return mark(class, shape, say(texts::state(live.state)), &more);
     }
     if seen.is_lost() && !seen.summary.run.is_empty() {
-        return mark("lost", UNKNOWN, "?", say(Text::ProgramGone));
+        let gone = if seen.summary.machines_within { Text::SimulationGone } else { Text::ProgramGone };
+        return mark("lost", UNKNOWN, "?", say(gone));
     }
     let result = seen.summary.result;
     let (class, shape) = match result {
@@ -272,22 +275,51 @@ fn range([least, most]: [f64; 2]) -> String {
     if least == most { format!("{most} {unit}") } else { format!("{least} – {most} {unit}") }
 }
 
-fn alarms(alarms: &[Alarm], language: Language) -> Markup {
+/// The alarms that stand; of a run that is over, or whose program is gone, all that its record tells.
+fn alarms(seen: &Seen, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
+    if let Some(live) = seen.snapshot.as_deref().filter(|live| seen.answers && !is_over(live.state)) {
+        return html! {
+            @if live.alarms.is_empty() { p .quiet { (say(Text::NoAlarm)) } }
+            @for alarm in &live.alarms { (standing(alarm, language)) }
+        };
+    }
+    let told = &seen.summary.alarms;
     html! {
-        @if alarms.is_empty() { p .quiet { (say(Text::NoAlarm)) } }
-        @for (alarm, said) in alarms.iter().map(|alarm| (alarm, said(alarm, language))) {
-            article .alarm {
-                h3 { (said.what) }
-                p { (said.consequence) }
-                p .quiet { (say(Text::WhatToDo)) ":" }
-                ol { @for remedy in &said.remedy { li { (remedy) } } }
-                p .quiet { (say(Text::ClearedBy)) ": " (say(match alarm.clears {
-                    Role::Nobody => Text::ByItself,
-                    Role::Operator => Text::ByOperator,
-                    _ => Text::ByEngineer,
-                })) }
+        @if told.is_empty() && !seen.summary.run.is_empty() { p .quiet { (say(Text::NoAlarmRaised)) } }
+        @for AlarmStory { alarm, raised, withdrawn } in told {
+            @if withdrawn.is_none() && seen.is_lost() {
+                (standing(alarm, language))
+            } @else {
+                article .alarm .past {
+                    h3 { (said(alarm, language).what) }
+                    p .quiet {
+                        (say(Text::Raised)) " " (when(raised)) ", "
+                        @match withdrawn {
+                            Some(withdrawn) => { (say(Text::Withdrawn)) " " (when(withdrawn)) }
+                            None => { (say(Text::StoodAtTheEnd)) }
+                        }
+                    }
+                }
             }
+        }
+    }
+}
+
+/// An alarm that somebody has to see to.
+fn standing(alarm: &Alarm, language: Language) -> Markup {
+    let (say, said) = (|text: Text| text.to(language), said(alarm, language));
+    html! {
+        article .alarm {
+            h3 { (said.what) }
+            p { (said.consequence) }
+            p .quiet { (say(Text::WhatToDo)) ":" }
+            ol { @for remedy in &said.remedy { li { (remedy) } } }
+            p .quiet { (say(Text::ClearedBy)) ": " (say(match alarm.clears {
+                Role::Nobody => Text::ByItself,
+                Role::Operator => Text::ByOperator,
+                _ => Text::ByEngineer,
+            })) }
         }
     }
 }
@@ -438,7 +470,7 @@ fn map(language: Language) -> Markup {
 fn script_texts(language: Language) -> Value {
     let say = |text: Text| text.to(language);
     json!({
-        "noData": say(Text::NotConnected), "pageGone": say(Text::PageGone), "programGone": say(Text::ProgramGone),
+        "noData": say(Text::NotConnected), "pageGone": say(Text::PageGone), "programGone": say(Text::ProgramGone), "simulationGone": say(Text::SimulationGone),
         "noRelief": say(Text::NoRelief), "notMeasured": say(Text::NotMeasured), "planned": say(Text::Planned),
         "touched": say(Text::Touched), "filtered": say(Text::Filtered), "known": say(Text::KnownTo), "order": say(Text::NoButtonStops),
     })
@@ -534,7 +566,7 @@ fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> M
                     @for k in 0..2 {
                         td .n { @if let Some(figures) = figures { (format!("{:.2}", figures[k][0])) } @else { "–" } }
                     }
-                    td .n { (summary.alarms) }
+                    td .n { (summary.alarms.len()) }
                     td class=(if summary.result == RunResult::Accepted { "good" } else { "" }) {
                         @if *is_live { strong { (say(Text::Live)) } } @else { (say(texts::result(summary.result))) }
                     }

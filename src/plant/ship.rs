@@ -330,7 +330,7 @@ pub fn glance(folder: &Path) -> Result<Value, PlantError> {
     });
     let [cmm, grinder] = machines;
     Ok(json!({
-        "result": result_word(result), "verdict": verdict, "alarms": alarms, "cmm": cmm, "grinder": grinder,
+        "result": result_word(result), "verdict": verdict, "alarms": alarms.len(), "cmm": cmm, "grinder": grinder,
         "wheel": wheel_radius_mm.map(|mm| format!("R {mm:.3} mm")), "probe": probe_of(folder).map(|mm| format!("R {mm:.3} mm")),
         "pv_limit_um": tolerance.and_then(|of| limit(of.pv_mm)), "rms_limit_um": tolerance.and_then(|of| limit(of.rms_mm)),
         "cycles": cycles.collect::<Vec<_>>(),

@@ -52,6 +52,7 @@ pub use ply::{coloured_ply, save_coloured_ply};
 pub use results::{RUN_DFQ, RUN_QIF, ResultsFormat, run_results, write_run_results};
 pub use run::{RUN_REPORT, run_report, write_run_report};
 pub use states::state_picture;
+pub use story::AlarmStory;
 pub use summary::{CycleSummary, RunResult, RunSummary, run_summary};
 pub use words::{ending_words, in_air, words};
 

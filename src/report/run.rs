@@ -13,9 +13,9 @@ use super::course::convergence;
 use super::form::form;
 use super::maps::{maps, within_html};
 use super::means::{last_model, last_registration, means, registered, signatures};
-use super::story::{Measurement, Story};
+use super::story::{Measurement, PassStory, Story};
 use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
-use regrind_cell::{Compared, Conformity, Ending, Figures, ParameterTold, Tolerance};
+use regrind_cell::{Compared, Conformity, Ending, Figures, JobResult, ParameterTold, Tolerance};
 use regrind_formats::{escaped, write_atomic};
 use regrind_journal::{Record, Verified};
 
@@ -67,6 +67,7 @@ fn html(story: &Story, folder: &Path, verified: &Verified) -> Result<String, Rep
          <style>{STYLE}</style>\n</head>\n<body>\n{mark}<h1>{name}{serial}</h1>\n"
     );
     html += &verdict(story);
+    html += &broken_off_pass(story);
     html += &judged(story);
     let registration = last_registration(story, folder)?;
     html += &facts(story, &begin);
@@ -104,6 +105,30 @@ fn verdict(story: &Story) -> String {
     let unrecorded = story.ending.is_some() && story.end.is_none();
     let more = if unrecorded { "<p>The record of the run has not been brought to its end.</p>\n" } else { "" };
     format!("<p class=\"{class}\">{}</p>\n{more}", escaped(&words))
+}
+
+/// How far the last pass came, where it did not come to its end: the rest of the part stands as it did before.
+fn broken_off_pass(story: &Story) -> String {
+    let Some(PassStory { cycle, ground, result }) = story.pass else { return String::new() };
+    let how = match result {
+        Some(JobResult::Complete) => return String::new(),
+        Some(JobResult::Stopped) => "was stopped",
+        Some(JobResult::Aborted) => "was aborted",
+        Some(JobResult::Failed) => "failed",
+        None => "has no end on record",
+    };
+    let far = match ground {
+        Some([done, total]) if total > 0 => {
+            format!(
+                "{:.0} % of its path had been ground as the grinder told last",
+                100.0 * f64::from(done) / f64::from(total)
+            )
+        }
+        _ => "how much of its path had been ground is not known".to_owned(),
+    };
+    format!(
+        "<p id=\"pass\">The pass of cycle {cycle} {how}: {far}; the rest of the part stands as it did before.</p>\n"
+    )
 }
 
 /// The figures that are judged, of the last measurement, beside their limits.

@@ -8,7 +8,10 @@ use serde_json::Value;
 use super::ReportError;
 use super::told::Told;
 use super::words::{gate_words, words};
-use regrind_cell::{Alarm, Command, Ending, Event, Figures, Gate, Judgement, ParameterTold, Tolerance};
+use regrind_cell::{
+    Alarm, Command, Device, Ending, Event, Figures, Gate, JobResult, Judgement, ParameterTold, Reconciliation,
+    Tolerance,
+};
 use regrind_journal::{Reader, Record, Verified, verify};
 
 /// The map of a cycle's error, as text.
@@ -39,6 +42,20 @@ pub(super) struct Story {
     pub(super) radius_error_mm: Option<(u32, f64)>,
     pub(super) alarms: Vec<AlarmStory>,
     pub(super) orders: Vec<Order>,
+    /// The pass that was begun last.
+    pub(super) pass: Option<PassStory>,
+    /// When the last record was written.
+    pub(super) last: String,
+}
+
+/// How far a pass came.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct PassStory {
+    pub(super) cycle: u32,
+    /// So much of its path was ground, of so much, as the grinder told last.
+    pub(super) ground: Option<[u32; 2]>,
+    /// How it ended; none where that is not on record.
+    pub(super) result: Option<JobResult>,
 }
 
 #[derive(Default)]
@@ -80,10 +97,15 @@ impl Measurement {
     }
 }
 
-pub(super) struct AlarmStory {
-    pub(super) alarm: Alarm,
-    pub(super) raised: String,
-    pub(super) withdrawn: Option<String>,
+/// An alarm as the record tells it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AlarmStory {
+    /// The alarm.
+    pub alarm: Alarm,
+    /// When it was raised, RFC 3339 in UTC.
+    pub raised: String,
+    /// When it was gone; none where it stood to the end of the record.
+    pub withdrawn: Option<String>,
 }
 
 /// What a person ordered, or said of a machine.
@@ -109,6 +131,7 @@ impl Story {
     }
 
     pub(super) fn take(&mut self, record: Record) {
+        self.last.clone_from(&record.utc);
         match Told::of(&record) {
             Told::Begun(_) => self.begin = Some(record),
             Told::Command(command) => self.take_command(record, *command),
@@ -186,6 +209,18 @@ impl Story {
                 let [name, address] =
                     ["name", "address"].map(|key| detail[key].as_str().unwrap_or("not told").to_owned());
                 self.machines[device as usize] = Some([name, address]);
+            }
+            Event::Started { device: Device::Grinder, cycle } => {
+                self.pass = Some(PassStory { cycle, ground: None, result: None });
+            }
+            Event::Progressed { device: Device::Grinder, done, total } => {
+                let under_way = self.pass.as_mut().filter(|pass| pass.result.is_none());
+                under_way.into_iter().for_each(|pass| pass.ground = Some([done, total]));
+            }
+            Event::Ended { device: Device::Grinder, cycle, result }
+            | Event::Reconciled { device: Device::Grinder, cycle, outcome: Reconciliation::Ended(result) } => {
+                let of_it = self.pass.as_mut().filter(|pass| pass.cycle == cycle);
+                of_it.into_iter().for_each(|pass| pass.result = Some(result));
             }
             Event::Qualified { cycle, radius_error_mm } => self.radius_error_mm = Some((cycle, radius_error_mm)),
             Event::Compensated { cycle, summary } => {

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::ReportError;
-use super::story::{CycleStory, Story};
+use super::story::{AlarmStory, CycleStory, Story};
 use super::words::{ending_words, home_words, verdict_words};
 use regrind_cell::{Ending, Tolerance};
 use regrind_journal::{Reader, Record};
@@ -27,6 +27,8 @@ pub struct RunSummary {
     pub ended: Option<String>,
     /// Whether any machine of it is simulated.
     pub simulation: bool,
+    /// Whether its machines were simulated by the program that ran it, and ended with that.
+    pub machines_within: bool,
     /// How it ended.
     pub result: RunResult,
     /// The same for people.
@@ -35,8 +37,10 @@ pub struct RunSummary {
     pub tolerance: Option<Tolerance>,
     /// Each cycle of which something is known.
     pub cycles: Vec<CycleSummary>,
-    /// How many alarms were raised.
-    pub alarms: usize,
+    /// The alarms that were raised, in that order.
+    pub alarms: Vec<AlarmStory>,
+    /// When the last record was written, RFC 3339 in UTC.
+    pub last: String,
     /// What each machine called itself: the measuring machine, the grinder; none where it has not answered.
     pub machines: [Option<String>; 2],
     /// The radius of the wheel as the grinder told it last, in millimetres.
@@ -116,11 +120,13 @@ fn summary(story: &Story) -> RunSummary {
         began: of_begin(|begin| &begin.utc),
         ended: story.end.as_ref().map(|end| end.utc.clone()),
         simulation: begin["simulation"] == true,
+        machines_within: begin["content"]["machines_within"] == true,
         result,
         verdict,
         cycles: story.cycles.iter().map(|(number, cycle)| cycle_summary(*number, cycle, tolerance.as_ref())).collect(),
         tolerance,
-        alarms: story.alarms.len(),
+        alarms: story.alarms.clone(),
+        last: story.last.clone(),
         machines: story.machines.clone().map(|machine| machine.map(|[name, _]| name)),
         wheel_radius_mm: story.wheel_radius_mm,
         probe_off_um: story.radius_error_mm.map(|(_, mm)| 1e3 * mm),

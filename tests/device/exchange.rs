@@ -349,6 +349,7 @@ fn the_cell_may_say_what_the_file_does_not() {
         coordinates: Some(Said::Contacts),
         decimal: DecimalMark::Comma,
         unit: regrind::formats::Unit::Inch,
+        height_unit: None,
         columns: None,
     };
     let mut bench = Bench::new(CmmExchange { content, ..shop.cmm() });

@@ -132,6 +132,14 @@ fn a_page_whose_cell_is_killed_says_so_and_offers_no_order() {
         &mut browser,
         "[...document.querySelectorAll('.orders [data-order]')].every((button) => button.disabled)",
     );
+    // A tab that is opened later says the same: data end where the record does, not where somebody began to look.
+    let ended = "Date.parse(JSON.parse(document.getElementById('data').textContent).state.last)";
+    tab.until(&mut browser, &format!("Date.now() - {ended} > 1500"));
+    let later = browser.open(&format!("{}runs/{}", shown.visitor().origin() + "/", shown.id), SCREEN);
+    later.until(&mut browser, "document.body.classList.contains('old')");
+    let since = "document.querySelector('#old').innerText.match(/\\d+:\\d+:\\d+/)[0]";
+    let of_record = format!("new Date({ended}).toLocaleTimeString().match(/\\d+:\\d+:\\d+/)[0]");
+    assert_eq!(later.read(&mut browser, since), later.read(&mut browser, &of_record));
     shown.page.signal("KILL");
     tab.until(&mut browser, "document.querySelector('#old').innerText.includes('lost its server')");
 }

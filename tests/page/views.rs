@@ -1,8 +1,8 @@
 //! What the pages hold, without a browser.
 
 use crate::http::Visitor;
-use crate::program::{run, small_recipe};
-use crate::serve;
+use crate::program::{replaced, run, small_recipe};
+use crate::{Shown, serve};
 
 #[test]
 fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
@@ -77,4 +77,34 @@ fn a_page_for_other_computers_and_one_on_a_port_in_use_are_refused() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let (code, _, errors) = run(&["serve", "--listen", &taken.local_addr().unwrap().to_string()], home.path());
     assert!(code == 2 && errors.contains("--listen"), "{errors}");
+}
+
+/// The probe's radius is told to be another than that on the sphere: the cell is held, and a person ends the run.
+#[test]
+fn a_run_that_was_stopped_shows_the_alarms_that_it_ended_with() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e5);
+    let text = std::fs::read_to_string(&recipe).unwrap();
+    let wrong = "[simulation.cmm]\nprobe_radius_error_um = 50.0\n\n[simulation.part]";
+    let text = replaced(&text, "[simulation.part]", wrong);
+    std::fs::write(&recipe, replaced(&text, "[cycle]\n", "[cycle]\nbegin_with = \"measure\"\n")).unwrap();
+    let mut shown = Shown::of(home.path(), &recipe);
+    let visitor = shown.visitor();
+    let path = format!("/runs/{}", shown.id);
+    let piece = |text: String, id: &str| {
+        text.split(&format!("id=\"{id}\"")).nth(1).unwrap().split("<h2").next().unwrap().to_owned()
+    };
+    let folder = shown.folder.clone();
+    let state = || run(&["status", &folder.display().to_string()], home.path()).1;
+    shown.run.until("a held cell", |_| state().contains("Held").then_some(()));
+    assert_eq!(run(&["stop", &folder.display().to_string()], home.path()).0, 0);
+    shown.run.end();
+    let alarms = shown.page.until("the alarms of the record", |_| {
+        let alarms = piece(visitor.get(&path).text(), "alarms");
+        alarms.contains("stood at the end").then_some(alarms)
+    });
+    assert!(
+        alarms.contains("radius of the probe") && alarms.contains("raised") && !alarms.contains("No alarm"),
+        "{alarms}"
+    );
 }

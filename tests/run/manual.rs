@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use regrind::formats::user_name;
 use regrind::journal::{Reader, Record};
 use regrind_sim::payload::{Feature, Map, Pass, Plan, PointRecord, Status, Target};
 use regrind_sim::spec::WorldSpec;
@@ -221,8 +222,10 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
     // Who and when, for each step.
     let reader = Reader::open(&folder).unwrap();
     let records: Vec<Record> = reader.records(1).map(Result::unwrap).collect();
+    let uid = std::os::unix::fs::MetadataExt::uid(&fs::metadata("/proc/self").unwrap());
+    let user = user_name(uid).map_or_else(|| format!("uid {uid}"), |name| format!("{name} (uid {uid})"));
     let by_a_person = |record: &&Record| {
-        assert!(record.actor.contains("uid") && record.utc.ends_with('Z'), "{record:?}");
+        assert!(record.actor == user && record.utc.ends_with('Z'), "{record:?}");
         true
     };
     let count = |device: &str, confirmed: &str| {

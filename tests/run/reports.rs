@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::program::{Running, regrind, root, run, small_recipe};
+use crate::program::{Running, records_with, regrind, root, run, small_recipe};
 use regrind::cell::{
     Actor, AlarmId, Command, Ending, Event, Figures, Gate, GateFailure, Judgement, Phase, State, Tolerance, Verdict,
     samples,
@@ -263,6 +263,12 @@ fn the_report_of_a_stopped_run_says_who_stopped_it_and_that_nothing_was_measured
     assert!(stop[1].starts_with("Ada at ") && stop[2] == "stop, SIGTERM" && stop[3] == "taken", "{orders:?}");
     let cycles = page.cycles();
     assert!(cycles.len() == 1 && cycles[0].join("|").contains("not measured"), "{cycles:?}");
+    // How much was ground is what the grinder told last.
+    let told = records_with(&folder, "done").into_iter().filter(|event| event["event"] == "progressed");
+    let last =
+        told.filter(|event| event["device"] == "grinder").next_back().expect("a pass that moves tells how far it is");
+    let share = 100.0 * last["done"].as_f64().unwrap() / last["total"].as_f64().unwrap();
+    assert!(page.says(&format!("The pass of cycle 1 was stopped: {share:.0} % of its path had been ground")), "{last}");
 }
 
 #[test]
@@ -275,6 +281,9 @@ fn the_report_of_an_aborted_run_says_so_and_which_order_was_refused() {
     let (code, out, errors) = run(&["abort", path, "--reason", "smoke"], home.path());
     assert_eq!(code, 0, "{out}{errors}");
     assert_eq!(running.end().0, 3);
+    // The terminal of the run shows the refusal, and not that the cell went on.
+    let said = running.said.join("\n");
+    assert!(said.contains("not done: ") && said.contains("ABORT ") && !said.contains("RESUME "), "{said}");
     let page = Page::of(&folder);
     let ending = json_in(&folder, "result.json")["ending"].clone();
     assert_eq!((&ending["ending"], &ending["confirmed"]), (&json!("aborted"), &json!(true)));

@@ -75,10 +75,8 @@ pub(crate) fn set_apart(command: &mut Command) {
 /// The name by which the operating system knows who started this program: a service may have none in its environment.
 pub(crate) fn own_name() -> String {
     use std::os::unix::fs::MetadataExt;
-    let Ok(uid) = std::fs::metadata("/proc/self").map(|own| own.uid().to_string()) else { return "unknown".into() };
-    let users = std::fs::read_to_string("/etc/passwd").unwrap_or_default();
-    let own = users.lines().map(|line| line.split(':').collect::<Vec<_>>()).find(|user| user.get(2) == Some(&&*uid));
-    own.map_or_else(|| format!("uid {uid}"), |user| user[0].to_owned())
+    let Ok(uid) = std::fs::metadata("/proc/self").map(|own| own.uid()) else { return "unknown".into() };
+    regrind::formats::user_name(uid).unwrap_or_else(|| format!("uid {uid}"))
 }
 
 /// The name of this computer, if it has one.

@@ -53,11 +53,11 @@ impl Caller {
     /// Names the person by what the operating system vouches for.
     pub(crate) fn actor(&self) -> io::Result<Actor> {
         let peer = self.0.peer_cred()?;
-        let name = match std::env::var("USER") {
-            // The same user as this process: the name is known.
-            Ok(name) if Some(peer.uid()) == own_uid() => format!("{name} (uid {})", peer.uid()),
-            _ => format!("uid {}", peer.uid()),
-        };
+        let uid = peer.uid();
+        // A user of a directory service stands in no list of this computer; the same one as this process is known by its own name.
+        let own = || std::env::var("USER").ok().filter(|_| Some(uid) == own_uid());
+        let name = regrind_formats::user_name(uid).or_else(own);
+        let name = name.map_or_else(|| format!("uid {uid}"), |name| format!("{name} (uid {uid})"));
         let station = peer.pid().map_or("local console".to_owned(), |pid| format!("local console, process {pid}"));
         Ok(Actor { name, station })
     }

@@ -48,6 +48,8 @@ pub struct CmmExchange {
     pub least_points: usize,
     /// The share of the targets of which a result must have a point.
     pub least_found: f64,
+    /// Whether the plan itself may be given back as what was measured.
+    pub rehearsal: bool,
     /// By how much the probe radius in a file may differ from the plan's.
     pub probe_tolerance_mm: f64,
     /// The sensor of a DMIS program, where the plan is written as one too.
@@ -68,6 +70,7 @@ impl CmmExchange {
             free_count: false,
             least_points: 1,
             least_found: 0.0,
+            rehearsal: false,
             take_earlier: false,
             probe_tolerance_mm: 1e-3,
             dmis_sensor: None,
@@ -163,7 +166,8 @@ impl CmmFolders {
         }?;
         if let Some((accepted, plan)) = accepted.as_ref().zip(expected.plan.as_ref()) {
             let path = accepted.files.first().map_or_else(PathBuf::new, |(name, _)| self.settings.inbox.join(name));
-            check_measurement(&path, plan, &accepted.measurement, self.settings.least_found)?;
+            let CmmExchange { least_found, rehearsal, .. } = self.settings;
+            check_measurement(&path, plan, &accepted.measurement, least_found, rehearsal)?;
         }
         Ok(accepted)
     }

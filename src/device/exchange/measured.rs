@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use super::ExchangeError;
-use crate::{Job, MeasuredPoint, Measurement, Plan, PointStatus};
+use crate::{BesidePlan, Job, MeasuredPoint, Measurement, Plan, PointStatus};
 use regrind_core::geometry::Point;
 use regrind_formats::FormatError;
 use regrind_formats::result::{Content, Coordinates, ResultFile, Statements, check_ended, parse_result};
@@ -85,12 +85,13 @@ impl Wanted<'_> {
 /// Holds a whole measurement against its plan, before it is taken for the answer: one that is not can still be exchanged for another.
 ///
 /// # Errors
-/// Points of fewer targets than this share of them, the plan itself, and points that are not where their targets are.
+/// Points of fewer targets than this share of them, the plan itself unless it is a rehearsal, and points that are not where their targets are.
 pub fn check_measurement(
     path: &Path,
     plan: &Plan,
     measurement: &Measurement,
     least_found: f64,
+    rehearsal: bool,
 ) -> Result<(), ExchangeError> {
     let found = measurement.points.iter().filter(|point| point.status == PointStatus::Touched).count();
     let expected = plan.targets.len();
@@ -98,8 +99,11 @@ pub fn check_measurement(
         let least = (least_found * expected as f64).ceil() as usize;
         return Err(ExchangeError::Short { path: path.to_owned(), found, expected, least });
     }
-    let why = |beside: crate::BesidePlan| ExchangeError::Foreign { path: path.to_owned(), why: beside.to_string() };
-    plan.check(measurement).map_err(why)
+    match plan.check(measurement) {
+        Err(BesidePlan::GivenBack) if rehearsal => Ok(()),
+        Err(beside) => Err(ExchangeError::Foreign { path: path.to_owned(), why: beside.to_string() }),
+        Ok(()) => Ok(()),
+    }
 }
 
 /// Puts a measurement together from its files; what none of them tells stays unknown.

@@ -150,6 +150,7 @@ impl Wired for ExchangeWire {
             free_count: making.free_points.is_some(),
             least_points: making.free_points.unwrap_or(1),
             least_found: making.least_found,
+            rehearsal: making.rehearsal,
             take_earlier: self.take_earlier,
             probe_tolerance_mm: self.probe_tolerance_mm,
             dmis_sensor: self.dmis_sensor.clone(),

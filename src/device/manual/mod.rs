@@ -42,6 +42,8 @@ pub struct ManualSettings {
     pub free_points: Option<usize>,
     /// The share of the targets of which a measurement must have a point.
     pub least_found: f64,
+    /// Whether the plan itself may be given back as what was measured.
+    pub rehearsal: bool,
     /// By how much the probe radius in a file may differ from the plan's.
     pub probe_tolerance_mm: f64,
 }
@@ -320,7 +322,7 @@ fn measured(
     }
     let measurement = measurement(points, &[file], job, identity, done);
     if settings.free_points.is_none() {
-        check_measurement(path, plan, &measurement, settings.least_found)?;
+        check_measurement(path, plan, &measurement, settings.least_found, settings.rehearsal)?;
     }
     Ok(measurement)
 }
@@ -508,6 +510,7 @@ mod tests {
             content: Content::default(),
             free_points: None,
             least_found: 0.0,
+            rehearsal: false,
             probe_tolerance_mm: 0.1,
         };
         let mut machine = ManualMachine::new(MachineKind::Grinder, settings);

@@ -75,6 +75,7 @@ impl ManualWire {
             },
             free_points: making.free_points,
             least_found: making.least_found,
+            rehearsal: making.rehearsal,
             probe_tolerance_mm: self.probe_tolerance_mm,
         }
     }

@@ -35,3 +35,8 @@ pub fn readable_by_others(path: &Path) -> std::io::Result<Option<OpenToOthers>> 
 pub fn is_same_file(one: &Path, other: &Path) -> bool {
     here::is_same_file(one, other).unwrap_or(false)
 }
+
+/// Returns the name of a user whom the system knows by a number; none where it has no such list.
+pub fn user_name(uid: u32) -> Option<String> {
+    here::user_name(uid)
+}

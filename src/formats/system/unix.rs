@@ -23,6 +23,13 @@ pub(super) fn is_same_file(one: &Path, other: &Path) -> io::Result<bool> {
     Ok(identity(one)? == identity(other)?)
 }
 
+pub(super) fn user_name(uid: u32) -> Option<String> {
+    let users = fs::read_to_string("/etc/passwd").ok()?;
+    let fields = |line: &str| line.split(':').take(3).map(str::to_owned).collect::<Vec<_>>();
+    let mut users = users.lines().map(fields).filter(|fields| fields.len() == 3);
+    users.find(|user| user[2].parse() == Ok(uid) && !user[0].is_empty()).map(|user| user[0].clone())
+}
+
 /// Whether what is at a path, itself and not what it links to, is a socket.
 pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
     Ok(fs::symlink_metadata(path)?.file_type().is_socket())

@@ -43,7 +43,8 @@
   const base = `/runs/${encodeURIComponent(run)}`;
   let state = data.state;
   let heard = Date.now();
-  let isOld = null;
+  /** When the program of the run was heard last: by this page, or else by its record. */
+  let programHeard = Date.parse(state.last) || 0;
 
   const source = new EventSource(`${base}/events`);
   source.addEventListener("message", (message) => {
@@ -51,6 +52,7 @@
     for (const [id, html] of Object.entries(pieces)) replace(element(id), html);
     const before = state;
     [state, heard] = [now, Date.now()];
+    programHeard = state.lost ? Math.max(programHeard, Date.parse(state.last) || 0) : heard;
     shown(before);
   });
 
@@ -73,17 +75,20 @@
     if (names(before) !== names(state) || (before.touched || []).join() !== (state.touched || []).join()) chooseCycle();
   }
 
-  /** Says that what is shown is old, as soon as it is. */
+  /** Says that what is shown is old, as soon as it is, and since when. */
   function tellAge() {
     const serverGone = Date.now() - heard > 2500;
     const old = (serverGone && !state.over) || state.lost;
-    if (old && !isOld) isOld = new Date(heard);
-    if (!old) isOld = null;
     document.body.classList.toggle("old", old);
     const words = element("old");
     words.hidden = !old;
     if (old) {
-      const text = `${texts.noData} ${isOld.toLocaleTimeString()}. ${serverGone ? texts.pageGone : texts.programGone}`;
+      const last = new Date(state.lost ? programHeard : heard);
+      const isToday = last.toDateString() === new Date().toDateString();
+      const since = isToday ? last.toLocaleTimeString() : last.toLocaleString();
+      const told = last.getTime() ? `${texts.noData} ${since}. ` : "";
+      const programGone = state.machinesWithin ? texts.simulationGone : texts.programGone;
+      const text = told + (serverGone ? texts.pageGone : programGone);
       if (words.textContent !== text) words.textContent = text;
     }
   }
