@@ -58,6 +58,8 @@ enum Noise {
     Drift,
     Laplace,
     Student,
+    /// Two touches of a hundred are off by 10 to 100 times the scatter; those that are left out are made once more, with the same chance.
+    Outliers,
 }
 
 #[derive(Clone, Copy)]
@@ -93,6 +95,7 @@ fn lines() -> Vec<Line> {
         beside("drift", Noise::Drift),
         beside("laplace", Noise::Laplace),
         beside("student t3", Noise::Student),
+        beside("2 % outliers", Noise::Outliers),
         on("spiral", Pattern::Spiral),
         on("random", Pattern::Random),
         on("radial", Pattern::Radial),
@@ -156,9 +159,15 @@ fn told(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64
         let seen = placement.apply(std::array::from_fn(|k| on[k] + away * normal[k]));
         Point::from(std::array::from_fn::<f64, 3, _>(|k| seen[k] + noise[k]))
     };
-    let cloud: Vec<Point> = places.iter().zip(&noise).map(touch).collect();
+    let mut cloud: Vec<Point> = places.iter().zip(&noise).map(touch).collect();
     let options = Options { start: Start::Pose(pose(&placement)), ..Options::new(RADIUS_MM) };
-    let found = register(nominal, &cloud, &options).ok()?;
+    let mut found = register(nominal, &cloud, &options).ok()?;
+    if line.noise == Noise::Outliers {
+        let again = scatter(line.noise, places.len(), &mut rng);
+        let left_out = (0..places.len()).filter(|k| found.deviations[*k].status == PointStatus::Outlier);
+        left_out.for_each(|k| cloud[k] = touch((&places[k], &again[k])));
+        found = register(nominal, &cloud, &options).ok()?;
+    }
     let told = Form::of(&found, &Given::default()).ok()?;
     // The same part without scatter, where the registration found it: a tilt moves the feet, and over strong forms that is no effect of first order.
     let held = Options { start: Start::Pose(found.cmm_from_model), locked: [true; 6], ..options };
@@ -263,11 +272,16 @@ fn scatter(noise: Noise, count: usize, rng: &mut Rng) -> Vec<Vec3> {
     let mut last = [0.0; 3];
     let mut one = || -> Vec3 {
         let z = normals(rng, 12);
+        let off = match noise {
+            Noise::Outliers => Some(uniforms(rng, 2)).filter(|u| u[0] < 0.02).map_or(0.0, |u| 10.0 + 90.0 * u[1]),
+            _ => 0.0,
+        };
         let of = |k: usize| match noise {
             Noise::Normal => z[k],
             Noise::Drift => DRIFT * last[k] + (1.0 - DRIFT * DRIFT).sqrt() * z[k],
             // A normal number times the root of an exponential one, and one over that of chi-squared.
             Noise::Laplace => z[k] * ((z[k + 3].powi(2) + z[k + 6].powi(2)) / 2.0).sqrt(),
+            Noise::Outliers => z[k] + off * z[k + 3] / (z[3].powi(2) + z[4].powi(2) + z[5].powi(2)).sqrt(),
             Noise::Student => z[k] / (z[k + 3].powi(2) + z[k + 6].powi(2) + z[k + 9].powi(2)).sqrt(),
         };
         last = std::array::from_fn(of);

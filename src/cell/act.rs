@@ -297,6 +297,7 @@ impl Cell {
         (known.clear, known.said_clear) = (false, false);
         self.passes += u32::from(device == Device::Grinder);
         self.doubted = false;
+        self.begun[device as usize] = false;
         (self.progressed, self.pace) = (None, Duration::ZERO);
         self.push(Command::StartMachine { device, cycle: self.cycle });
     }
@@ -847,6 +848,7 @@ impl Cell {
 
     pub(super) fn reconciled(&mut self, device: Device, outcome: &Reconciliation) {
         let run = Phase::of(device, JobStep::Run);
+        self.begun[device as usize] |= matches!(outcome, Reconciliation::Running | Reconciliation::Held);
         match (outcome, self.state) {
             (Reconciliation::Running, Holding(_) | Suspending(_)) => {
                 self.go(self.same(run));
@@ -860,6 +862,10 @@ impl Cell {
                 self.go(Held(run));
             }
             (Reconciliation::Ended(result), _) => self.ended(device, *result),
+            // A machine that has forgotten its job says so too; a second start would go over what the first one ground.
+            (Reconciliation::NotStarted, _) if self.begun[device as usize] => {
+                self.unknown(device, "it says that this job never began, and it was seen at it");
+            }
             (Reconciliation::NotStarted, _) => {
                 self.not_started(device);
                 self.advance(Phase::of(device, JobStep::Send));

@@ -178,11 +178,13 @@ impl Cell {
                 self.advance(Phase::of(*device, JobStep::Start));
             }
             (Execute(p), Event::Started { device, .. }) if p.job() == Some((*device, JobStep::Start)) => {
+                self.begun[*device as usize] = true;
                 self.runs(Phase::of(*device, JobStep::Run));
             }
             (Holding(p) | Suspending(p), Event::Started { device, .. })
                 if p.job() == Some((*device, JobStep::Start)) =>
             {
+                self.begun[*device as usize] = true;
                 self.go(self.same(Phase::of(*device, JobStep::Run)));
                 self.push(Command::HoldMachine { device: *device });
             }

@@ -50,6 +50,8 @@ pub struct Cell {
     pub(super) passes: u32,
     /// What the grinder said of the pass of this cycle cannot be.
     pub(super) doubted: bool,
+    /// Whether each machine was seen at the job for which it was asked last: no answer of the machine undoes that.
+    pub(super) begun: [bool; 2],
     pub(super) known: [Known; 2],
     pub(super) causes: BTreeSet<Cause>,
     pub(super) raised: BTreeMap<AlarmId, Arc<Alarm>>,
@@ -89,6 +91,7 @@ impl Cell {
             cycle: 0,
             passes: 0,
             doubted: false,
+            begun: [false; 2],
             known: [Known::default(); 2],
             causes: BTreeSet::new(),
             raised: BTreeMap::new(),

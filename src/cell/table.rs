@@ -12,11 +12,11 @@ use super::event::{
 };
 use super::memory::Cell;
 use super::plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
-use super::state::{Device, Phase, State};
+use super::state::{Device, JobStep, Phase, State};
 
 /// The version of the table. A run is gone on with by a program of the version that began it only; a change of what follows from
 /// anything is another version.
-pub const TABLE_VERSION: u32 = 9;
+pub const TABLE_VERSION: u32 = 10;
 
 /// What an event does in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -101,7 +101,10 @@ fn key(cell: &Cell) -> impl Eq + Hash + use<> {
     let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
     let grinds = cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
     let by_hand = cell.known.iter().any(|known| known.manual);
-    let memory = (memory, cell.hold_due.is_some(), grinds && cell.doubted, cell.still, by_hand);
+    // Only what became of a job is asked by it.
+    let asked = cell.state().phase().and_then(Phase::job).filter(|(_, step)| *step == JobStep::Reconcile);
+    let begun = asked.map(|(device, _)| cell.begun[device as usize]);
+    let memory = (memory, cell.hold_due.is_some(), grinds && cell.doubted, cell.still, by_hand, begun);
     (cell.state, known, clear, cell.causes.is_empty(), memory, cell.plan.on_stall == Disposal::Hold)
 }
 

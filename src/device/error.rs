@@ -132,6 +132,9 @@ pub enum DeviceError {
          address, port and unit number in the cell file, and the base of the identity block; nothing was written to it"
     )]
     WrongDevice { machine: Arc<str>, expected: MachineKind, address: u16, required: u16, found: u16 },
+    /// The identity block of the map, found otherwise than it must be: bytes exchanged, or addresses off by one.
+    #[error("{machine} answers with the identity block of this map, {how}; nothing was written to it")]
+    OtherLayout { machine: Arc<str>, how: &'static str },
     /// The cell file names the machine as one kind, and it is the other.
     #[error(
         "{machine} is a {found}, and the cell file has it as the {expected}: the two addresses may be exchanged; nothing was written to it"
@@ -146,10 +149,13 @@ pub enum DeviceError {
     /// The machine speaks another version of the map.
     #[error("{machine} speaks version {found} of the register map, this program version {required}: {}; nothing was written to it", version_in_words(*.found, *.required))]
     WrongVersion { machine: Arc<str>, required: u16, found: u16 },
-    /// Another client has taken the machine.
+    /// The machine has another owner than this client, or none (0).
     #[error(
-        "{machine} belongs to another client now (owner {owner:08x}, this client is {ours:08x}): find out who commands it; one of the two \
-         must let it go"
+        "{machine} belongs to {}",
+        match .owner {
+            0 => "nobody now: it has forgotten its client, as after a restart of its application; look at the machine before it goes on".to_owned(),
+            owner => format!("another client now (owner {owner:08x}, this client is {ours:08x}): find out who commands it; one of the two must let it go"),
+        }
     )]
     Taken { machine: Arc<str>, ours: u32, owner: u32 },
     /// The machine works in inches (unit code 2), or does not say what it works in (1 is mm).

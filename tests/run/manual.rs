@@ -11,9 +11,10 @@ use regrind_sim::payload::{Feature, Map, Pass, Plan, PointRecord, Status, Target
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
 use serde::Deserialize;
+use serde_json::Value;
 use sha2::{Digest, Sha256};
 
-use crate::program::{PATIENCE, Running, changed, regrind, root, run};
+use crate::program::{PATIENCE, Running, changed, regrind, replaced, root, run};
 use crate::study::{grind, touch};
 
 const RADIUS_MM: f64 = 1.5;
@@ -141,6 +142,36 @@ fn hold_and_go_on(person: &Person, program: &mut Running) {
         assert!(began.elapsed() < PATIENCE, "{}", state());
     }
     person.does("resume");
+}
+
+/// At machines that people serve the plan comes back as the measurement: all of it is marked, and no other cell is rehearsed.
+#[test]
+fn a_rehearsal_is_marked_and_takes_the_plan_for_the_measurement() {
+    let home = tempfile::tempdir().unwrap();
+    let (recipe, _) = recipe(home.path());
+    let text = fs::read_to_string(&recipe).unwrap();
+    fs::write(&recipe, replaced(&text, "[cycle]\n", "[cycle]\nbegin_with = \"measure\"\n")).unwrap();
+    let (recipe, cell) = (recipe.display().to_string(), root().join("config/manual.toml").display().to_string());
+    let (code, _, refused) = run(&["run", &recipe, "--rehearsal"], home.path());
+    assert!(code == 2 && refused.contains("rehearsal"), "{refused}");
+
+    let begin = ["run", &*recipe, "--cell", &*cell, "--part", "SN-7", "--loaded", "--rehearsal"];
+    let mut program = Running::new(regrind(&begin, home.path()));
+    let folder = program.folder(home.path());
+    program.line("the prompt to measure", |line| line.contains("confirm done --file"));
+    let centre = |row: Vec<f64>| {
+        let at: Vec<String> = (1..4).map(|k| (row[k] + RADIUS_MM * row[k + 3]).to_string()).collect();
+        format!("{},{}\n", row[0], at.join(","))
+    };
+    let given_back: String = rows(&folder.join("cycle-1/plan.csv")).into_iter().map(centre).collect();
+    fs::write(home.path().join("rehearsal.csv"), format!("index,x,y,z\n{given_back}")).unwrap();
+    let (code, _, refused) = run(&["confirm", "done", "--file", "rehearsal.csv"], home.path());
+    assert_eq!(code, 0, "{refused}");
+    assert_eq!(program.end(), (0, String::new()), "{:?}", program.said);
+    let begun = Reader::open(&folder).unwrap().records(1).next().unwrap().unwrap().value();
+    assert_eq!((&begun["simulation"], &begun["content"]["rehearsal"]), (&Value::Bool(true), &Value::Bool(true)));
+    assert!(folder.to_str().unwrap().ends_with("-SIMULATION"));
+    assert!(fs::read_to_string(folder.join("report.html")).unwrap().contains(">SIMULATION<"));
 }
 
 #[test]

@@ -231,6 +231,9 @@ impl Unit {
     /// Reads an identity block, or says what it is that answers instead.
     pub(super) fn recognise(&self, words: &[u16]) -> Result<Identity, DeviceError> {
         let machine = self.name.clone();
+        if let Some(how) = layout_fault(words) {
+            return Err(DeviceError::OtherLayout { machine, how });
+        }
         for (at, required) in MAGIC.into_iter().enumerate() {
             if words[at] != required {
                 let address = self.map.identity.saturating_add(at as u16);
@@ -274,6 +277,35 @@ impl Unit {
             simulation: words[12] & SIMULATION != 0,
             silence_limit_s: Some(f64::from(silence_ms) / 1e3),
         })
+    }
+}
+
+/// How an identity block that is there lies otherwise than it must; none where it lies right, or where there is none.
+fn layout_fault(words: &[u16]) -> Option<&'static str> {
+    let begins = |from: usize, swap: fn(u16) -> u16| {
+        let due = [MAGIC[0], MAGIC[1], VERSION];
+        // One that begins a register early has lost its first word.
+        let (due, from) = if from == 0 { (&due[1..], 0) } else { (&due[..], from - 1) };
+        due.iter().enumerate().all(|(k, word)| words.get(from + k).is_some_and(|found| swap(*found) == *word))
+    };
+    let (as_it_is, swapped) = (|word: u16| word, u16::swap_bytes);
+    if begins(1, swapped) {
+        Some(
+            "with the two bytes of each register exchanged: have its server or the gateway send the high byte first; word_order orders words, and no \
+             bytes",
+        )
+    } else if begins(2, as_it_is) || begins(2, swapped) {
+        Some(
+            "one register later than the cell file says: its server counts from 1 where the protocol counts from 0; correct its addresses, or add 1 to \
+             each in the table `registers` of the cell file",
+        )
+    } else if begins(0, as_it_is) || begins(0, swapped) {
+        Some(
+            "one register earlier than the cell file says: its server takes 1 off each address; correct its addresses, or take 1 off each in the table \
+             `registers` of the cell file",
+        )
+    } else {
+        None
     }
 }
 
