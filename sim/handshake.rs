@@ -510,6 +510,17 @@ impl Handshake {
 
     /// Starts the application anew: it forgets all but which jobs it began, and a motion that was cut off is a fault.
     pub(crate) fn reboot(&mut self) {
+        let cut_off = self.lose_memory();
+        self.note(What::Rebooted { boot_id: self.boot_id });
+        self.enter(State::Idle);
+        if cut_off {
+            self.show(FAULT_OTHER);
+            self.enter(State::Faulted);
+        }
+    }
+
+    /// Takes another boot id and forgets all but which jobs it began; returns whether a motion was cut off.
+    fn lose_memory(&mut self) -> bool {
         let cut_off = std::mem::take(&mut self.running);
         if cut_off {
             self.body.retract();
@@ -522,17 +533,23 @@ impl Handshake {
                 break id;
             }
         };
-        self.note(What::Rebooted { boot_id: self.boot_id });
         self.slots = [None, None, None];
         (self.acknowledged, self.answer, self.owner, self.epoch) = (0, Answer::None, 0, 0);
         (self.begun_by, self.done, self.result) = (0, 0, 0);
         self.progress = Progress::default();
         self.silent = Duration::ZERO;
+        cut_off
+    }
+
+    /// Starts the application anew as one does that keeps its boot id and none of its jobs: it stands idle, as if it had never been asked.
+    pub(crate) fn forget(&mut self) {
+        let boot_id = self.boot_id;
+        self.lose_memory();
+        self.note(What::Forgot);
+        (self.boot_id, self.last_begun) = (boot_id, (0, 0));
+        self.begun.clear();
+        self.show(0);
         self.enter(State::Idle);
-        if cut_off {
-            self.show(FAULT_OTHER);
-            self.enter(State::Faulted);
-        }
     }
 
     pub(crate) fn note(&mut self, what: What) {

@@ -350,6 +350,16 @@ impl Machine {
     /// Starts the application anew, with another boot id and empty memory; a motion it cuts off is fault 30.
     pub fn reboot(&mut self) {
         self.handshake.reboot();
+        self.empty_memory();
+    }
+
+    /// The same by an application that keeps its boot id, forgets which jobs it began, and calls nothing a fault: a machine that lies.
+    pub fn forget(&mut self) {
+        self.handshake.forget();
+        self.empty_memory();
+    }
+
+    fn empty_memory(&mut self) {
         self.inbox = Inbox::default();
         (self.sync, self.beat, self.command, self.select) = ([0; 2], 0, [0; 20], [0; 2]);
         self.beat_block = [0; 3];

@@ -96,6 +96,8 @@ pub enum What {
         /// Its new boot id.
         boot_id: u32,
     },
+    /// The same under its old boot id, and it says that it never began what it was at.
+    Forgot,
 }
 
 /// How the owner's beats came while a job ran, from its START to its end.

@@ -433,7 +433,10 @@ async fn what_is_not_the_machine_is_told_apart_and_never_written_to() {
     assert!(matches!(e, DeviceError::OtherLayout { how, .. } if how.contains("bytes of each register")), "{e}");
     let e = refusal(|image| image.insert(0, 7)).await;
     assert!(matches!(e, DeviceError::OtherLayout { how, .. } if how.contains("one register later")), "{e}");
-    let e = refusal(|image| drop(image.remove(0))).await;
+    let e = refusal(|image| {
+        image.remove(0);
+    })
+    .await;
     assert!(matches!(e, DeviceError::OtherLayout { how, .. } if how.contains("one register earlier")), "{e}");
     let e = refusal(|image| image[2] = 1).await;
     assert!(matches!(e, DeviceError::WrongVersion { required: 2, found: 1, .. }), "{e}");

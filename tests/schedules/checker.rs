@@ -179,13 +179,32 @@ fn sound_record(evidence: &Evidence) -> Result<(Vec<Value>, bool), String> {
     Ok((records, verified.closed))
 }
 
+/// Whether a machine has forgotten a job that it began before anything on record had seen it at that: then nobody can know that it began.
+fn was_forgotten_unseen(evidence: &Evidence, began: &Moment) -> bool {
+    let of_it = || evidence.log.iter().filter(|moment| moment.machine == began.machine && moment.at >= began.at);
+    let forgot = of_it().find(|moment| matches!(moment.what, What::Forgot));
+    let Some(forgot) = forgot else { return false };
+    let seen = |w: &Recorded| {
+        let event = &w.payload;
+        let at_work = event["outcome"] == "running" || event["outcome"] == "held";
+        event["device"] == NAMES[began.machine]
+            && (event["event"] == "started"
+                || event["event"] == "progressed"
+                || event["event"] == "reconciled" && at_work)
+    };
+    // What was on its way when the machine forgot is told a moment later.
+    let next_start = of_it().find(|moment| moment.at > began.at && matches!(moment.what, What::Began { .. }));
+    let until = next_start.map_or(forgot.at + Duration::from_secs(1), |next| next.at);
+    !evidence.written.iter().any(|w| w.at >= began.at && w.at <= until && seen(w))
+}
+
 /// Every START moves a machine once, and every pass is begun once.
 fn began_once(evidence: &Evidence) -> Result<(), String> {
     let mut starts: BTreeSet<(usize, u32, u32, u16)> = BTreeSet::new();
     let mut passes = BTreeSet::new();
     for moment in &evidence.log {
         // A machine that was started anew counts anew.
-        if let What::Rebooted { .. } = moment.what {
+        if let What::Rebooted { .. } | What::Forgot = moment.what {
             starts.retain(|(machine, ..)| *machine != moment.machine);
         }
         let What::Began { start, job, cycle } = moment.what else { continue };
@@ -193,6 +212,9 @@ fn began_once(evidence: &Evidence) -> Result<(), String> {
         // Numbers come again where somebody has counted to their end; a START is told by its job too.
         if !starts.insert((moment.machine, start, job, cycle)) {
             return Err(format!("the {machine} carried out START {start} twice, again at {at:.3} s"));
+        }
+        if was_forgotten_unseen(evidence, moment) {
+            continue;
         }
         if moment.machine == 1 && !passes.insert((job, cycle)) {
             return Err(format!("pass {cycle} of job {job} was begun twice, again at {at:.3} s"));
@@ -227,7 +249,7 @@ fn map_of_record(evidence: &Evidence, records: &[Value]) -> Result<(), String> {
     for moment in &evidence.log {
         match &moment.what {
             What::Taken { kind, identity } => drop(in_force[moment.machine].insert(*kind, *identity)),
-            What::Rebooted { .. } => in_force[moment.machine].clear(),
+            What::Rebooted { .. } | What::Forgot => in_force[moment.machine].clear(),
             What::Began { job, cycle, .. } if *job == evidence.job => {
                 let bytes: Vec<u8> = in_force[moment.machine].values().flatten().copied().collect();
                 let digest = u64::from(crc32fast::hash(&bytes));
@@ -450,6 +472,9 @@ fn aborted_at_once(evidence: &Evidence) -> Result<(), String> {
 fn begun_is_not_intended_again(evidence: &Evidence) -> Result<(), String> {
     for began in evidence.log.iter().filter(|moment| moment.machine == 1) {
         let What::Began { start, job, cycle } = began.what else { continue };
+        if was_forgotten_unseen(evidence, began) {
+            continue;
+        }
         let again = evidence.written.iter().find(|w| {
             w.at > began.at
                 && is_intent(w, 1)
@@ -492,7 +517,10 @@ fn said_of_starts_is_so(evidence: &Evidence) -> Result<(), String> {
                     is_intent(w, machine) && w.at <= moment.at && w.payload["intent"]["start_sequence"] == start
                 })
             };
-            if is_it && !is_later() {
+            // A machine that has forgotten its job says that it never began; the record has what it said, and nothing follows from that.
+            let forgot = |then: &&Moment| matches!(then.what, What::Forgot) && then.machine == machine;
+            let is_a_lie = evidence.log.iter().filter(forgot).any(|then| moment.at <= then.at && then.at <= said.at);
+            if is_it && !is_later() && !is_a_lie {
                 let [at, told] = [moment.at, said.at].map(|at| evidence.seconds(at));
                 return Err(format!(
                     "the {} begins by START {start} at {at:.3} s, of which the record says at {told:.3} s that it was not taken",

@@ -29,7 +29,7 @@ mod wire;
 use std::panic::AssertUnwindSafe;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use schedule::{OTHER_WIRES, Schedule, Tally};
+use schedule::{FORGETFUL, OTHER_WIRES, Schedule, Tally};
 
 /// Seeds in which it shows that a guard is missing which hardly another one needs: a station asks again whether the loop lives (134); what
 /// waited behind a look that found the link lost is not sent, START (163) and RESUME (181); nothing may wait when a question is asked (264);
@@ -43,6 +43,8 @@ const KEPT_BY_OTHER_WIRES: &[u64] = &[1_000_075];
 /// How many a merge has time for.
 const SAMPLE: u64 = 40;
 const SAMPLE_BY_OTHER_WIRES: u64 = 10;
+
+const SAMPLE_OF_FORGETFUL: u64 = 24;
 
 /// Every so many effects the program dies once.
 const STRIDE: usize = 151;
@@ -101,6 +103,16 @@ fn no_schedule_breaks_a_promise() {
 fn nor_one_by_other_wires() {
     let seeds = KEPT_BY_OTHER_WIRES.iter().copied();
     let seeds = seeds.chain((0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_BY_OTHER_WIRES)).map(|k| OTHER_WIRES + k));
+    let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
+    let began = std::time::Instant::now();
+    let tally = run_all(&schedules);
+    println!("{} schedules in {:.1} s: {tally}", schedules.len(), began.elapsed().as_secs_f64());
+}
+
+/// Machines that start anew with their old boot id and say that their job never began.
+#[test]
+fn nor_one_in_which_a_machine_forgets_its_job() {
+    let seeds = (0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_FORGETFUL)).map(|k| FORGETFUL + k);
     let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
     let began = std::time::Instant::now();
     let tally = run_all(&schedules);

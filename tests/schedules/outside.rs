@@ -68,6 +68,7 @@ impl Outside {
             Act::EmergencyStop { machine } => self.stop_circuit(machine).await,
             Act::Freeze { machine, .. }
             | Act::Reboot { machine }
+            | Act::Forget { machine }
             | Act::Manual { machine, .. }
             | Act::Supplies { machine, .. }
             | Act::Stranger { machine, .. }
@@ -93,6 +94,7 @@ impl Outside {
                 of.with(|machine| machine.freeze(false));
             }
             Act::Reboot { .. } => of.with(|machine| machine.reboot()),
+            Act::Forget { .. } => of.with(|machine| machine.forget()),
             Act::Manual { lasts, .. } => {
                 of.with(|machine| machine.set_mode(Mode::Manual));
                 sleep(lasts).await;

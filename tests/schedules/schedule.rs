@@ -24,6 +24,9 @@ const MOST_DEATHS: usize = 3;
 /// From this seed on the machines are reached by other wires than Modbus.
 pub const OTHER_WIRES: u64 = 1_000_000;
 
+/// From this seed on a machine forgets its job.
+pub const FORGETFUL: u64 = 2_000_000;
+
 /// What goes wrong at a server of I++ DME: at which command, after how many of them, what.
 pub type DmeFault = (&'static str, u32, OfDme);
 
@@ -70,6 +73,10 @@ pub enum Act {
         lasts: Duration,
     },
     Reboot {
+        machine: usize,
+    },
+    /// Its application starts anew with its old boot id, and knows of no job that it began.
+    Forget {
         machine: usize,
     },
     Manual {
@@ -127,7 +134,23 @@ impl Act {
 impl Schedule {
     /// Draws the schedule of a seed. Every kind of fault is in some schedules and not in others, so that none hides another.
     pub fn drawn(seed: u64) -> Self {
-        if seed >= OTHER_WIRES { Self::by_other_wires(seed) } else { Self::by_modbus(seed) }
+        match seed {
+            FORGETFUL.. => Self::forgetful(seed),
+            OTHER_WIRES.. => Self::by_other_wires(seed),
+            _ => Self::by_modbus(seed),
+        }
+    }
+
+    /// What happens is drawn as for Modbus; once or twice a machine forgets the job that it is at, or has just done.
+    fn forgetful(seed: u64) -> Self {
+        let mut chance = StdRng::seed_from_u64(seed ^ 0x0F02_6E70);
+        let mut drawn = Self { speed: [400.0, 60.0, 10.0][chance.random_range(0..3)], ..Self::by_modbus(seed) };
+        for _ in 0..chance.random_range(1..3) {
+            let cue = [Cue::Begins, Cue::Begins, Cue::StartSent, Cue::Held, Cue::Complete][chance.random_range(0..5)];
+            let when = When::After(cue, chance.random_range(1..=4), any_length(&mut chance, 5.0));
+            drawn.acts.push((when, Act::Forget { machine: chance.random_range(0..2) }));
+        }
+        drawn
     }
 
     /// What happens is drawn as for Modbus; the wires, and what goes wrong at their servers, by dice of their own.
