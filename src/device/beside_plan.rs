@@ -186,12 +186,12 @@ mod tests {
         let given_back = measurement(plan.targets.iter().map(contacts).collect(), Coordinates::Contacts);
         assert_eq!(plan.check(&given_back), Err(BesidePlan::GivenBack));
         // To seven significant digits, as many programs print: five decimals beside six.
-        let significant = |v: f64| {
+        let significant = |v: f64| -> f64 {
             let decimals = 6 - v.abs().max(1e-6).log10().floor() as i32;
             (v * 10f64.powi(decimals)).round() / 10f64.powi(decimals)
         };
         let mut rounded = measured(&plan, 12, |_| 0.0, |k| k);
-        rounded.points.iter_mut().for_each(|point| point.at_mm = point.at_mm.map(|v| significant(v)));
+        rounded.points.iter_mut().for_each(|point| point.at_mm = point.at_mm.map(significant));
         assert_eq!(plan.check(&rounded), Err(BesidePlan::GivenBack));
         rounded.points[3].at_mm[2] += 2e-5;
         assert_eq!(plan.check(&rounded), Ok(()));

@@ -264,9 +264,8 @@ fn the_report_of_a_stopped_run_says_who_stopped_it_and_that_nothing_was_measured
     let cycles = page.cycles();
     assert!(cycles.len() == 1 && cycles[0].join("|").contains("not measured"), "{cycles:?}");
     // How much was ground is what the grinder told last.
-    let told = records_with(&folder, "done").into_iter().filter(|event| event["event"] == "progressed");
-    let last =
-        told.filter(|event| event["device"] == "grinder").next_back().expect("a pass that moves tells how far it is");
+    let mut told = records_with(&folder, "done").into_iter().filter(|event| event["event"] == "progressed");
+    let last = told.rfind(|event| event["device"] == "grinder").expect("a pass that moves tells how far it is");
     let share = 100.0 * last["done"].as_f64().unwrap() / last["total"].as_f64().unwrap();
     assert!(page.says(&format!("The pass of cycle 1 was stopped: {share:.0} % of its path had been ground")), "{last}");
 }
