@@ -281,7 +281,8 @@ fn scatter(noise: Noise, count: usize, rng: &mut Rng) -> Vec<Vec3> {
             Noise::Drift => DRIFT * last[k] + (1.0 - DRIFT * DRIFT).sqrt() * z[k],
             // A normal number times the root of an exponential one, and one over that of chi-squared.
             Noise::Laplace => z[k] * ((z[k + 3].powi(2) + z[k + 6].powi(2)) / 2.0).sqrt(),
-            Noise::Outliers => z[k] + off * z[k + 3] / (z[3].powi(2) + z[4].powi(2) + z[5].powi(2)).sqrt(),
+            // Along the way of the touch.
+            Noise::Outliers => z[k] + if k == 2 { off * z[3].signum() } else { 0.0 },
             Noise::Student => z[k] / (z[k + 3].powi(2) + z[k + 6].powi(2) + z[k + 9].powi(2)).sqrt(),
         };
         last = std::array::from_fn(of);

@@ -11,7 +11,7 @@ use regrind::device::{
 };
 use regrind::drive::recover::{in_short, look};
 use regrind::formats::{ResultFolder, try_writing};
-use regrind::journal::{free_bytes, utc};
+use regrind::journal::{free_bytes, is_open_to_all, utc};
 use regrind::recipe::Recipe;
 use regrind::report::run_summary;
 use regrind::setup;
@@ -85,6 +85,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let mut findings = vec![Finding::new("cell", Found::Good, format!("{} is a good cell file", path.display()))];
     findings.extend(cell.notes().into_iter().map(|note| Finding::new("cell", Found::Notice, note)));
     findings.extend([folder(runs), clock(runs), signing()]);
+    findings.extend(open_runs(runs));
     findings.extend(recipe.as_ref().map(|recipe| Finding::of("recipe", fits(recipe, &cell))));
     findings.extend(super::runtime()?.block_on(machines(&cell)));
     if *json {
@@ -124,6 +125,16 @@ fn folder(runs: &Path) -> Finding {
             format!("{} can be written, {} GB are free", runs.display(), free >> 30),
         ),
     }
+}
+
+/// Runs into which every user of the computer may look, as those of earlier versions: who reads a record can hold it up.
+fn open_runs(runs: &Path) -> Option<Finding> {
+    let open = control::folders(runs).filter(|folder| is_open_to_all(folder)).count();
+    let words = format!(
+        "{open} of them can be read by every user of this computer, and held up by them while they are on: `chmod o-rwx {}/*`",
+        runs.display()
+    );
+    (open > 0).then(|| Finding::new("runs", Found::Notice, words))
 }
 
 /// Whether the clock goes on from what was recorded.

@@ -167,7 +167,11 @@ pub(super) fn take(link: &Link, kind: MachineKind, run: &Path) -> Result<Option<
     let served = link.wire.dme().or(link.wire.rsh()).map(|(host, port)| format!("{kind} at {host}:{port}"));
     let heard = link.wire.hit_line().map(|line| format!("{kind} at {line}"));
     let taken = on_line.or(served).or(heard).map(|machine| MachineLock::take(&machine, &run));
-    taken.transpose().map_err(Failure::Machine)
+    let taken = taken.transpose().map_err(Failure::Machine)?;
+    for note in taken.iter().flat_map(MachineLock::notes) {
+        eprintln!("lock: {}", regrind::document::visible(note));
+    }
+    Ok(taken)
 }
 
 /// A number for this run as a client of its machines, the same whoever goes on with it.

@@ -19,6 +19,8 @@ use crate::journal::{Anchor, Artefact, Entry, Journal, JournalError, Kind};
 /// Resolves once what was given is on the disk, or is known never to come there.
 pub(super) type Ticket = oneshot::Receiver<Result<(), RecordFailure>>;
 
+/// Between two looks for the files of the record, where nothing is to be written.
+const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
 /// Between two tries to write what could not be written.
 const BETWEEN_TRIES: Duration = Duration::from_millis(100);
 /// How long the end of a run waits for its record.
@@ -36,6 +38,10 @@ pub trait Ledger: Send {
     fn intend(&mut self, entry: Entry) -> Result<u32, JournalError>;
     fn adopt_known(&mut self, found: Artefact, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError>;
     fn end(&mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError>;
+    /// Sees that the record lies where it is written.
+    fn is_in_place(&mut self) -> Result<(), JournalError> {
+        Ok(())
+    }
 }
 
 impl Ledger for Journal {
@@ -57,6 +63,9 @@ impl Ledger for Journal {
     fn end(&mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError> {
         self.end(mono_ns, cycle, ending)
     }
+    fn is_in_place(&mut self) -> Result<(), JournalError> {
+        self.is_in_place()
+    }
 }
 
 /// What is to be recorded.
@@ -68,6 +77,8 @@ enum Job {
     Outcome(u64, Box<Entry>),
     Adopt(Vec<Artefact>, Duration, u32),
     Close(Duration, u32, Value),
+    /// Sees that the record lies where it is written.
+    Look,
 }
 
 type Given = (Job, oneshot::Sender<Result<(), RecordFailure>>);
@@ -182,9 +193,16 @@ struct Scribe {
 
 impl Scribe {
     async fn keep(mut self, mut jobs: mpsc::UnboundedReceiver<Given>) {
-        while let Some((job, answer)) = jobs.recv().await {
-            // Who asked may have gone; the record stands all the same.
-            let _ = answer.send(self.until_written(&job).await.map_err(failure));
+        loop {
+            match tokio::time::timeout(BETWEEN_LOOKS, jobs.recv()).await {
+                Ok(Some((job, answer))) => {
+                    // Who asked may have gone; the record stands all the same.
+                    let _ = answer.send(self.until_written(&job).await.map_err(failure));
+                }
+                Ok(None) => return,
+                // A pass may go on for long without a word: its record is looked for all the same.
+                Err(_) => drop(self.until_written(&Job::Look).await),
+            }
         }
     }
 
@@ -197,12 +215,12 @@ impl Scribe {
                 Ok(()) => return Ok(()),
                 Err(error) if !error.may_pass() => {
                     // A gap among events and commands is the end of the record; a file that cannot come on it is none.
-                    self.broken_off |= !matches!(job, Job::Adopt(..));
+                    self.broken_off |= !matches!(job, Job::Adopt(..) | Job::Look);
                     return Err(error);
                 }
                 Err(error) if self.given_up.load(Ordering::Acquire) => {
                     // What follows would stand in the record as if nothing were missing before it.
-                    self.broken_off = true;
+                    self.broken_off |= !matches!(job, Job::Look);
                     return Err(error);
                 }
                 Err(error) => error,
@@ -235,6 +253,7 @@ impl Scribe {
             Job::Adopt(files, now, cycle) => {
                 files.iter().try_for_each(|file| journal.adopt_known(file.clone(), nanoseconds(*now), *cycle).map(drop))
             }
+            Job::Look => journal.is_in_place(),
             Job::Close(now, cycle, ending) => {
                 journal.end(nanoseconds(*now), *cycle, ending.clone())?;
                 self.journal = None;

@@ -34,6 +34,9 @@ pub enum JournalError {
         "{address}: another run has this machine: {holder}; wait for it, or stop it with `regrind stop` and its folder"
     )]
     MachineTaken { address: String, holder: String },
+    /// The folder in which the locks of machines lie is not what it should be: somebody else may have laid it there.
+    #[error("{path}: the locks of machines cannot lie in it: {what}; {remedy}")]
+    LockFolder { path: PathBuf, what: String, remedy: String },
     /// The run is over.
     #[error("{path}: the journal is closed, its run is over; begin another run")]
     Closed { path: PathBuf },
@@ -64,13 +67,20 @@ pub enum JournalError {
          which proves no author"
     )]
     NoAuthor { path: PathBuf, what: String },
+    /// The record lies no longer where it is written: what is written now would be lost with it.
+    #[error(
+        "{path}: this file of the record was deleted, renamed or exchanged while the run is on; put it back where it was, or stop the run"
+    )]
+    Gone { path: PathBuf },
     /// The file of an audit key holds none.
     #[error(
         "{path}: this is no audit key: {what}; bring it back from a copy, or put it away and make another with `regrind audit key`"
     )]
     Key { path: PathBuf, what: &'static str },
     /// Others may read the audit key.
-    #[error("{path}: others may read this audit key ({how}): {remedy}, and make another if somebody may have it")]
+    #[error(
+        "{path}: others may read or exchange this audit key ({how}): {remedy}, and make another if somebody may have it"
+    )]
     KeyIsOpen { path: PathBuf, how: String, remedy: String },
     /// A name that may lead out of the run folder.
     #[error("`{name}` cannot be the name of a file in a run folder; give a relative path of plain names")]
@@ -94,7 +104,7 @@ impl JournalError {
 
     /// Returns whether the same may be written later: the disk is full, busy or out of reach, and nothing is wrong with what is written.
     pub fn may_pass(&self) -> bool {
-        matches!(self, Self::DiskFull { .. } | Self::File { .. } | Self::Database { .. })
+        matches!(self, Self::DiskFull { .. } | Self::File { .. } | Self::Database { .. } | Self::Gone { .. })
     }
 
     /// Names what an operation of the system failed for.

@@ -131,6 +131,10 @@ impl AuditKey {
         if let Some(system::OpenToOthers { how, remedy }) = system::readable_by_others(path).map_err(&failed)? {
             return Err(JournalError::KeyIsOpen { path: path.to_owned(), how, remedy });
         }
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        if let Some(system::OpenToOthers { how, remedy }) = system::changeable_by_others(folder).map_err(&failed)? {
+            return Err(JournalError::KeyIsOpen { path: path.to_owned(), how, remedy });
+        }
         let text = String::from_utf8(fs::read(path).map_err(&failed)?).map_err(|_| broken("it is no text"))?;
         let value = |name: &str| {
             let line = text.lines().find_map(|line| line.strip_prefix(name)?.trim_start().strip_prefix('='))?;

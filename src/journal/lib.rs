@@ -42,7 +42,7 @@ pub use copy::{restore, restore_file};
 pub use error::JournalError;
 pub use key::{AuditKey, PublicKey};
 pub use machine::MachineLock;
-pub use open::free_bytes;
+pub use open::{free_bytes, is_open_to_all};
 pub use record::{Entry, Kind, Record, Records};
 pub use seal::SEALED_EVERY;
 pub use verify::{Against, Anchor, Verified, is_driven, verify, verify_against};

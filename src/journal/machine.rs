@@ -3,37 +3,48 @@
 //! The file of the lock also keeps the last epoch that a client of this computer had for the machine, so that the next one is higher
 //! whatever the clock says.
 
-use std::fs::{self, File, OpenOptions, TryLockError};
-use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::fs::{File, TryLockError};
+use std::io::{Read, Seek, Write};
+use std::path::Path;
 
 use super::error::JournalError;
 use super::held::HeldFile;
+use super::system::{LockFile, LockFolder};
 use super::{sha256_hex, system};
 
 /// A machine that no other run on this computer can take while this lives.
+///
+/// Two files are locked: one of the machine for every user, and one of this user's alone. Somebody else may have laid anything in the place of the first,
+/// or hold it: that is told, and keeps no run from its machine. The second keeps two runs of one user apart all the same.
 #[derive(Debug)]
 pub struct MachineLock {
     /// Held, not read.
-    _file: HeldFile,
+    _files: Vec<HeldFile>,
     /// Where the holder and the epoch stand.
-    told: PathBuf,
+    told: Vec<File>,
     holder: String,
     last_epoch: u32,
+    notes: Vec<String>,
 }
 
 const FOLDER: &str = "regrind-machines";
 /// Begins the line of the lock's file that keeps the epoch.
 const EPOCH: &str = "epoch ";
+/// Epochs are seconds of a clock in so many bits: whatever is higher was written by somebody else.
+const EPOCH_BITS: u32 = 31;
+/// Most bytes that are read of what is told beside a lock.
+const MOST_TOLD: u64 = 4096;
+/// So many files of a user are tried, where others have laid something in their place.
+const OWN_FILES: usize = 16;
 
 impl MachineLock {
     /// Takes a machine, by the address by which every run would call it, for a run.
     ///
     /// # Errors
-    /// A machine that another run has, which is named; no folder for locks that can be written.
+    /// A machine that another run has, which is named; no folder for locks that can be used.
     pub fn take(address: &str, run: &Path) -> Result<Self, JournalError> {
         // Where no place is for all, the user's own is better than none.
-        Self::take_in(&system::place_of_locks().unwrap_or_else(std::env::temp_dir).join(FOLDER), address, run)
+        Self::take_in(&system::place_of_locks().unwrap_or_else(std::env::temp_dir), address, run)
     }
 
     /// Returns an epoch for the client of these machines: higher than every one that a client of this computer had for any of them, and
@@ -45,54 +56,106 @@ impl MachineLock {
         epoch
     }
 
-    fn take_in(folder: &Path, address: &str, run: &Path) -> Result<Self, JournalError> {
-        let path = folder.join(format!("{}.lock", &sha256_hex(address.as_bytes())[..16]));
-        let file = opened(folder, &path)?;
-        let told = system::beside_lock(&path);
-        let file = match HeldFile::take(file) {
-            Ok(file) => file,
-            Err(TryLockError::WouldBlock) => {
-                let holder = fs::read_to_string(&told).unwrap_or_default();
-                let holder = holder.lines().next().unwrap_or_default().trim().to_owned();
-                return Err(JournalError::MachineTaken { address: address.to_owned(), holder });
-            }
-            Err(TryLockError::Error(error)) => return Err(JournalError::file(&path, "locking it")(error)),
-        };
-        let kept = fs::read_to_string(&told).unwrap_or_default();
-        let last_epoch = kept.lines().find_map(|line| line.strip_prefix(EPOCH)?.trim().parse().ok()).unwrap_or(0);
-        let holder = format!("{}, process {}", run.display(), std::process::id());
-        let lock = Self { _file: file, told, holder, last_epoch };
-        lock.write(last_epoch);
-        Ok(lock)
+    /// Returns what was found in the place of its files that should not be there: nothing of it was followed or believed.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
-    /// Who holds it is for people, and the machine itself tells of its last epoch too: a file that another user made and that cannot be
-    /// written locks all the same.
+    fn take_in(place: &Path, address: &str, run: &Path) -> Result<Self, JournalError> {
+        let path = place.join(FOLDER);
+        let folder = LockFolder::open(place, FOLDER).map_err(|bad| JournalError::LockFolder {
+            path: path.clone(),
+            what: bad.what,
+            remedy: bad.remedy,
+        })?;
+        let machine = &sha256_hex(address.as_bytes())[..16];
+        let mut lock = Self {
+            _files: Vec::new(),
+            told: Vec::new(),
+            holder: format!("{}, process {}", run.display(), std::process::id()),
+            last_epoch: 0,
+            notes: Vec::new(),
+        };
+        let name = format!("{machine}.lock");
+        match folder.file(&name) {
+            Ok(file) => lock.hold(file, &path.join(&name), address)?,
+            Err(what) => lock.note(&path.join(&name), &what),
+        }
+        let own = |k: usize| match k {
+            0 => format!("{machine}.{}.lock", LockFolder::own_mark()),
+            k => format!("{machine}.{}-{k}.lock", LockFolder::own_mark()),
+        };
+        for name in (0..OWN_FILES).map(own) {
+            match folder.file(&name) {
+                Ok(file) if file.is_trusted => {
+                    lock.hold(file, &path.join(&name), address)?;
+                    lock.write(lock.last_epoch);
+                    return Ok(lock);
+                }
+                Ok(_) => lock.note(&path.join(&name), "it is another user's"),
+                Err(what) => lock.note(&path.join(&name), &what),
+            }
+        }
+        let remedy = format!("have root empty {}", path.display());
+        Err(JournalError::LockFolder { path, what: lock.notes.join("; "), remedy })
+    }
+
+    /// Locks a file and takes the epoch that it keeps.
+    fn hold(&mut self, file: LockFile, path: &Path, address: &str) -> Result<(), JournalError> {
+        let stranger = file.stranger();
+        let told = file.told.as_ref().unwrap_or(&file.lock);
+        match HeldFile::take(again(&file.lock, path)?) {
+            Ok(held) => self._files.push(held),
+            Err(TryLockError::WouldBlock) => match stranger {
+                Some(who) => {
+                    self.note(path, &format!("{who} holds it, who did not make it"));
+                    return Ok(());
+                }
+                None => {
+                    let holder = text_of(told).lines().next().unwrap_or_default().trim().to_owned();
+                    return Err(JournalError::MachineTaken { address: address.to_owned(), holder });
+                }
+            },
+            Err(TryLockError::Error(error)) => return Err(JournalError::file(path, "locking it")(error)),
+        }
+        let kept = text_of(told);
+        let epochs = kept.lines().filter_map(|line| line.strip_prefix(EPOCH));
+        for text in epochs {
+            match text.trim().parse::<u32>() {
+                Ok(epoch) if epoch < (1 << EPOCH_BITS) - 1 => self.last_epoch = self.last_epoch.max(epoch),
+                _ => self.note(path, &format!("its epoch `{text}` is none that a client of this computer had")),
+            }
+        }
+        self.told.extend(file.told.filter(|_| file.is_trusted));
+        Ok(())
+    }
+
+    fn note(&mut self, path: &Path, what: &str) {
+        self.notes.push(format!("{}: {what}; it was left alone", path.display()));
+    }
+
+    /// Who holds it is for people, and the machine itself tells of its last epoch too: where it cannot be written the lock is one all the same.
     fn write(&self, epoch: u32) {
         let text = format!("{}\n{EPOCH}{epoch}\n", self.holder);
-        // Never empty in between: what was kept outlives a program that is killed here.
-        let _ = OpenOptions::new().write(true).create(true).truncate(false).open(&self.told).and_then(|mut file| {
-            file.write_all(text.as_bytes())?;
-            file.set_len(text.len() as u64)
-        });
+        for mut file in &self.told {
+            // Never empty in between: what was kept outlives a program that is killed here.
+            let _ = file
+                .rewind()
+                .and_then(|()| file.write_all(text.as_bytes()))
+                .and_then(|()| file.set_len(text.len() as u64));
+        }
     }
 }
 
-/// Opens the file that is locked; every user of the computer may.
-fn opened(folder: &Path, path: &PathBuf) -> Result<File, JournalError> {
-    if !folder.is_dir() {
-        // Another run may make it at the same moment.
-        let made = fs::create_dir_all(folder);
-        if !folder.is_dir() {
-            made.map_err(JournalError::file(folder, "creating the folder"))?;
-        }
-        system::open_folder_to_all(folder);
-    }
-    if !path.exists() {
-        OpenOptions::new().append(true).create(true).open(path).map_err(JournalError::file(path, "creating it"))?;
-        system::open_file_to_all(path);
-    }
-    File::open(path).map_err(JournalError::file(path, "opening it"))
+/// Another handle of a file, for its lock.
+fn again(file: &File, path: &Path) -> Result<File, JournalError> {
+    file.try_clone().map_err(JournalError::file(path, "opening it"))
+}
+
+fn text_of(mut file: &File) -> String {
+    let mut bytes = Vec::new();
+    let _ = file.rewind().and_then(|()| file.take(MOST_TOLD).read_to_end(&mut bytes));
+    String::from_utf8_lossy(&bytes).into_owned()
 }
 
 #[cfg(test)]
@@ -102,8 +165,9 @@ mod tests {
     #[test]
     fn a_machine_is_taken_once_and_who_has_it_is_named() {
         let folder = tempfile::tempdir().unwrap();
-        let take = |address, run| MachineLock::take_in(&folder.path().join("locks"), address, Path::new(run));
+        let take = |address, run| MachineLock::take_in(folder.path(), address, Path::new(run));
         let first = take("grinder at 10.0.0.6:502, unit 1", "runs/a").unwrap();
+        assert_eq!(first.notes(), [""; 0]);
         take("grinder at 10.0.0.7:502, unit 1", "runs/b").unwrap();
         let refused = take("grinder at 10.0.0.6:502, unit 1", "runs/b").unwrap_err().to_string();
         assert!(refused.contains("runs/a, process ") && refused.contains("10.0.0.6"), "{refused}");
@@ -128,5 +192,153 @@ mod tests {
         assert_eq!(epoch(&[], 7), 7);
         drop(take("cmm"));
         assert_eq!(epoch(&["cmm"], 0), 1003, "who only had it has kept it");
+    }
+}
+
+/// Somebody else was there first.
+#[cfg(all(test, unix))]
+mod strangers {
+    use std::fs;
+    use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
+    use std::path::PathBuf;
+
+    use super::*;
+
+    const ADDRESS: &str = "grinder at 10.0.0.6:502, unit 1";
+
+    fn name() -> String {
+        format!("{}.lock", &sha256_hex(ADDRESS.as_bytes())[..16])
+    }
+
+    /// A place for all with the folder of the locks in it, and a file of the owner that nobody else may have changed.
+    fn place() -> (tempfile::TempDir, PathBuf, PathBuf) {
+        let place = tempfile::tempdir().unwrap();
+        let (folder, precious) = (place.path().join(FOLDER), place.path().join("precious"));
+        fs::create_dir(&folder).unwrap();
+        fs::set_permissions(&folder, fs::Permissions::from_mode(0o1777)).unwrap();
+        fs::write(&precious, "precious").unwrap();
+        fs::set_permissions(&precious, fs::Permissions::from_mode(0o600)).unwrap();
+        (place, folder, precious)
+    }
+
+    /// Takes the machine, sees that a second run of this user does not, and that nothing of what lay there was touched.
+    fn taken(place: &Path, precious: &Path) -> MachineLock {
+        let take = || MachineLock::take_in(place, ADDRESS, Path::new("runs/a"));
+        let lock = take().unwrap();
+        assert!(matches!(take(), Err(JournalError::MachineTaken { .. })));
+        assert_eq!(MachineLock::epoch([&lock], 1000), 1000);
+        assert_eq!(fs::read_to_string(precious).unwrap(), "precious");
+        assert_eq!(fs::metadata(precious).unwrap().mode() & 0o777, 0o600);
+        lock
+    }
+
+    #[test]
+    fn a_link_another_name_a_pipe_or_a_large_file_in_place_of_a_lock_is_left_alone() {
+        type Lays = fn(&Path, &Path);
+        let lays: [(&str, Lays); 5] = [
+            ("it is a link", |lock, precious| symlink(precious, lock).unwrap()),
+            ("it is a link", |lock, _| symlink("/nowhere/at all", lock).unwrap()),
+            ("2 names", |lock, precious| fs::hard_link(precious, lock).unwrap()),
+            ("it is no file", |lock, _| {
+                assert!(std::process::Command::new("mkfifo").arg(lock).status().unwrap().success());
+            }),
+            ("bytes", |lock, _| fs::File::create(lock).unwrap().set_len(20 << 30).unwrap()),
+        ];
+        for (what, lay) in lays {
+            let (place, folder, precious) = place();
+            lay(&folder.join(name()), &precious);
+            let lock = taken(place.path(), &precious);
+            assert!(lock.notes().len() == 1 && lock.notes()[0].contains(what), "{what}: {:?}", lock.notes());
+        }
+        // The file of this user alone, too.
+        let (place, folder, precious) = place();
+        let own = format!("{}.{}.lock", &sha256_hex(ADDRESS.as_bytes())[..16], LockFolder::own_mark());
+        symlink(&precious, folder.join(own)).unwrap();
+        assert_eq!(taken(place.path(), &precious).notes().len(), 1);
+    }
+
+    #[test]
+    fn a_folder_that_is_a_link_or_lets_others_take_files_away_is_refused_with_what_to_do() {
+        let refused = |lay: &dyn Fn(&Path, &Path)| {
+            let (place, folder, precious) = place();
+            lay(&folder, place.path());
+            let refused = MachineLock::take_in(place.path(), ADDRESS, Path::new("runs/a")).unwrap_err();
+            assert!(refused.to_string().contains("install -d -o root"), "{refused}");
+            assert_eq!(fs::read_to_string(precious).unwrap(), "precious");
+            refused.to_string()
+        };
+        let elsewhere = |folder: &Path, place: &Path| {
+            fs::remove_dir(folder).unwrap();
+            fs::create_dir(place.join("elsewhere")).unwrap();
+            symlink(place.join("elsewhere"), folder).unwrap();
+        };
+        assert!(refused(&elsewhere).contains("a link or a file"));
+        let a_file = |folder: &Path, _: &Path| {
+            fs::remove_dir(folder).unwrap();
+            fs::write(folder, "").unwrap();
+        };
+        assert!(refused(&a_file).contains("a link or a file"));
+        let open = |folder: &Path, _: &Path| fs::set_permissions(folder, fs::Permissions::from_mode(0o777)).unwrap();
+        assert!(refused(&open).contains("its mode is 777"));
+        // Only root can give a folder away.
+        if rustix::process::geteuid().is_root() {
+            let given = |folder: &Path, _: &Path| std::os::unix::fs::chown(folder, Some(4711), None).unwrap();
+            assert!(refused(&given).contains("4711"));
+        }
+    }
+
+    #[test]
+    fn what_was_there_keeps_its_mode_and_what_is_made_is_for_all() {
+        let (place, folder, _) = place();
+        fs::set_permissions(&folder, fs::Permissions::from_mode(0o700)).unwrap();
+        drop(MachineLock::take_in(place.path(), ADDRESS, Path::new("runs/a")).unwrap());
+        assert_eq!(fs::metadata(&folder).unwrap().mode() & 0o7777, 0o700);
+        let fresh = tempfile::tempdir().unwrap();
+        drop(MachineLock::take_in(fresh.path(), ADDRESS, Path::new("runs/a")).unwrap());
+        let folder = fresh.path().join(FOLDER);
+        assert_eq!(fs::metadata(&folder).unwrap().mode() & 0o7777, 0o1777);
+        assert_eq!(fs::metadata(folder.join(name())).unwrap().mode() & 0o777, 0o666);
+    }
+
+    #[test]
+    fn an_epoch_that_no_client_had_is_told_and_not_outbid() {
+        for poison in ["4294967295", "2147483647", "-1", "x"] {
+            let (place, folder, precious) = place();
+            fs::write(folder.join(name()), format!("somebody\nepoch 900\nepoch {poison}\n")).unwrap();
+            let lock = taken(place.path(), &precious);
+            assert!(lock.notes().len() == 1 && lock.notes()[0].contains(poison), "{:?}", lock.notes());
+            drop(lock);
+            let lock = taken_again(place.path());
+            assert_eq!(MachineLock::epoch([&lock], 0), 1001, "what was lower is believed, and the poison is gone");
+        }
+    }
+
+    #[test]
+    fn a_lock_that_another_user_holds_is_told_with_his_process_and_keeps_no_run_back() {
+        use std::io::{BufRead, BufReader};
+        use std::os::unix::process::CommandExt;
+        use std::process::{Command, Stdio};
+        // Only root can be another user.
+        if !rustix::process::geteuid().is_root() {
+            return;
+        }
+        let (place, folder, precious) = place();
+        fs::set_permissions(place.path(), fs::Permissions::from_mode(0o755)).unwrap();
+        drop(taken_again(place.path()));
+        let script = "echo held; cat";
+        let mut stranger = Command::new("flock");
+        stranger.arg(folder.join(name())).args(["sh", "-c", script]).uid(65534).gid(65534);
+        let mut stranger = stranger.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+        let mut said = String::new();
+        BufReader::new(stranger.stdout.take().unwrap()).read_line(&mut said).unwrap();
+        assert_eq!(said, "held\n");
+        let lock = taken(place.path(), &precious);
+        assert!(lock.notes().len() == 1 && lock.notes()[0].contains("number 65534"), "{:?}", lock.notes());
+        drop(stranger.stdin.take());
+        stranger.wait().unwrap();
+    }
+
+    fn taken_again(place: &Path) -> MachineLock {
+        MachineLock::take_in(place, ADDRESS, Path::new("runs/b")).unwrap()
     }
 }

@@ -207,6 +207,11 @@ pub(super) fn is_free(folder: &Path) -> Result<bool, JournalError> {
     }
 }
 
+/// Whether every user of this computer may look into the folder of a run: a reader can hold its record up.
+pub fn is_open_to_all(folder: &Path) -> bool {
+    system::is_open_to_all(folder)
+}
+
 /// Returns how much room is left for the user of this program on the disk of a folder, or of the nearest one above it that is there.
 ///
 /// # Errors

@@ -1,7 +1,7 @@
 //! The one writer of a journal.
 
 use std::collections::BTreeMap;
-use std::fs::{self, OpenOptions, TryLockError};
+use std::fs::{OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -17,7 +17,7 @@ use super::key::AuditKey;
 use super::record::{Entry, Kind, Record, Records, signed, whole};
 use super::seal::{SEALED_EVERY, Seal};
 use super::verify::{Anchor, read_anchor};
-use super::{ANCHOR, DATABASE, LOCK, open};
+use super::{ANCHOR, DATABASE, LOCK, open, system};
 
 /// What the first record tells.
 #[derive(Clone, Debug, PartialEq)]
@@ -59,6 +59,8 @@ pub struct Journal {
     /// A record whose write failed: only the database knows whether it stands.
     doubtful: Option<Record>,
     artefacts: BTreeMap<String, String>,
+    /// The files that are written, as they were when they were seen first.
+    files: BTreeMap<PathBuf, system::FileIdentity>,
 }
 
 /// The end of the chain.
@@ -97,7 +99,7 @@ impl Journal {
         if !open::is_free(&folder)? {
             return Err(JournalError::Exists { path: folder });
         }
-        fs::create_dir_all(&folder).map_err(JournalError::file(&folder, "creating the folder"))?;
+        system::create_run_folder(&folder).map_err(JournalError::file(&folder, "creating the folder"))?;
         let lock = lock(&folder)?;
         let connection = open::create(&folder)?;
         open::sync_folder(&folder)?;
@@ -117,6 +119,7 @@ impl Journal {
             anchored: 0,
             doubtful: None,
             artefacts: BTreeMap::new(),
+            files: BTreeMap::new(),
         };
         let payload = json!({
             "run": journal.run, "simulation": simulation, "first_command_id": first_command_id, "content": content,
@@ -163,6 +166,7 @@ impl Journal {
             anchored: 0,
             doubtful: None,
             artefacts: artefacts_of(&connection, &folder)?,
+            files: BTreeMap::new(),
             connection,
             folder,
             _lock: lock,
@@ -183,6 +187,27 @@ impl Journal {
     /// Returns the serial number of the part.
     pub fn part(&self) -> &str {
         &self.part
+    }
+
+    /// Sees that the files of the record lie where they are written. A file that has lost its name takes everything and keeps nothing.
+    ///
+    /// # Errors
+    /// [`JournalError::Gone`] with the file that is not there any more, or is another one.
+    pub fn is_in_place(&mut self) -> Result<(), JournalError> {
+        for name in [DATABASE.to_owned(), format!("{DATABASE}-wal"), LOCK.to_owned()] {
+            let path = self.folder.join(name);
+            match (system::identity(&path), self.files.get(&path)) {
+                (Ok(found), Some(known)) if found == *known => {}
+                (Ok(found), None) => drop(self.files.insert(path, found)),
+                // The log is made with the first record.
+                (Err(error), None) if error.kind() == std::io::ErrorKind::NotFound => {}
+                (Err(error), _) if error.kind() != std::io::ErrorKind::NotFound => {
+                    return Err(JournalError::file(&path, "looking for it")(error));
+                }
+                _ => return Err(JournalError::Gone { path }),
+            }
+        }
+        Ok(())
     }
 
     /// Returns the number of the last record.
@@ -367,6 +392,7 @@ impl Journal {
         if self.tail.closed && entry.kind != Kind::Seal {
             return Err(JournalError::Closed { path: self.folder.clone() });
         }
+        self.is_in_place()?;
         let record = self.record_of(entry);
         if let Err(error) = self.write(&record) {
             self.doubtful = Some(record);

@@ -17,6 +17,7 @@ mod dialects;
 mod faults;
 mod files;
 mod first_touches;
+mod gone;
 mod heartbeats;
 mod height_maps;
 mod hit_lines;

@@ -21,6 +21,21 @@ pub(crate) fn create_owners_folder(folder: &Path) -> io::Result<()> {
     }
 }
 
+/// Makes the folder of a run; who may look into it comes down from the folder above.
+pub(crate) fn create_run_folder(folder: &Path) -> io::Result<()> {
+    std::fs::create_dir_all(folder)
+}
+
+/// What a folder hands down is for who set it up.
+pub(crate) fn is_open_to_all(_: &Path) -> bool {
+    false
+}
+
+/// As for the folder of a run.
+pub(crate) fn changeable_by_others(_: &Path) -> io::Result<Option<OpenToOthers>> {
+    Ok(None)
+}
+
 /// Makes a file that nobody but its owner may read, for writing.
 pub(crate) fn create_owners_file(path: &Path) -> io::Result<File> {
     regrind_windows::create_owners_file(path)
@@ -47,6 +62,14 @@ pub(crate) fn sync_folder(_: &Path) -> io::Result<()> {
     Ok(())
 }
 
+/// A file that is open there is neither deleted nor renamed: that it is there is enough.
+pub(crate) type FileIdentity = ();
+
+/// Returns whether a file is at a path.
+pub(crate) fn identity(path: &Path) -> io::Result<FileIdentity> {
+    std::fs::metadata(path).map(drop)
+}
+
 /// How much room is left for the user of this program on the disk of a folder.
 pub(crate) fn free_bytes(folder: &Path) -> io::Result<u64> {
     regrind_windows::free_bytes(folder)
@@ -57,13 +80,62 @@ pub(crate) fn place_of_locks() -> Option<PathBuf> {
     std::env::var_os("ProgramData").map(PathBuf::from).filter(|place| place.is_dir())
 }
 
-/// Who may do what comes down from the place of the locks.
-pub(crate) fn open_folder_to_all(_: &Path) {}
+/// The folder in which the locks of this computer lie; who may do what in it comes down from its place.
+pub(crate) struct LockFolder(PathBuf);
 
-/// As for the folder.
-pub(crate) fn open_file_to_all(_: &Path) {}
+/// Why a folder for locks is not used.
+pub(crate) struct BadFolder {
+    pub(crate) what: String,
+    pub(crate) remedy: String,
+}
 
-/// The file that tells of who holds a lock: one beside it, for nobody can read the locked one.
-pub(crate) fn beside_lock(lock: &Path) -> PathBuf {
-    lock.with_extension("txt")
+impl LockFolder {
+    /// Opens it where it lies, and makes it where it is not there.
+    pub(crate) fn open(place: &Path, name: &str) -> Result<Self, BadFolder> {
+        let folder = place.join(name);
+        let made = std::fs::create_dir_all(&folder);
+        // Another run may make it at the same moment.
+        match made {
+            Err(error) if !folder.is_dir() => {
+                let remedy = format!("see that {} can be written", place.display());
+                Err(BadFolder { what: format!("making it: {error}"), remedy })
+            }
+            _ => Ok(Self(folder)),
+        }
+    }
+
+    /// Opens a file in it, made where it is not there.
+    pub(crate) fn file(&self, name: &str) -> Result<LockFile, String> {
+        let path = self.0.join(name);
+        let words = |error: io::Error| error.to_string();
+        if !path.exists() {
+            OpenOptions::new().append(true).create(true).open(&path).map_err(words)?;
+        }
+        let lock = File::open(&path).map_err(words)?;
+        // Nobody can read the locked one: what is told stands beside it.
+        let told = path.with_extension("txt");
+        let told = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(told).ok();
+        Ok(LockFile { lock, told, is_trusted: true })
+    }
+
+    /// Tells the files of this user from those of others.
+    pub(crate) fn own_mark() -> String {
+        regrind_windows::own_name().unwrap_or_default().chars().filter(char::is_ascii_alphanumeric).collect()
+    }
+}
+
+/// A file to be locked.
+pub(crate) struct LockFile {
+    pub(crate) lock: File,
+    /// Where who holds it and the last epoch stand; none where that may not be written.
+    pub(crate) told: Option<File>,
+    /// Whether nobody but this user and administrators can have written it first.
+    pub(crate) is_trusted: bool,
+}
+
+impl LockFile {
+    /// Who holds a lock is not told there.
+    pub(crate) fn stranger(&self) -> Option<String> {
+        None
+    }
 }
