@@ -53,6 +53,9 @@ impl Cell {
             self.withdraw(AlarmId::ProgressStands);
         }
         self.state = state;
+        if let Some((device, JobStep::Run)) = state.phase().and_then(Phase::job) {
+            self.begun[device as usize] = true;
+        }
         self.deadline = self.limit().map(|limit| self.now.saturating_add(limit));
         match (state, state.phase().and_then(Phase::job)) {
             (Holding(_) | Suspending(_), Some((_, JobStep::Run))) => {
@@ -848,7 +851,7 @@ impl Cell {
 
     pub(super) fn reconciled(&mut self, device: Device, outcome: &Reconciliation) {
         let run = Phase::of(device, JobStep::Run);
-        self.begun[device as usize] |= matches!(outcome, Reconciliation::Running | Reconciliation::Held);
+        self.begun[device as usize] |= !matches!(outcome, Reconciliation::NotStarted | Reconciliation::Unknown(_));
         match (outcome, self.state) {
             (Reconciliation::Running, Holding(_) | Suspending(_)) => {
                 self.go(self.same(run));

@@ -35,7 +35,11 @@ impl Cell {
             return Ok(());
         }
         self.now = now;
+        let asked = self.state.phase().and_then(Phase::job);
         let answered = self.foreign(event).map_or_else(|| self.take(event), |why| Err(Some(why)));
+        if let (Some((device, JobStep::Start | JobStep::Run | JobStep::Reconcile)), Ok(())) = (asked, &answered) {
+            self.begun[device as usize] |= shows_at_work(event, device);
+        }
         if self.state.is_end() {
             self.deadline = None;
         }
@@ -178,16 +182,16 @@ impl Cell {
                 self.advance(Phase::of(*device, JobStep::Start));
             }
             (Execute(p), Event::Started { device, .. }) if p.job() == Some((*device, JobStep::Start)) => {
-                self.begun[*device as usize] = true;
                 self.runs(Phase::of(*device, JobStep::Run));
             }
             (Holding(p) | Suspending(p), Event::Started { device, .. })
                 if p.job() == Some((*device, JobStep::Start)) =>
             {
-                self.begun[*device as usize] = true;
                 self.go(self.same(Phase::of(*device, JobStep::Run)));
                 self.push(Command::HoldMachine { device: *device });
             }
+            // Late, and asked for meanwhile: that it was taken is known all the same.
+            (state, Event::Started { device, .. }) if reconciling(state) == Some(*device) => {}
             (Execute(p) | Holding(p) | Suspending(p), Event::StartUnknown { device, .. })
                 if p.job() == Some((*device, JobStep::Start)) =>
             {
@@ -293,5 +297,17 @@ impl Cell {
             _ => return Err(None),
         }
         Ok(())
+    }
+}
+
+/// Whether an event shows a machine at the job that it was asked for, or at its end.
+fn shows_at_work(event: &Event, of: Device) -> bool {
+    match event {
+        Event::Started { device, .. }
+        | Event::Progressed { device, .. }
+        | Event::MachineHeld { device }
+        | Event::MachineResumed { device }
+        | Event::Ended { device, .. } => *device == of,
+        _ => false,
     }
 }

@@ -97,7 +97,9 @@ impl Look {
             // Folders in which nothing stands are no runs; one that cannot be read is one of which nothing is known.
             match folders.iter().find(|run| run.join(DATABASE).is_file() && !self.known.contains_key(*run)) {
                 Some(run) if is_driven(run) => self.does_not_answer(run.clone()),
-                Some(run) => (self.told.now, self.silent) = (Now::Gone { run: name(run) }, None),
+                Some(run) => {
+                    (self.told.now, self.silent) = (Now::Gone { run: name(run), machines_within: false }, None)
+                }
                 None => (self.told.now, self.silent) = (Now::NoRun, None),
             }
             return;
@@ -114,9 +116,7 @@ impl Look {
                 self.told = Told { now: Now::NoRun, last: Some(Ended { run: name(run), verdict, accepted }) };
             }
             Ok(_) if is_driven(run) => return self.does_not_answer(run.clone()),
-            // Its machines have gone with it.
-            Ok(RunSummary { machines_within: true, .. }) => self.told.now = Now::NoRun,
-            Ok(_) => self.told.now = Now::Gone { run: name(run) },
+            Ok(RunSummary { machines_within, .. }) => self.told.now = Now::Gone { run: name(run), machines_within },
             // It cannot be read just now.
             Err(_) => return,
         }

@@ -514,7 +514,25 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
     const HEIGHTS: [&str; 10] =
         ["z", "height", "heights", "höhe", "höhen", "hoehe", "sag", "hauteur", "hauteurs", "altura"];
     const NO_LENGTHS: [&str; 6] = ["wave", "waves", "fringe", "fringes", "lambda", "radians"];
-    /// A letter or two beside a name may be another name.
+    const BETWEEN: [&str; 6] = ["is", "are", "in", "en", "given", "unit"];
+    /// Words before it that make it another height than those of the points.
+    const OTHER: [&str; 14] = [
+        "step",
+        "peak",
+        "safe",
+        "clearance",
+        "mean",
+        "max",
+        "maximum",
+        "min",
+        "minimum",
+        "largest",
+        "least",
+        "range",
+        "noise",
+        "tolerances",
+    ];
+    /// A letter beside a name may be another name.
     const SHORTEST: usize = 2;
     let mut words: Vec<Range<usize>> = Vec::new();
     for (at, c) in text.char_indices().filter(|(_, c)| c.is_alphanumeric()) {
@@ -524,12 +542,23 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
         }
     }
     let word = |k: usize| words.get(k).map_or("", |word| &text[word.clone()]);
-    let is_one = |word: &str| is_unit(word) || NO_LENGTHS.contains(&word);
-    (0..words.len()).filter(|k| HEIGHTS.contains(&word(*k))).find_map(|k| match (word(k + 1), word(k + 2)) {
-        ("in" | "en" | "is" | "are", unit) if is_one(unit) => Some(words[k + 2].clone()),
-        (unit, _) if is_one(unit) && unit.chars().count() >= SHORTEST && unit != "in" => Some(words[k + 1].clone()),
-        _ => None,
-    })
+    let is_other = |word: &str| OTHER.contains(&word) || (BESIDE_AXES.contains(&word) && word.chars().count() > 1);
+    let unit_behind = |height: usize| {
+        let mut at = height + 1;
+        // "heights are in um"; a lone "in" at the end is the inch.
+        while BETWEEN.contains(&word(at)) && at + 1 < words.len() {
+            at += 1;
+        }
+        let unit = word(at);
+        let is_one = is_unit(unit) || NO_LENGTHS.contains(&unit);
+        let is_long = unit.chars().count() >= SHORTEST && (unit != "in" || at > height + 1);
+        // "mil-spec" names no unit, and "M coordinates" no metre.
+        let goes_on = text[words.get(at)?.end..].starts_with('-');
+        let is_last = at + 1 == words.len();
+        (is_one && !goes_on && (is_long || (at > height + 1 && is_last))).then(|| words[at].clone())
+    };
+    let heights = (0..words.len()).filter(|&k| HEIGHTS.contains(&word(k)));
+    heights.filter(|&k| !(k.saturating_sub(2)..k).any(|before| is_other(word(before)))).find_map(unit_behind)
 }
 
 /// Returns the unit behind a word such as "units:", if one stands there; behind a mark whatever stands there, for it shall be one.
@@ -551,11 +580,17 @@ fn unit_statement(text: &str) -> Option<String> {
 }
 
 /// Refuses a file whose header states another unit than the one it is read in.
-pub(super) fn check_stated_unit(path: &Path, line: u64, header: &[u8], unit: Unit) -> Result<(), FormatError> {
+pub(super) fn check_stated_unit(
+    path: &Path,
+    line: u64,
+    header: &[u8],
+    [unit, height_unit]: [Unit; 2],
+) -> Result<(), FormatError> {
     let StatedUnits { of_heights, of_all } = StatedUnits::of(&text_of(header));
-    match of_all.or(of_heights) {
-        Some(found) if !unit.is(&found) => Err(FormatError::Unit { path: path.to_owned(), line, found, unit }),
-        _ => Ok(()),
+    let other = |found: Option<String>, unit: Unit| found.filter(|found| !unit.is(found)).map(|found| (found, unit));
+    match other(of_all, unit).or(other(of_heights, height_unit)) {
+        Some((found, unit)) => Err(FormatError::Unit { path: path.to_owned(), line, found, unit }),
+        None => Ok(()),
     }
 }
 
@@ -589,6 +624,12 @@ mod tests {
             ("x in mm", None),
             ("x y z m", None),
             ("heights from the sphere", None),
+            ("z is in the direction of the normal", None),
+            ("Z in M coordinates", None),
+            ("x, y, z, mil-spec", None),
+            ("step height in um: 12", None),
+            ("uncertainty of z in um: 0.3", None),
+            ("z 5 mm", None),
         ];
         for (text, unit) in cases {
             let of_all = unit.map(str::to_owned);
@@ -606,6 +647,9 @@ mod tests {
             ("units: mm, height in waves", "waves", Some("mm")),
             ("Höhe [nm]", "nm", None),
             ("sag is m", "m", None),
+            ("z is in mm", "mm", None),
+            ("heights are in nm", "nm", None),
+            ("sag is in waves", "waves", None),
         ] {
             let stated = StatedUnits { of_heights: Some(of_heights.to_owned()), of_all: of_all.map(str::to_owned) };
             assert_eq!(StatedUnits::of(text), stated, "{text}");

@@ -40,12 +40,12 @@ pub fn read_ply(path: impl AsRef<Path>) -> Result<PlyFile, FormatError> {
 /// # Errors
 /// Those of [`read_ply`].
 pub fn parse_ply(path: &Path, bytes: &[u8]) -> Result<PlyFile, FormatError> {
-    parse_ply_in(path, bytes, Unit::Millimetre)
+    parse_ply_in(path, bytes, [Unit::Millimetre; 2])
 }
 
-/// Parses PLY whose comments may state this unit and no other; the coordinates stay in it.
-pub(super) fn parse_ply_in(path: &Path, bytes: &[u8], unit: Unit) -> Result<PlyFile, FormatError> {
-    let header = Header::parse(path, bytes, unit)?;
+/// Parses PLY whose comments may state these units, of all and of the heights, and no others; the coordinates stay in them.
+pub(super) fn parse_ply_in(path: &Path, bytes: &[u8], units: [Unit; 2]) -> Result<PlyFile, FormatError> {
+    let header = Header::parse(path, bytes, units)?;
     let data = &bytes[header.length..];
     match header.encoding {
         Encoding::Ascii => header.read(path, &mut Words::new(data, header.lines)),
@@ -151,7 +151,7 @@ struct Header {
 }
 
 impl Header {
-    fn parse(path: &Path, bytes: &[u8], unit: Unit) -> Result<Self, FormatError> {
+    fn parse(path: &Path, bytes: &[u8], units: [Unit; 2]) -> Result<Self, FormatError> {
         if bytes.is_empty() {
             return Err(FormatError::Empty { path: path.to_owned(), expected: "a PLY header" });
         }
@@ -169,7 +169,7 @@ impl Header {
                     let known = "format ascii, binary_little_endian or binary_big_endian";
                     encoding = Some(Encoding::named(name).ok_or_else(|| fault(known))?);
                 }
-                [b"comment" | b"obj_info", ..] => check_stated_unit(path, number, line, unit)?,
+                [b"comment" | b"obj_info", ..] => check_stated_unit(path, number, line, units)?,
                 [] => {}
                 _ if encoding.is_none() => return Err(fault("`format ascii 1.0` or another format")),
                 [b"end_header"] => break,

@@ -260,7 +260,7 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     let table =
         Table { columns: content.columns.clone(), unit: (unit != Unit::Millimetre).then_some(unit), height_unit };
     let (points, columns) = if is_ply {
-        let mut points = ply::parse_ply_in(path, text, unit)?.points;
+        let mut points = ply::parse_ply_in(path, text, [unit, height_unit.unwrap_or(unit)])?.points;
         table.to_mm(&mut points);
         (points, OtherColumns::default())
     } else {

@@ -54,7 +54,7 @@ pub fn read_stl(path: impl AsRef<Path>) -> Result<StlFile, FormatError> {
 pub fn parse_stl(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
     let kind = kind(path, bytes, bytes.len() as u64)?;
     let first_line = bytes[..bytes.len().min(80)].split(|&b| b == b'\n').next().unwrap_or_default();
-    check_stated_unit(path, 1, first_line, Unit::Millimetre)?;
+    check_stated_unit(path, 1, first_line, [Unit::Millimetre; 2])?;
     match kind {
         Kind::Binary => parse_binary(path, bytes),
         Kind::Ascii => parse_ascii(path, bytes),

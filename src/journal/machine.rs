@@ -14,8 +14,8 @@ use super::{sha256_hex, system};
 
 /// A machine that no other run on this computer can take while this lives.
 ///
-/// Two files are locked: one of the machine for every user, and one of this user's alone. Somebody else may have laid anything in the place of the first,
-/// or hold it: that is told, and keeps no run from its machine. The second keeps two runs of one user apart all the same.
+/// Two files are locked: one of the machine for every user, and one of this user's alone. Where somebody else has laid something in the place of the first
+/// that is no lock, that is told, and the second keeps the runs of this user apart all the same.
 #[derive(Debug)]
 pub struct MachineLock {
     /// Held, not read.
@@ -36,6 +36,11 @@ const EPOCH_BITS: u32 = 31;
 const MOST_TOLD: u64 = 4096;
 /// So many files of a user are tried, where others have laid something in their place.
 const OWN_FILES: usize = 16;
+/// So often a file is opened anew that was taken away while it was being locked.
+const TRIES: usize = 5;
+
+/// How a file of a machine is opened.
+type Opens = fn(&LockFolder, &str) -> Result<LockFile, String>;
 
 impl MachineLock {
     /// Takes a machine, by the address by which every run would call it, for a run.
@@ -44,7 +49,7 @@ impl MachineLock {
     /// A machine that another run has, which is named; no folder for locks that can be used.
     pub fn take(address: &str, run: &Path) -> Result<Self, JournalError> {
         // Where no place is for all, the user's own is better than none.
-        Self::take_in(&system::place_of_locks().unwrap_or_else(std::env::temp_dir), address, run)
+        Self::take_in(&system::place_of_locks(FOLDER).unwrap_or_else(std::env::temp_dir), address, run)
     }
 
     /// Returns an epoch for the client of these machines: higher than every one that a client of this computer had for any of them, and
@@ -76,58 +81,76 @@ impl MachineLock {
             last_epoch: 0,
             notes: Vec::new(),
         };
+        let (shared, own): (Opens, Opens) = (LockFolder::shared, LockFolder::own);
         let name = format!("{machine}.lock");
-        match folder.file(&name) {
-            Ok(file) => lock.hold(file, &path.join(&name), address)?,
-            Err(what) => lock.note(&path.join(&name), &what),
+        if let Err(what) = lock.hold(&folder, (&name, shared), (&path, address))? {
+            lock.note(&path.join(&name), &what);
         }
-        let own = |k: usize| match k {
+        let own_name = |k: usize| match k {
             0 => format!("{machine}.{}.lock", LockFolder::own_mark()),
             k => format!("{machine}.{}-{k}.lock", LockFolder::own_mark()),
         };
-        for name in (0..OWN_FILES).map(own) {
-            match folder.file(&name) {
-                Ok(file) if file.is_trusted => {
-                    lock.hold(file, &path.join(&name), address)?;
+        for name in (0..OWN_FILES).map(own_name) {
+            match lock.hold(&folder, (&name, own), (&path, address))? {
+                Ok(()) => {
                     lock.write(lock.last_epoch);
                     return Ok(lock);
                 }
-                Ok(_) => lock.note(&path.join(&name), "it is another user's"),
                 Err(what) => lock.note(&path.join(&name), &what),
             }
         }
-        let remedy = format!("have root empty {}", path.display());
+        let remedy = format!("have root take away the files in {} that no process holds", path.display());
         Err(JournalError::LockFolder { path, what: lock.notes.join("; "), remedy })
     }
 
-    /// Locks a file and takes the epoch that it keeps.
-    fn hold(&mut self, file: LockFile, path: &Path, address: &str) -> Result<(), JournalError> {
-        let stranger = file.stranger();
-        let told = file.told.as_ref().unwrap_or(&file.lock);
-        match HeldFile::take(again(&file.lock, path)?) {
-            Ok(held) => self._files.push(held),
-            Err(TryLockError::WouldBlock) => match stranger {
-                Some(who) => {
-                    self.note(path, &format!("{who} holds it, who did not make it"));
-                    return Ok(());
-                }
-                None => {
-                    let holder = text_of(told).lines().next().unwrap_or_default().trim().to_owned();
+    /// Locks a file and takes the epoch that it keeps; says why that is not done where something else lies in its place.
+    fn hold(
+        &mut self,
+        folder: &LockFolder,
+        (name, open): (&str, Opens),
+        (path, address): (&Path, &str),
+    ) -> Result<Result<(), String>, JournalError> {
+        let path = path.join(name);
+        for _ in 0..TRIES {
+            let file = match open(folder, name) {
+                Ok(file) => file,
+                Err(what) => return Ok(Err(what)),
+            };
+            let told = file.told.as_ref().unwrap_or(&file.lock);
+            let held = match HeldFile::take(again(&file.lock, &path)?) {
+                Ok(held) => held,
+                Err(TryLockError::WouldBlock) => {
+                    let who = text_of(told).lines().next().unwrap_or_default().trim().to_owned();
+                    let holder = [who, file.holder().unwrap_or_default()].into_iter().filter(|who| !who.is_empty());
+                    let holder = holder.collect::<Vec<_>>().join("; held by ");
                     return Err(JournalError::MachineTaken { address: address.to_owned(), holder });
                 }
-            },
-            Err(TryLockError::Error(error)) => return Err(JournalError::file(path, "locking it")(error)),
+                Err(TryLockError::Error(error)) => return Err(JournalError::file(&path, "locking it")(error)),
+            };
+            // Somebody may have taken its name away meanwhile, and whoever comes next would lock another one.
+            if !folder.is_still(name, &file) {
+                continue;
+            }
+            if file.is_spoiled {
+                self.note(&path, "others have given it more names or bytes than a lock has");
+            } else {
+                self.believe(&text_of(told), &path);
+            }
+            self._files.push(held);
+            self.told.extend(file.told);
+            return Ok(Ok(()));
         }
-        let kept = text_of(told);
-        let epochs = kept.lines().filter_map(|line| line.strip_prefix(EPOCH));
-        for text in epochs {
+        Ok(Err("it is taken away again and again".to_owned()))
+    }
+
+    /// Takes the epoch that a file keeps, unless no client of this computer can have had it.
+    fn believe(&mut self, kept: &str, path: &Path) {
+        for text in kept.lines().filter_map(|line| line.strip_prefix(EPOCH)) {
             match text.trim().parse::<u32>() {
                 Ok(epoch) if epoch < (1 << EPOCH_BITS) - 1 => self.last_epoch = self.last_epoch.max(epoch),
                 _ => self.note(path, &format!("its epoch `{text}` is none that a client of this computer had")),
             }
         }
-        self.told.extend(file.told.filter(|_| file.is_trusted));
-        Ok(())
     }
 
     fn note(&mut self, path: &Path, what: &str) {
@@ -238,11 +261,11 @@ mod strangers {
         let lays: [(&str, Lays); 5] = [
             ("it is a link", |lock, precious| symlink(precious, lock).unwrap()),
             ("it is a link", |lock, _| symlink("/nowhere/at all", lock).unwrap()),
-            ("2 names", |lock, precious| fs::hard_link(precious, lock).unwrap()),
             ("it is no file", |lock, _| {
                 assert!(std::process::Command::new("mkfifo").arg(lock).status().unwrap().success());
             }),
-            ("bytes", |lock, _| fs::File::create(lock).unwrap().set_len(20 << 30).unwrap()),
+            ("more names or bytes", |lock, precious| fs::hard_link(precious, lock).unwrap()),
+            ("more names or bytes", |lock, _| fs::File::create(lock).unwrap().set_len(20 << 30).unwrap()),
         ];
         for (what, lay) in lays {
             let (place, folder, precious) = place();
@@ -263,7 +286,7 @@ mod strangers {
             let (place, folder, precious) = place();
             lay(&folder, place.path());
             let refused = MachineLock::take_in(place.path(), ADDRESS, Path::new("runs/a")).unwrap_err();
-            assert!(refused.to_string().contains("install -d -o root"), "{refused}");
+            assert!(refused.to_string().contains("chown -h root:root"), "{refused}");
             assert_eq!(fs::read_to_string(precious).unwrap(), "precious");
             refused.to_string()
         };
@@ -298,6 +321,9 @@ mod strangers {
         let folder = fresh.path().join(FOLDER);
         assert_eq!(fs::metadata(&folder).unwrap().mode() & 0o7777, 0o1777);
         assert_eq!(fs::metadata(folder.join(name())).unwrap().mode() & 0o777, 0o666);
+        let modes: Vec<u32> =
+            fs::read_dir(&folder).unwrap().map(|file| file.unwrap().metadata().unwrap().mode() & 0o777).collect();
+        assert!(modes.len() == 2 && modes.contains(&0o600), "{modes:?}");
     }
 
     #[test]
@@ -313,29 +339,75 @@ mod strangers {
         }
     }
 
-    #[test]
-    fn a_lock_that_another_user_holds_is_told_with_his_process_and_keeps_no_run_back() {
-        use std::io::{BufRead, BufReader};
+    /// A child that is another user, where only root can be one.
+    fn stranger(program: &str, arguments: &[&std::ffi::OsStr]) -> std::process::Command {
         use std::os::unix::process::CommandExt;
-        use std::process::{Command, Stdio};
-        // Only root can be another user.
+        let mut command = std::process::Command::new(program);
+        command.args(arguments).uid(65534).gid(65534);
+        command
+    }
+
+    #[test]
+    fn a_lock_that_another_user_holds_is_a_machine_that_is_taken_and_his_process_is_named() {
+        use std::io::{BufRead, BufReader};
+        use std::process::Stdio;
+        if !rustix::process::geteuid().is_root() {
+            return;
+        }
+        let (place, folder, _) = place();
+        fs::set_permissions(place.path(), fs::Permissions::from_mode(0o755)).unwrap();
+        drop(taken_again(place.path()));
+        let lock = folder.join(name());
+        let arguments = [lock.as_os_str(), "sh".as_ref(), "-c".as_ref(), "echo held; cat".as_ref()];
+        let mut holder = stranger("flock", &arguments).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+        let mut said = String::new();
+        BufReader::new(holder.stdout.take().unwrap()).read_line(&mut said).unwrap();
+        assert_eq!(said, "held\n");
+        let refused = MachineLock::take_in(place.path(), ADDRESS, Path::new("runs/a")).unwrap_err().to_string();
+        assert!(refused.contains("number 65534"), "{refused}");
+        drop(holder.stdin.take());
+        holder.wait().unwrap();
+        drop(taken_again(place.path()));
+    }
+
+    #[test]
+    fn nobody_else_can_hold_spoil_or_take_away_what_keeps_the_runs_of_a_user_apart() {
         if !rustix::process::geteuid().is_root() {
             return;
         }
         let (place, folder, precious) = place();
         fs::set_permissions(place.path(), fs::Permissions::from_mode(0o755)).unwrap();
+        let lock = taken_again(place.path());
+        let own = folder.join(format!("{}.{}.lock", &sha256_hex(ADDRESS.as_bytes())[..16], LockFolder::own_mark()));
+        for (program, arguments) in [
+            ("flock", vec!["-n".as_ref(), own.as_os_str(), "true".as_ref()]),
+            ("truncate", vec!["-s".as_ref(), "9999".as_ref(), own.as_os_str()]),
+            ("rm", vec!["-f".as_ref(), own.as_os_str()]),
+        ] {
+            let done = stranger(program, &arguments).stderr(std::process::Stdio::null()).status().unwrap();
+            assert!(!done.success(), "{program}");
+        }
+        // What he may do to the lock of all users takes it from nobody.
+        assert!(
+            stranger("truncate", &["-s".as_ref(), "9999".as_ref(), folder.join(name()).as_os_str()])
+                .status()
+                .unwrap()
+                .success()
+        );
+        assert!(matches!(
+            MachineLock::take_in(place.path(), ADDRESS, Path::new("runs/b")),
+            Err(JournalError::MachineTaken { .. })
+        ));
+        drop(lock);
+        assert_eq!(taken(place.path(), &precious).notes().len(), 1);
+    }
+
+    #[test]
+    fn a_lock_whose_name_was_taken_away_is_taken_anew() {
+        let (place, folder, precious) = place();
         drop(taken_again(place.path()));
-        let script = "echo held; cat";
-        let mut stranger = Command::new("flock");
-        stranger.arg(folder.join(name())).args(["sh", "-c", script]).uid(65534).gid(65534);
-        let mut stranger = stranger.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
-        let mut said = String::new();
-        BufReader::new(stranger.stdout.take().unwrap()).read_line(&mut said).unwrap();
-        assert_eq!(said, "held\n");
-        let lock = taken(place.path(), &precious);
-        assert!(lock.notes().len() == 1 && lock.notes()[0].contains("number 65534"), "{:?}", lock.notes());
-        drop(stranger.stdin.take());
-        stranger.wait().unwrap();
+        fs::remove_file(folder.join(name())).unwrap();
+        assert_eq!(taken(place.path(), &precious).notes(), [""; 0]);
     }
 
     fn taken_again(place: &Path) -> MachineLock {

@@ -97,7 +97,10 @@ pub const FIGURES: &[Figure] = &[
         Now::Silent { run } => Some(FigureValue::Text(format!(
             "the program of {run} does not answer: what the machines do is not known; see to them"
         ))),
-        Now::Gone { run } => Some(FigureValue::Text(format!(
+        Now::Gone { run, machines_within: true } => Some(FigureValue::Text(format!(
+            "the program of {run} has gone before its end, and its simulated machines with it"
+        ))),
+        Now::Gone { run, machines_within: false } => Some(FigureValue::Text(format!(
             "the program of {run} has gone before its end: what the machines do is not known; see to them, then: regrind resume"
         ))),
         Now::On { snapshot, .. } => Some(in_words(&snapshot.message)),
@@ -236,7 +239,7 @@ mod tests {
 
     #[test]
     fn a_run_that_was_left_is_not_called_idle() {
-        let gone = Told { now: Now::Gone { run: "a run".into() }, last: None };
+        let gone = Told { now: Now::Gone { run: "a run".into(), machines_within: false }, last: None };
         assert_eq!((value("Status/StateCurrent", &gone), value("Status/StateName", &gone)), (None, None));
         assert_eq!(value("Status/StateCurrent", &Told::default()), Some(FigureValue::Whole(4)));
         assert_eq!(value("Run", &gone), Some(FigureValue::Text("a run".into())));

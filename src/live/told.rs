@@ -21,8 +21,12 @@ pub enum Now {
     #[expect(missing_docs, reason = "named for what it is")]
     Silent { run: String },
     /// A run has no end on record, and its program has gone: what the machines do is not known.
-    #[expect(missing_docs, reason = "named for what it is")]
-    Gone { run: String },
+    Gone {
+        /// What it is called.
+        run: String,
+        /// Whether its machines were simulated by that program, and have gone with it.
+        machines_within: bool,
+    },
     /// A run is on.
     #[expect(missing_docs, reason = "named for what they are")]
     On { run: String, snapshot: Box<Snapshot> },
@@ -44,7 +48,7 @@ impl Told {
     pub(crate) fn run(&self) -> Option<&str> {
         match &self.now {
             Now::NoRun => None,
-            Now::Silent { run } | Now::Gone { run } | Now::On { run, .. } => Some(run),
+            Now::Silent { run } | Now::Gone { run, .. } | Now::On { run, .. } => Some(run),
         }
     }
 

@@ -21,7 +21,7 @@ use super::{Exchange, ExchangeError, HandOver, Look, MeasureOrder, Pattern, Perm
 use crate::{Job, MeasuredPoint, Measurement, Plan, Target, TargetKind, hex};
 use regrind_formats::FormatError;
 use regrind_formats::references::{References, parse_references, read_references};
-use regrind_formats::result::{Content, Coordinates, ResultFile, read_bytes, read_statements};
+use regrind_formats::result::{Content, Coordinates, ResultFile, parse_result, read_bytes, read_statements};
 
 /// How a measuring machine exchanges files.
 #[derive(Clone, Debug)]
@@ -108,6 +108,8 @@ pub struct CmmFolders {
     settings: CmmExchange,
     outbox: Outbox,
     watch: Watch,
+    /// The plan that this program handed over last.
+    published: Option<(Job, Arc<Plan>)>,
     /// What is waited for, once it was handed over or found again.
     expected: Option<Expected>,
     /// What the folder looked like when it was judged last, and how.
@@ -143,7 +145,7 @@ impl CmmFolders {
     pub fn new(settings: CmmExchange) -> Self {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
-        Self { settings, outbox, watch, expected: None, judged: None }
+        Self { settings, outbox, watch, published: None, expected: None, judged: None }
     }
 
     /// Finds a hand-over again that was made before a restart.
@@ -152,8 +154,22 @@ impl CmmFolders {
             return Ok(expected.clone());
         }
         let stored = self.outbox.handed_over(job)?;
-        let plan = (!self.settings.free_count).then(|| stored_plan(&stored.path).map(Arc::new)).transpose()?;
-        let targets = plan.iter().flat_map(|plan| &plan.targets).map(|target| target.index).collect();
+        let (mut plan, mut targets) = (None, Arc::default());
+        // Where any number of points will do the plan may name none.
+        if !self.settings.free_count {
+            match self.published.as_ref().filter(|(of, _)| *of == job) {
+                Some((_, published)) => plan = Some(Arc::clone(published)),
+                // One that somebody saved anew in between names its targets still.
+                None => plan = stored_plan(&stored.path).ok().map(Arc::new),
+            }
+            targets = match &plan {
+                Some(plan) => plan.targets.iter().map(|target| target.index).collect(),
+                None => {
+                    let path = stored.path.join("plan.csv");
+                    parse_result(&path, &read_bytes(&path)?, &Content::default())?.indices.unwrap_or_default().into()
+                }
+            };
+        }
         let expected = Expected { stored, plan, targets, since: None };
         self.expected = Some(expected.clone());
         Ok(expected)
@@ -456,6 +472,7 @@ impl Exchange for CmmFolders {
         }
         self.outbox.publish(&ticket, &files, permit)?;
         (self.expected, self.judged) = (None, None);
+        self.published = Some((job, Arc::new(order.plan.clone())));
         Ok(())
     }
 

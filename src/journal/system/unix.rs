@@ -6,7 +6,7 @@ use std::os::fd::OwnedFd;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::{FileType, Mode, OFlags};
+use rustix::fs::{AtFlags, FileType, Mode, OFlags, RenameFlags};
 use rustix::io::Errno;
 
 use super::OpenToOthers;
@@ -26,7 +26,10 @@ pub(crate) fn create_run_folder(folder: &Path) -> io::Result<()> {
     fs::create_dir_all(above)?;
     let is_shared = fs::metadata(above)?.mode() & 0o2000 != 0;
     match DirBuilder::new().mode(0o700).create(folder) {
-        Ok(()) if is_shared => fs::set_permissions(folder, fs::Permissions::from_mode(0o2750)),
+        Ok(()) if is_shared => {
+            let made = rustix::fs::open(folder, AS_FOLDER | OFlags::NOFOLLOW, Mode::empty())?;
+            Ok(rustix::fs::fchmod(&made, Mode::from_raw_mode(0o2750))?)
+        }
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists && folder.is_dir() => Ok(()),
         made => made,
     }
@@ -84,8 +87,12 @@ pub(crate) fn free_bytes(folder: &Path) -> io::Result<u64> {
 }
 
 /// The first place for locks that is there, that every user can write, and in which nobody can take away what is another's; none where there is no such place.
-pub(crate) fn place_of_locks() -> Option<PathBuf> {
-    first_for_all(&PLACES.map(Path::new)).map(Path::to_owned)
+pub(crate) fn place_of_locks(folder: &str) -> Option<PathBuf> {
+    // One that root has set up, as the package does, comes before any other.
+    let by_root =
+        |place: &&str| fs::symlink_metadata(Path::new(place).join(folder)).is_ok_and(|m| m.is_dir() && m.uid() == 0);
+    let set_up = PLACES.iter().find(|place| by_root(place)).map(PathBuf::from);
+    set_up.or_else(|| first_for_all(&PLACES.map(Path::new)).map(Path::to_owned))
 }
 
 fn first_for_all<'a>(places: &[&'a Path]) -> Option<&'a Path> {
@@ -97,6 +104,7 @@ fn first_for_all<'a>(places: &[&'a Path]) -> Option<&'a Path> {
 /// The folder in which the locks of this computer lie. It is reached by its descriptor: whatever becomes of its name, nothing is opened elsewhere.
 ///
 /// Anybody may write where it lies, so somebody may have been there first: what is found is looked at and never made anybody's, and no link is followed.
+/// The folder and each file come whole, with their modes, by one change of a name.
 pub(crate) struct LockFolder {
     folder: OwnedFd,
     /// Whether every user of the computer may make files in it, or only a group.
@@ -115,22 +123,24 @@ impl LockFolder {
         let path = place.join(name);
         let bad = |what: String| {
             let remedy = format!(
-                "have root do `rm -r {0}` and `install -d -o root -g root -m 1777 {0}`, or install the package, which brings it with a group",
+                "have root do `chown -h root:root {0}; chmod 1777 {0}` if it is a folder, take away what lies there if it is none, and write \
+                 `d {0} 1777 root root -` into /etc/tmpfiles.d/regrind.conf; or install the package, which brings it for a group",
                 path.display()
             );
             BadFolder { what, remedy }
         };
         let failed = |action: &str, error: Errno| bad(format!("{action}: {}", io::Error::from(error)));
-        const AS_FOLDER: OFlags = OFlags::DIRECTORY.union(OFlags::CLOEXEC);
         let place =
             rustix::fs::open(place, AS_FOLDER, Mode::empty()).map_err(|error| failed("opening its place", error))?;
-        let is_made = match rustix::fs::mkdirat(&place, name, Mode::from_raw_mode(0o700)) {
-            Ok(()) => true,
-            Err(Errno::EXIST) => false,
-            Err(error) => return Err(failed("making it", error)),
+        let open = || rustix::fs::openat(&place, name, AS_FOLDER | OFlags::NOFOLLOW, Mode::empty());
+        let opened = match open() {
+            Err(Errno::NOENT) => {
+                make_folder(&place, name).map_err(|error| failed("making it", error))?;
+                open()
+            }
+            opened => opened,
         };
-        let folder = rustix::fs::openat(&place, name, AS_FOLDER | OFlags::NOFOLLOW, Mode::empty());
-        let folder = folder.map_err(|error| match error {
+        let folder = opened.map_err(|error| match error {
             Errno::LOOP | Errno::NOTDIR => bad("a link or a file lies in its place".to_owned()),
             Errno::ACCESS => BadFolder {
                 what: "it is for the users of a group alone".to_owned(),
@@ -142,68 +152,110 @@ impl LockFolder {
             error => failed("opening it", error),
         })?;
         let found = rustix::fs::fstat(&folder).map_err(|error| failed("looking at it", error))?;
-        let own_uid = rustix::process::geteuid().as_raw();
-        if found.st_uid != own_uid && found.st_uid != 0 {
+        if !is_trusted(found.st_uid) {
             return Err(bad(format!("it belongs to {}, who may exchange what lies in it", user_of(found.st_uid))));
         }
-        if is_made {
-            // Each user may make files in it, and take away his own.
-            rustix::fs::fchmod(&folder, Mode::from_raw_mode(0o1777))
-                .map_err(|error| failed("opening it to all", error))?;
-            return Ok(Self { folder, is_for_all: true });
-        }
         let mode = found.st_mode & 0o7777;
-        if mode & 0o002 != 0 && mode & 0o1000 == 0 {
-            return Err(bad(format!("its mode is {mode:o}: every user may take away the files of others in it")));
+        if mode & 0o022 != 0 && mode & 0o1000 == 0 {
+            return Err(bad(format!("its mode is {mode:o}: others may take away the files of each other in it")));
         }
         Ok(Self { folder, is_for_all: mode & 0o002 != 0 })
     }
 
-    /// Opens a file in it, made where it is not there; says why it is not used where somebody laid something else in its place.
-    pub(crate) fn file(&self, name: &str) -> Result<LockFile, String> {
+    /// Opens the file of a machine, which every user of the folder may lock; says why it is not used where somebody laid something else in its place.
+    pub(crate) fn shared(&self, name: &str) -> Result<LockFile, String> {
+        self.file(name, if self.is_for_all { 0o666 } else { 0o660 })
+    }
+
+    /// Opens the file of a machine that is this user's alone: nobody else may open it, so that nobody else can hold or spoil it.
+    pub(crate) fn own(&self, name: &str) -> Result<LockFile, String> {
+        let file = self.file(name, 0o600)?;
+        if file.owner != rustix::process::geteuid().as_raw() {
+            return Err(format!("it belongs to {}", user_of(file.owner)));
+        }
+        Ok(file)
+    }
+
+    fn file(&self, name: &str, mode: u32) -> Result<LockFile, String> {
         let words = |error: Errno| io::Error::from(error).to_string();
-        let base = OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC | OFlags::NOCTTY;
-        let open = |flags: OFlags| rustix::fs::openat(&self.folder, name, base | flags, Mode::from_raw_mode(0o600));
-        let (file, is_made, may_write) = match open(OFlags::RDWR | OFlags::CREATE | OFlags::EXCL) {
-            Ok(file) => (file, true, true),
-            Err(Errno::EXIST) => match open(OFlags::RDWR) {
-                Ok(file) => (file, false, true),
-                // A lock needs no more than a look.
-                Err(Errno::ACCESS | Errno::PERM) => {
-                    let file =
-                        open(OFlags::RDONLY).map_err(|error| format!("it cannot be opened: {}", words(error)))?;
-                    (file, false, false)
-                }
-                Err(Errno::LOOP) => return Err("it is a link".to_owned()),
+        let open = |flags: OFlags| rustix::fs::openat(&self.folder, name, AS_FILE | flags, Mode::empty());
+        let opened = match open(OFlags::RDWR) {
+            Err(Errno::NOENT) => {
+                self.make(name, mode).map_err(|error| format!("it cannot be made: {}", words(error)))?;
+                open(OFlags::RDWR)
+            }
+            opened => opened,
+        };
+        let (file, may_write) = match opened {
+            Ok(file) => (file, true),
+            Err(Errno::LOOP) => return Err("it is a link".to_owned()),
+            // A lock needs no more than a look.
+            Err(Errno::ACCESS | Errno::PERM) => match open(OFlags::RDONLY) {
+                Ok(file) => (file, false),
                 Err(error) => return Err(format!("it cannot be opened: {}", words(error))),
             },
-            Err(error) => return Err(format!("it cannot be made: {}", words(error))),
+            Err(error) => return Err(format!("it cannot be opened: {}", words(error))),
         };
         let found = rustix::fs::fstat(&file).map_err(words)?;
         if FileType::from_raw_mode(found.st_mode) != FileType::RegularFile {
             return Err("it is no file".to_owned());
         }
-        if found.st_nlink != 1 {
-            return Err(format!("it has {} names, and may be another file", found.st_nlink));
+        let is_spoiled = found.st_nlink != 1 || found.st_size.cast_unsigned() > MOST_TOLD;
+        if is_spoiled && !is_trusted(found.st_uid) {
+            let (names, bytes) = (found.st_nlink, found.st_size);
+            return Err(format!("it has {names} names and {bytes} bytes, and a lock has one and {MOST_TOLD} at most"));
         }
-        if found.st_size as u64 > MOST_TOLD {
-            return Err(format!("it has {} bytes, and a lock has {MOST_TOLD} at most", found.st_size));
-        }
-        if is_made {
-            // Who may make files here may lock this one, whatever his umask says.
-            let mode = if self.is_for_all { 0o666 } else { 0o660 };
-            rustix::fs::fchmod(&file, Mode::from_raw_mode(mode)).map_err(words)?;
-        }
-        let is_trusted = found.st_uid == 0 || found.st_uid == rustix::process::geteuid().as_raw();
         let lock = File::from(file);
-        let told = if may_write { lock.try_clone().ok() } else { None };
-        Ok(LockFile { lock, told, is_trusted, identity: [found.st_dev as u64, found.st_ino as u64] })
+        // One that others have spoiled is still the lock; what stands in it is left alone.
+        let told = if may_write && !is_spoiled { lock.try_clone().ok() } else { None };
+        let identity = [found.st_dev, found.st_ino];
+        Ok(LockFile { lock, told, is_spoiled, owner: found.st_uid, identity })
+    }
+
+    /// Makes a file with its mode, unless one comes there first.
+    fn make(&self, name: &str, mode: u32) -> Result<(), Errno> {
+        let draft = format!(".{:016x}", rand::random::<u64>());
+        let flags = AS_FILE | OFlags::RDWR | OFlags::CREATE | OFlags::EXCL;
+        let file = rustix::fs::openat(&self.folder, &draft, flags, Mode::from_raw_mode(0o600))?;
+        let made = rustix::fs::fchmod(&file, Mode::from_raw_mode(mode))
+            .and_then(|()| rustix::fs::linkat(&self.folder, &draft, &self.folder, name, AtFlags::empty()));
+        // The error that brought us here is the one to report.
+        let _ = rustix::fs::unlinkat(&self.folder, &draft, AtFlags::empty());
+        if made == Err(Errno::EXIST) { Ok(()) } else { made }
+    }
+
+    /// Whether a file lies still under its name: one that was taken away in between locks nothing.
+    pub(crate) fn is_still(&self, name: &str, file: &LockFile) -> bool {
+        let found = rustix::fs::statat(&self.folder, name, AtFlags::SYMLINK_NOFOLLOW);
+        found.is_ok_and(|found| [found.st_dev, found.st_ino] == file.identity)
     }
 
     /// Tells the files of this user from those of others.
     pub(crate) fn own_mark() -> String {
         rustix::process::geteuid().as_raw().to_string()
     }
+}
+
+const AS_FOLDER: OFlags = OFlags::DIRECTORY.union(OFlags::CLOEXEC);
+const AS_FILE: OFlags = OFlags::NOFOLLOW.union(OFlags::NONBLOCK).union(OFlags::CLOEXEC).union(OFlags::NOCTTY);
+
+/// Makes a folder in which each user may make files, and take away his own, unless one comes there first.
+fn make_folder(place: &OwnedFd, name: &str) -> Result<(), Errno> {
+    let draft = format!(".{name}-{:016x}", rand::random::<u64>());
+    rustix::fs::mkdirat(place, &draft, Mode::from_raw_mode(0o700))?;
+    let folder = rustix::fs::openat(place, &draft, AS_FOLDER | OFlags::NOFOLLOW, Mode::empty());
+    let made = folder
+        .and_then(|folder| rustix::fs::fchmod(&folder, Mode::from_raw_mode(0o1777)))
+        .and_then(|()| rustix::fs::renameat_with(place, &draft, place, name, RenameFlags::NOREPLACE));
+    if made.is_err() {
+        // The error that brought us here is the one to report.
+        let _ = rustix::fs::unlinkat(place, &draft, AtFlags::REMOVEDIR);
+    }
+    if made == Err(Errno::EXIST) { Ok(()) } else { made }
+}
+
+fn is_trusted(uid: u32) -> bool {
+    uid == 0 || uid == rustix::process::geteuid().as_raw()
 }
 
 /// Most bytes that are told beside a lock.
@@ -214,15 +266,16 @@ pub(crate) struct LockFile {
     pub(crate) lock: File,
     /// Where who holds it and the last epoch stand; none where that may not be written.
     pub(crate) told: Option<File>,
-    /// Whether nobody but this user and root can have written it first.
-    pub(crate) is_trusted: bool,
+    /// Whether others have given it further names, or more bytes than a lock has.
+    pub(crate) is_spoiled: bool,
+    owner: u32,
     /// Device and inode.
     identity: [u64; 2],
 }
 
 impl LockFile {
-    /// Returns whether a process of another user holds a file that is this user's or root's, with what is known of it. None where the system does not tell.
-    pub(crate) fn stranger(&self) -> Option<String> {
+    /// Returns which process holds it, and whose that is; none where the system does not tell.
+    pub(crate) fn holder(&self) -> Option<String> {
         let locks = fs::read_to_string("/proc/locks").ok()?;
         let [device, inode] = self.identity;
         let (major, minor) = (rustix::fs::major(device as _), rustix::fs::minor(device as _));
@@ -230,8 +283,7 @@ impl LockFile {
         let is_it = |line: &&str| line.split_whitespace().any(|word| word == name) && line.contains("FLOCK");
         let pid: u32 = locks.lines().find(is_it)?.split_whitespace().nth(4)?.parse().ok()?;
         let uid = fs::metadata(format!("/proc/{pid}")).ok()?.uid();
-        let is_strange = self.is_trusted && uid != 0 && uid != rustix::process::geteuid().as_raw();
-        is_strange.then(|| format!("process {pid} of {}", user_of(uid)))
+        Some(format!("process {pid} of {}", user_of(uid)))
     }
 }
 

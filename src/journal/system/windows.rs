@@ -76,7 +76,7 @@ pub(crate) fn free_bytes(folder: &Path) -> io::Result<u64> {
 }
 
 /// The place for what belongs to no user in particular, in which each may make files and read those of others.
-pub(crate) fn place_of_locks() -> Option<PathBuf> {
+pub(crate) fn place_of_locks(_: &str) -> Option<PathBuf> {
     std::env::var_os("ProgramData").map(PathBuf::from).filter(|place| place.is_dir())
 }
 
@@ -104,8 +104,8 @@ impl LockFolder {
         }
     }
 
-    /// Opens a file in it, made where it is not there.
-    pub(crate) fn file(&self, name: &str) -> Result<LockFile, String> {
+    /// Opens the file of a machine, which every user may lock.
+    pub(crate) fn shared(&self, name: &str) -> Result<LockFile, String> {
         let path = self.0.join(name);
         let words = |error: io::Error| error.to_string();
         if !path.exists() {
@@ -115,7 +115,17 @@ impl LockFolder {
         // Nobody can read the locked one: what is told stands beside it.
         let told = path.with_extension("txt");
         let told = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(told).ok();
-        Ok(LockFile { lock, told, is_trusted: true })
+        Ok(LockFile { lock, told, is_spoiled: false })
+    }
+
+    /// Opens the file of a machine that is this user's.
+    pub(crate) fn own(&self, name: &str) -> Result<LockFile, String> {
+        self.shared(name)
+    }
+
+    /// A file that is open there keeps its name.
+    pub(crate) fn is_still(&self, _: &str, _: &LockFile) -> bool {
+        true
     }
 
     /// Tells the files of this user from those of others.
@@ -129,13 +139,13 @@ pub(crate) struct LockFile {
     pub(crate) lock: File,
     /// Where who holds it and the last epoch stand; none where that may not be written.
     pub(crate) told: Option<File>,
-    /// Whether nobody but this user and administrators can have written it first.
-    pub(crate) is_trusted: bool,
+    /// Whether others have given it further names, or more bytes than a lock has.
+    pub(crate) is_spoiled: bool,
 }
 
 impl LockFile {
     /// Who holds a lock is not told there.
-    pub(crate) fn stranger(&self) -> Option<String> {
+    pub(crate) fn holder(&self) -> Option<String> {
         None
     }
 }

@@ -213,7 +213,7 @@ mod tests {
         assert!(cycles(&on("a", 3), &on("a", 3)).is_empty());
         assert_eq!(cycles(&on("a", 3), &on("b", 1)), [Variant::UInt32(1)]);
         assert_eq!(cycles(&Told::default(), &on("b", 1)), [Variant::UInt32(1)]);
-        let gone = Told { now: Now::Gone { run: "a".into() }, last: None };
+        let gone = Told { now: Now::Gone { run: "a".into(), machines_within: false }, last: None };
         assert!(cycles_since([&gone, &on("a", 2)], &on("a", 2)).is_empty(), "it was left, and is gone on with");
         // A cycle that was measured again came to something else.
         let mut again = on("a", 1);
