@@ -1,6 +1,5 @@
 //! A record that was kept elsewhere, on its way back into a run folder, where it is read and proven as every other.
 
-use std::fs;
 use std::path::Path;
 
 use serde_json::Value;
@@ -10,7 +9,7 @@ use super::canonical::canonical_json;
 use super::error::JournalError;
 use super::record::Record;
 use super::verify::Anchor;
-use super::{ANCHOR, open};
+use super::{ANCHOR, open, system};
 
 impl Record {
     /// Reads a record from the text that was hashed and the hashes around it; nothing where the text is not one that the journal writes, to
@@ -55,7 +54,7 @@ pub fn restore(
     if !open::is_free(folder)? {
         return Err(JournalError::Exists { path: folder.to_owned() });
     }
-    fs::create_dir_all(folder).map_err(JournalError::file(folder, "creating the folder"))?;
+    system::create_run_folder(folder).map_err(JournalError::file(folder, "creating the folder"))?;
     let mut connection = open::create(folder)?;
     let failed = JournalError::database(folder);
     let all = connection.transaction().map_err(&failed)?;

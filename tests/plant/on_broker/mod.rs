@@ -213,7 +213,7 @@ fn a_run_is_told_beside_it_and_one_whose_program_has_gone_is_not_called_idle() {
     let values = until_value(&mut told.host, "Status/StateCurrent", &Value::Null);
     assert_eq!(values["Run"], json!(folder.file_name().unwrap().to_str().unwrap()));
     let message = values["Message"].as_str().unwrap();
-    assert!(message.contains("what the machines do is not known"), "{message}");
+    assert!(message.contains("and its simulated machines with it"), "{message}");
     assert_eq!(
         (&values["Figures/PV"], &values["Status/StateName"], &values["Last Run/Name"]),
         (&Value::Null, &Value::Null, &json!(name))

@@ -236,7 +236,7 @@ fn a_server_that_was_killed_is_found_again_and_tells_what_is_so() {
         said.iter().any(|line| line["changed"] == "Status/StateCurrent" && line["status"] == "BadNoData").then_some(())
     });
     let values = read(&mut second, &["Message", "Run", "BaseStateMachine/CurrentState"]);
-    assert!(values["Message"]["value"].as_str().unwrap().contains("what the machines do is not known"), "{values}");
+    assert!(values["Message"]["value"].as_str().unwrap().contains("and its simulated machines with it"), "{values}");
     assert_eq!(values["Run"]["value"], folder.file_name().unwrap().to_str().unwrap());
     assert_eq!(values["BaseStateMachine/CurrentState"]["status"], "BadNoData");
     teller.signal("TERM");
