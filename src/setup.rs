@@ -709,8 +709,7 @@ pub fn machines(
             Pattern::Free { least_points } => Some(usize::try_from(*least_points).unwrap_or(usize::MAX)),
             _ => None,
         },
-        // Where touches are chosen a batch is a few of them, and all are counted together once they are there.
-        least_found: if recipe.measuring.mode == Mode::Adaptive { 0.0 } else { least_found(recipe) },
+        least_found: least_found(recipe),
         rehearsal: cell.rehearsal,
         volume_mm: volume_mm(cell),
         ..making(link, cell.simulated, [owner, epoch])
