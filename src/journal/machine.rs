@@ -20,7 +20,7 @@ use super::{sha256_hex, system};
 pub struct MachineLock {
     /// Held, not read.
     _files: Vec<HeldFile>,
-    /// Where the holder and the epoch stand.
+    /// The files that tell the holder and the epoch.
     told: Vec<File>,
     holder: String,
     last_epoch: u32,
@@ -387,7 +387,7 @@ mod strangers {
             let done = stranger(program, &arguments).stderr(std::process::Stdio::null()).status().unwrap();
             assert!(!done.success(), "{program}");
         }
-        // What he may do to the lock of all users takes it from nobody.
+        // He may spoil the lock of all users, and takes the machine from nobody by that.
         assert!(
             stranger("truncate", &["-s".as_ref(), "9999".as_ref(), folder.join(name()).as_os_str()])
                 .status()

@@ -22,7 +22,7 @@ pub enum Now {
     Silent { run: String },
     /// A run has no end on record, and its program has gone: what the machines do is not known.
     Gone {
-        /// What it is called.
+        /// Its name.
         run: String,
         /// Whether its machines were simulated by that program, and have gone with it.
         machines_within: bool,

@@ -195,7 +195,7 @@ fn proud_mm(number: usize) -> f64 {
     0.004 * number as f64
 }
 
-/// What a machine that runs DMIS writes for a program: every statement of its text, and every point touched above where it was asked for by a ball of 1.5 mm.
+/// Writes what a machine that runs DMIS writes for a program: every statement of its text, and every point touched by a ball of 1.5 mm, a little above its target.
 fn ran(program: &str) -> String {
     // A `$` at the end of a line goes on in the next.
     let whole = program.replace("$\n", "");

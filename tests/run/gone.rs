@@ -57,7 +57,7 @@ fn a_record_that_is_deleted_ends_with_the_run_and_no_further_pass_is_started() {
     running.line("the alarm", |line| line.contains("was deleted, renamed or exchanged"));
     let path = folder.display().to_string();
     running.until("a held cell", |_| run(&["status", &path], home.path()).1.contains("Held").then_some(()));
-    // What makes safe is carried out; that it is not on record is said.
+    // The order that makes safe is carried out, and the person is told that it is not on record.
     let (code, _, told) = run(&["abort", &path], home.path());
     assert!(code == 3 && told.contains("not on record"), "{told}");
     let (code, errors) = running.end();

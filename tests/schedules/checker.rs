@@ -192,7 +192,7 @@ fn was_forgotten_unseen(evidence: &Evidence, began: &Moment) -> bool {
                 || event["event"] == "progressed"
                 || event["event"] == "reconciled" && at_work)
     };
-    // What was on its way when the machine forgot is told a moment later.
+    // A status that was on its way when the machine forgot is told a moment later.
     let next_start = of_it().find(|moment| moment.at > began.at && matches!(moment.what, What::Began { .. }));
     let until = next_start.map_or(forgot.at + Duration::from_secs(1), |next| next.at);
     !evidence.written.iter().any(|w| w.at >= began.at && w.at <= until && seen(w))

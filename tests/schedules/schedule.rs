@@ -141,7 +141,7 @@ impl Schedule {
         }
     }
 
-    /// What happens is drawn as for Modbus; once or twice a machine forgets the job that it is at, or has just done.
+    /// Draws what happens as for Modbus; once or twice a machine forgets the job that it is at, or has just done.
     fn forgetful(seed: u64) -> Self {
         let mut chance = StdRng::seed_from_u64(seed ^ 0x0F02_6E70);
         let mut drawn = Self { speed: [400.0, 60.0, 10.0][chance.random_range(0..3)], ..Self::by_modbus(seed) };

@@ -264,7 +264,7 @@ const MOST_TOLD: u64 = 4096;
 /// A file to be locked.
 pub(crate) struct LockFile {
     pub(crate) lock: File,
-    /// Where who holds it and the last epoch stand; none where that may not be written.
+    /// The file that tells its holder and the last epoch; none where that may not be written.
     pub(crate) told: Option<File>,
     /// Whether others have given it further names, or more bytes than a lock has.
     pub(crate) is_spoiled: bool,

@@ -26,7 +26,7 @@ pub(crate) fn create_run_folder(folder: &Path) -> io::Result<()> {
     std::fs::create_dir_all(folder)
 }
 
-/// What a folder hands down is for who set it up.
+/// A folder hands down the rights that its maker gave it.
 pub(crate) fn is_open_to_all(_: &Path) -> bool {
     false
 }
@@ -137,7 +137,7 @@ impl LockFolder {
 /// A file to be locked.
 pub(crate) struct LockFile {
     pub(crate) lock: File,
-    /// Where who holds it and the last epoch stand; none where that may not be written.
+    /// The file that tells its holder and the last epoch; none where that may not be written.
     pub(crate) told: Option<File>,
     /// Whether others have given it further names, or more bytes than a lock has.
     pub(crate) is_spoiled: bool,
