@@ -497,7 +497,8 @@ pub(super) struct StatedUnits {
 }
 
 impl StatedUnits {
-    pub(super) fn of(text: &str) -> Self {
+    /// Finds the units in a text.
+    pub(super) fn found_in(text: &str) -> Self {
         let text = text.to_lowercase();
         match height_unit(&text) {
             Some(word) => {
@@ -586,7 +587,7 @@ pub(super) fn check_stated_unit(
     header: &[u8],
     [unit, height_unit]: [Unit; 2],
 ) -> Result<(), FormatError> {
-    let StatedUnits { of_heights, of_all } = StatedUnits::of(&text_of(header));
+    let StatedUnits { of_heights, of_all } = StatedUnits::found_in(&text_of(header));
     let other = |found: Option<String>, unit: Unit| found.filter(|found| !unit.is(found)).map(|found| (found, unit));
     match other(of_all, unit).or(other(of_heights, height_unit)) {
         Some((found, unit)) => Err(FormatError::Unit { path: path.to_owned(), line, found, unit }),
@@ -633,7 +634,7 @@ mod tests {
         ];
         for (text, unit) in cases {
             let of_all = unit.map(str::to_owned);
-            assert_eq!(StatedUnits::of(text), StatedUnits { of_heights: None, of_all }, "{text}");
+            assert_eq!(StatedUnits::found_in(text), StatedUnits { of_heights: None, of_all }, "{text}");
         }
     }
 
@@ -652,7 +653,7 @@ mod tests {
             ("sag is in waves", "waves", None),
         ] {
             let stated = StatedUnits { of_heights: Some(of_heights.to_owned()), of_all: of_all.map(str::to_owned) };
-            assert_eq!(StatedUnits::of(text), stated, "{text}");
+            assert_eq!(StatedUnits::found_in(text), stated, "{text}");
         }
     }
 

@@ -270,16 +270,20 @@ impl<'p> Preamble<'p> {
 
     /// Refuses a text that speaks of other units.
     fn check_stated(&self, line: u64, text: &[u8]) -> Result<(), FormatError> {
-        let [unit, _, height_unit] = self.table.units();
-        let StatedUnits { of_heights, of_all } = StatedUnits::of(&text_of(text));
-        of_heights.map_or(Ok(()), |found| self.check_unit(line, found, height_unit))?;
-        of_all.map_or(Ok(()), |found| self.check_unit(line, found, unit))
+        self.check_heights(line, text)?;
+        let of_all = StatedUnits::found_in(&text_of(text)).of_all;
+        of_all.map_or(Ok(()), |found| self.check_unit(line, found, self.table.units()[0]))
     }
 
-    /// Refuses a title that speaks of another unit, unless a person gave the unit.
+    /// Refuses a text that speaks of another unit of the heights.
+    fn check_heights(&self, line: u64, text: &[u8]) -> Result<(), FormatError> {
+        let of_heights = StatedUnits::found_in(&text_of(text)).of_heights;
+        of_heights.map_or(Ok(()), |found| self.check_unit(line, found, self.table.units()[2]))
+    }
+
+    /// Refuses a title that speaks of another unit; a person who gave the unit of all has answered what it says of all.
     fn check_title(&self, title: &[u8], number: u64) -> Result<(), FormatError> {
-        let is_given = self.table.unit.is_some() || self.table.height_unit.is_some();
-        if is_given { Ok(()) } else { self.check_stated(number, title) }
+        if self.table.unit.is_some() { self.check_heights(number, title) } else { self.check_stated(number, title) }
     }
 
     /// Refuses other units that a header states of x, y and z.
@@ -298,7 +302,7 @@ impl<'p> Preamble<'p> {
         let unit_of = |column: usize| match columns.iter().position(|of| *of == column) {
             Some(axis) if units.len() == count => Some(of_axes[axis]),
             Some(_) => Some(of_axes[0]),
-            // Whatever stands beside the coordinates has units of its own.
+            // A column beside the coordinates has a unit of its own.
             None => (units.len() != count).then_some(of_axes[0]),
         };
         let stated = units.iter().enumerate().filter(|(_, found)| !found.is_empty());

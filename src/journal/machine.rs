@@ -18,8 +18,8 @@ use super::{sha256_hex, system};
 /// that is no lock, that is told, and the second keeps the runs of this user apart all the same.
 #[derive(Debug)]
 pub struct MachineLock {
-    /// Held, not read.
-    _files: Vec<HeldFile>,
+    /// Both files: held, not read.
+    held: Vec<HeldFile>,
     /// The files that tell the holder and the epoch.
     told: Vec<File>,
     holder: String,
@@ -75,7 +75,7 @@ impl MachineLock {
         })?;
         let machine = &sha256_hex(address.as_bytes())[..16];
         let mut lock = Self {
-            _files: Vec::new(),
+            held: Vec::new(),
             told: Vec::new(),
             holder: format!("{}, process {}", run.display(), std::process::id()),
             last_epoch: 0,
@@ -136,7 +136,7 @@ impl MachineLock {
             } else {
                 self.believe(&text_of(told), &path);
             }
-            self._files.push(held);
+            self.held.push(held);
             self.told.extend(file.told);
             return Ok(Ok(()));
         }

@@ -760,6 +760,8 @@ fn heights_have_a_unit_of_their_own_where_a_person_says_so() {
         (b"x_mm,y_mm,z_mm\n1,-2,0.5\n", Unit::Micrometre),
         (b"# height in nm\nx,y,z\n1,-2,0.5\n", Unit::Micrometre),
         (b"# units: um\nx,y,z\n1,-2,0.5\n", Unit::Micrometre),
+        // The unit of the heights says nothing of the others.
+        (b"All dimensions in inches\nx,y,z\n1,-2,500\n", Unit::Micrometre),
     ] {
         let found = read(form, None, Some(height_unit));
         assert!(matches!(found, Err(FormatError::Unit { .. })), "{} {found:?}", String::from_utf8_lossy(form));
