@@ -43,7 +43,7 @@ pub struct Document<'t> {
 pub fn read_text(path: &Path) -> Result<String, Problems> {
     let failed = |found: String, remedy: &str| Problems::whole(path, "", found, remedy);
     let mut bytes = Vec::new();
-    let read = File::open(path).and_then(|file| file.take(MOST_BYTES as u64 + 1).read_to_end(&mut bytes));
+    let read = open(path).and_then(|file| file.take(MOST_BYTES as u64 + 1).read_to_end(&mut bytes));
     read.map_err(|e| failed(format!("the file cannot be read: {e}"), "check the path and the rights"))?;
     if bytes.len() > MOST_BYTES {
         return Err(too_large(path));
@@ -52,6 +52,15 @@ pub fn read_text(path: &Path) -> Result<String, Problems> {
         let line = 1 + e.as_bytes()[..e.utf8_error().valid_up_to()].iter().filter(|&&b| b == b'\n').count();
         failed(format!("the file is not text: line {line} is not UTF-8"), "save it as UTF-8 text")
     })
+}
+
+/// Opens a file; a named pipe would be waited for, and a device has no end. A shell lays what a program is given to read under `/dev/fd`.
+fn open(path: &Path) -> std::io::Result<File> {
+    let found = std::fs::metadata(path)?;
+    if !found.is_file() && !found.is_dir() && !path.starts_with("/dev") && !path.starts_with("/proc") {
+        return Err(std::io::Error::new(std::io::ErrorKind::InvalidInput, "it is a pipe or a device and no file"));
+    }
+    File::open(path)
 }
 
 fn too_large(path: &Path) -> Problems {

@@ -34,6 +34,7 @@ mod system;
 mod told_figures;
 mod whole;
 pub mod x3p;
+mod xml;
 
 use std::path::Path;
 

@@ -16,6 +16,7 @@ use super::foreign::{check_is_ours, is_utf16};
 use super::layout::{Fields, Layout, Preamble, Separator, are_empty_rows, is_comment};
 use super::note::{NotedPoints, PointNote};
 use super::number::{Decimal, NumberFault, coordinate, digits_after, has_both_marks, is_believable, looks_numeric};
+use super::system;
 use regrind_core::geometry::Point;
 
 /// Largest text file that is read.
@@ -60,7 +61,7 @@ pub fn read_nominal_points(path: impl AsRef<Path>, table: &Table) -> Result<Vec<
 
 fn opened(path: &Path) -> Result<(File, u64), FormatError> {
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
-    let file = File::open(path).map_err(unreadable)?;
+    let file = system::open_to_read(path).map_err(unreadable)?;
     let length = file.metadata().map_err(unreadable)?.len();
     Ok((file, length))
 }

@@ -13,6 +13,7 @@ use super::dmis::index_of;
 use super::error::{FormatError, excerpt};
 use super::number::is_believable;
 use super::result::{Content, Coordinates, ResultFile, Statements};
+use super::xml::{Beyond, beyond_bounds};
 use regrind_core::geometry::Point;
 
 /// Most nodes of a document.
@@ -53,6 +54,10 @@ fn with_root<T>(
         let line = text[..error.valid_up_to()].iter().filter(|b| **b == b'\n').count() as u64 + 1;
         FormatError::NotText { path: path.to_owned(), line, value: text.get(error.valid_up_to()).copied().unwrap_or(0) }
     })?;
+    if let Some(Beyond { line, allowed, found }) = beyond_bounds(text) {
+        let place = format!("line {line}");
+        return Err(FormatError::Unexpected { path: path.to_owned(), place, expected: allowed, found });
+    }
     let options = ParsingOptions { allow_dtd: false, nodes_limit: MOST_NODES, ..ParsingOptions::default() };
     let document = Document::parse_with_options(text, options).map_err(|source| FormatError::Xml {
         path: path.to_owned(),

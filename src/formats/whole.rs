@@ -6,6 +6,7 @@ use std::path::Path;
 
 use super::error::FormatError;
 use super::points::fill;
+use super::system;
 use regrind_core::geometry::Point;
 
 /// Largest mesh file that is read.
@@ -25,7 +26,7 @@ pub(super) struct Opened {
 /// Opens a file and reads its beginning.
 pub(super) fn open(path: &Path) -> Result<Opened, FormatError> {
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
-    let mut file = File::open(path).map_err(unreadable)?;
+    let mut file = system::open_to_read(path).map_err(unreadable)?;
     let length = file.metadata().map_err(unreadable)?.len();
     let mut head = vec![0; HEAD];
     let filled = fill(&mut file, &mut head).map_err(unreadable)?;

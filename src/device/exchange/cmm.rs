@@ -6,7 +6,7 @@
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
 use serde::Deserialize;
@@ -105,9 +105,10 @@ pub struct StationFiles {
 /// The folders of a measuring machine.
 #[derive(Debug)]
 pub struct CmmFolders {
-    settings: CmmExchange,
-    outbox: Outbox,
+    judge: Arc<Judge>,
     watch: Watch,
+    /// A judgement that is not over yet.
+    judging: Option<Judging>,
     /// The plan that this program handed over last.
     published: Option<(Job, Arc<Plan>)>,
     /// What is waited for, once it was handed over or found again.
@@ -115,6 +116,26 @@ pub struct CmmFolders {
     /// What the folder looked like when it was judged last, and how.
     judged: Option<(Vec<WatchedFile>, Look<Measurement>)>,
 }
+
+/// Reads the files of the inbox and holds them against what is waited for.
+#[derive(Debug)]
+struct Judge {
+    settings: CmmExchange,
+    outbox: Outbox,
+}
+
+/// What a thread of its own finds in the inbox: a file that takes long to read keeps nobody from holding or aborting the job.
+#[derive(Debug)]
+struct Judging {
+    job: Job,
+    found: Vec<WatchedFile>,
+    judged: mpsc::Receiver<(Judgement, Vec<String>)>,
+}
+
+/// How long a look waits for what it finds to be read; what takes longer is told by a later one.
+const READ_WITHIN: Duration = Duration::from_millis(40);
+/// A file whose name says nothing is not looked into to see whether it belongs here, if it is larger.
+const MOST_TO_LOOK_INTO: u64 = 16 << 20;
 
 /// What is waited for.
 #[derive(Clone, Debug)]
@@ -128,6 +149,7 @@ struct Expected {
 }
 
 /// An answer that was made of some files.
+#[derive(Debug)]
 struct Accepted {
     measurement: Measurement,
     files: Vec<(String, String)>,
@@ -145,7 +167,8 @@ impl CmmFolders {
     pub fn new(settings: CmmExchange) -> Self {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
-        Self { settings, outbox, watch, published: None, expected: None, judged: None }
+        let judge = Arc::new(Judge { settings, outbox });
+        Self { judge, watch, judging: None, published: None, expected: None, judged: None }
     }
 
     /// Finds a hand-over again that was made before a restart.
@@ -153,10 +176,10 @@ impl CmmFolders {
         if let Some(expected) = self.expected.as_ref().filter(|e| e.stored.ticket.job() == job) {
             return Ok(expected.clone());
         }
-        let stored = self.outbox.handed_over(job)?;
+        let stored = self.judge.outbox.handed_over(job)?;
         let (mut plan, mut targets) = (None, Arc::default());
         // Where any number of points will do the plan may name none.
-        if !self.settings.free_count {
+        if !self.judge.settings.free_count {
             match self.published.as_ref().filter(|(of, _)| *of == job) {
                 Some((_, published)) => plan = Some(Arc::clone(published)),
                 // One that somebody saved anew in between names its targets still.
@@ -175,6 +198,34 @@ impl CmmFolders {
         Ok(expected)
     }
 
+    /// Returns what some files come to, where that is known by now; begins to read them, unless others are still being read.
+    fn judged_by_now(&mut self, expected: &Expected, found: &[WatchedFile]) -> Option<(Judgement, Vec<String>)> {
+        let job = expected.stored.ticket.job();
+        if self.judging.is_none() {
+            let (judge, expected, files) = (Arc::clone(&self.judge), expected.clone(), found.to_owned());
+            let (tell, judged) = mpsc::channel();
+            std::thread::spawn(move || {
+                let mut notes = Vec::new();
+                let judgement = judge.judge(&expected, &files, &mut notes);
+                // Nobody may want to know any more.
+                let _ = tell.send((judgement, notes));
+            });
+            self.judging = Some(Judging { job, found: found.to_owned(), judged });
+        }
+        let Judging { job: asked, found: of, judged } = self.judging.as_ref()?;
+        let is_of_these = *asked == job && *of == found;
+        let judged = judged.recv_timeout(READ_WITHIN);
+        if matches!(judged, Err(mpsc::RecvTimeoutError::Timeout)) {
+            return None;
+        }
+        self.judging = None;
+        let broken = || (Err(ExchangeError::NotRead { folder: self.judge.settings.inbox.clone() }), Vec::new());
+        // The files have changed meanwhile: the next look reads them anew.
+        is_of_these.then(|| judged.unwrap_or_else(|_| broken()))
+    }
+}
+
+impl Judge {
     fn judge(&self, expected: &Expected, found: &[WatchedFile], notes: &mut Vec<String>) -> Judgement {
         let accepted = match &self.settings.stations {
             None => self.judge_single(expected, found, notes),
@@ -241,6 +292,13 @@ impl CmmFolders {
 
     /// Returns why a file does not belong to a hand-over, or nothing if it does.
     fn belongs(&self, ticket: &Ticket, pattern: &Pattern, file: &WatchedFile) -> Result<Option<String>, ExchangeError> {
+        if file.look.bytes > MOST_TO_LOOK_INTO && !pattern.fits(&file.name) {
+            let most = MOST_TO_LOOK_INTO >> 20;
+            let pattern = pattern.as_str();
+            return Ok(Some(format!(
+                "is larger than {most} MiB and its name does not fit {pattern}: it was not looked into"
+            )));
+        }
         let says = read_statements(&file.path, &read_bytes(&file.path)?)?;
         let says_so = says.part.is_some() && says.cycle.is_some() || says.plan.is_some();
         Ok(foreign(&says, &ticket.part, ticket.cycle, &ticket.identity).or_else(|| {
@@ -454,31 +512,33 @@ impl Exchange for CmmFolders {
     type Answer = Measurement;
 
     fn open(&mut self) -> Result<Vec<HandOver>, ExchangeError> {
-        self.outbox.open(&mut self.watch)
+        self.judge.outbox.open(&mut self.watch)
     }
 
     fn publish(&mut self, job: Job, sequence: u32, order: &MeasureOrder, permit: &Permit) -> Result<(), ExchangeError> {
-        let CmmExchange { part, inbox, .. } = &self.settings;
+        let CmmExchange { part, inbox, .. } = &self.judge.settings;
         let ticket = Ticket::new(part, job, sequence, &order.plan_identity, order.plan.probe_radius_mm, inbox)?;
-        let expects = self.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
+        let expects = self.judge.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
         let mut files = vec![
             ("plan.csv", plan_csv(&ticket.part, job, &ticket.identity, &order.plan).into_bytes()),
-            ("plan.json", plan_json(&ticket, order, &self.settings, expects.as_str())),
+            ("plan.json", plan_json(&ticket, order, &self.judge.settings, expects.as_str())),
         ];
-        if let (Some(sensor), Some(coordinates)) = (&self.settings.dmis_sensor, self.settings.content.coordinates) {
+        if let (Some(sensor), Some(coordinates)) =
+            (&self.judge.settings.dmis_sensor, self.judge.settings.content.coordinates)
+        {
             let (part, identity) = (&*ticket.part, &*ticket.identity);
             let about = dmis::About { part, cycle: ticket.cycle, identity, sensor, coordinates };
             files.push(("plan.dmi", dmis::program(&order.plan, &about).into_bytes()));
         }
-        self.outbox.publish(&ticket, &files, permit)?;
-        (self.expected, self.judged) = (None, None);
+        self.judge.outbox.publish(&ticket, &files, permit)?;
+        (self.expected, self.judged, self.judging) = (None, None, None);
         self.published = Some((job, Arc::new(order.plan.clone())));
         Ok(())
     }
 
     fn mark(&mut self, job: Job, standing: Standing) -> Result<(), ExchangeError> {
-        (self.expected, self.judged) = (None, None);
-        self.outbox.mark(job, standing)
+        (self.expected, self.judged, self.judging) = (None, None, None);
+        self.judge.outbox.mark(job, standing)
     }
 
     fn look(&mut self, now: Duration, job: Job) -> Result<Look<Measurement>, ExchangeError> {
@@ -489,8 +549,11 @@ impl Exchange for CmmFolders {
         if let Some((_, look)) = self.judged.as_ref().filter(|(before, _)| *before == found) {
             return Ok(look.clone());
         }
-        let mut notes = Vec::new();
-        let answer = match self.judge(&expected, &found, &mut notes) {
+        let Some((judgement, mut notes)) = self.judged_by_now(&expected, &found) else {
+            let names = found.iter().map(|file| file.name.as_str()).collect::<Vec<_>>().join(", ");
+            return Ok(Look { begun: false, answer: None, notes: vec![format!("reading {names}")] });
+        };
+        let answer = match judgement {
             Ok(None) => None,
             Err(error) => {
                 notes.push(format!("not taken: {error}"));
@@ -498,7 +561,7 @@ impl Exchange for CmmFolders {
             }
             Ok(Some(accepted)) => {
                 let taken = Taken { job: job.job, cycle: job.cycle, files: accepted.files };
-                self.outbox.note_taken(&expected.stored, &taken)?;
+                self.judge.outbox.note_taken(&expected.stored, &taken)?;
                 notes.extend(accepted.notes);
                 let duration_s = now.saturating_sub(since).as_secs_f64();
                 Some(Measurement { duration_s: Some(duration_s), ..accepted.measurement })

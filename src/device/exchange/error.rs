@@ -81,6 +81,11 @@ pub enum ExchangeError {
     /// A hand-over that is not where it was put.
     #[error("{folder}: the hand-over is not there; was it moved or deleted? put it back or stop the job")]
     Missing { folder: PathBuf },
+    /// What read the files has failed.
+    #[error(
+        "{folder}: a file there could not be read by a fault of this program; take away what does not belong there, and report it"
+    )]
+    NotRead { folder: PathBuf },
     /// A file that says it is of something else.
     #[error("{path}: {why}; export the measurement that was asked for")]
     Foreign { path: PathBuf, why: String },

@@ -72,7 +72,7 @@ impl ProgramMap {
 /// A file that cannot be read, other columns, rows that are no numbers, nodes that are no whole grid.
 pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
     let unreadable = |source| GcodeError::File(FormatError::Unreadable { path: path.to_owned(), source });
-    let file = std::fs::File::open(path).map_err(unreadable)?;
+    let file = crate::system::open_to_read(path).map_err(unreadable)?;
     let mut reader = BufReader::new(file.take(MOST_BYTES + 1));
     let (mut lines, mut line, mut number, mut bytes) = (MapLines::default(), Vec::new(), 0u64, 0u64);
     loop {

@@ -12,7 +12,7 @@ use unix as here;
 #[cfg(windows)]
 use windows as here;
 
-pub(super) use here::{create_owners, is_socket, link_to, sync_folder};
+pub(super) use here::{create_owners, is_socket, link_to, open_to_read, sync_folder};
 
 /// That others than its owner may read a file.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -30,6 +30,18 @@ pub(super) fn user_name(uid: u32) -> Option<String> {
     users.find(|user| user[2].parse() == Ok(uid) && !user[0].is_empty()).map(|user| user[0].clone())
 }
 
+/// Opens a file for reading. A named pipe is waited for by whoever opens it, and a device may have no end: neither is opened but under `/dev/fd` and
+/// the like, where a shell lays what a program is given to read.
+pub(crate) fn open_to_read(path: &Path) -> io::Result<File> {
+    let kind = fs::metadata(path)?.file_type();
+    let is_given =
+        ["/dev/fd/", "/dev/stdin", "/proc/self/fd/"].iter().any(|place| path.starts_with(place.trim_end_matches('/')));
+    if (kind.is_fifo() || kind.is_char_device() || kind.is_block_device()) && !is_given {
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is a pipe or a device and no file"));
+    }
+    File::open(path)
+}
+
 /// Whether what is at a path, itself and not what it links to, is a socket.
 pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
     Ok(fs::symlink_metadata(path)?.file_type().is_socket())

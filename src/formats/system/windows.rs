@@ -26,6 +26,11 @@ pub(super) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>
     Ok((!others.is_empty()).then(open))
 }
 
+/// Opens a file for reading.
+pub(crate) fn open_to_read(path: &Path) -> io::Result<File> {
+    File::open(path)
+}
+
 /// Whether what is at a path is a socket; none is, for programs talk to each other by pipes, which lie in no folder.
 pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
     fs::symlink_metadata(path).map(|_| false)

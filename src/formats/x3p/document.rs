@@ -6,6 +6,7 @@ use roxmltree::{Document, Node, ParsingOptions};
 
 use crate::error::{FormatError, excerpt};
 use crate::height_map::{MOST_SAMPLES, check_size};
+use crate::xml::{Beyond, beyond_bounds};
 
 /// Most nodes of the document: three for a sample that stands in it.
 const MOST_NODES: u32 = 10_000_000;
@@ -157,6 +158,10 @@ impl Main {
             let line = 1 + bytes[..at].iter().filter(|&&b| b == b'\n').count() as u64;
             FormatError::NotText { path: path.to_owned(), line, value: bytes[at] }
         })?;
+        if let Some(Beyond { line, allowed, found }) = beyond_bounds(source) {
+            let place = format!("{entry}, line {line}");
+            return Err(FormatError::Unexpected { path: path.to_owned(), place, expected: allowed, found });
+        }
         let options = ParsingOptions { nodes_limit: MOST_NODES, ..ParsingOptions::default() };
         let document = Document::parse_with_options(source.trim_start_matches('\u{feff}'), options)
             .map_err(|source| FormatError::Xml { path: path.to_owned(), entry: entry.to_owned(), source })?;
