@@ -89,6 +89,8 @@ impl Layout {
 pub struct MachineOptions {
     /// In which order the words of a value stand.
     pub word_order: WordOrder,
+    /// Whether the low byte of each register stands before the high one.
+    pub swaps_bytes: bool,
     /// Where the blocks are.
     pub layout: Layout,
     /// Seconds of the machine's own time in a real second.
@@ -115,6 +117,7 @@ impl Default for MachineOptions {
     fn default() -> Self {
         Self {
             word_order: WordOrder::Big,
+            swaps_bytes: false,
             layout: Layout::default(),
             speed: 1.0,
             seed: 1,

@@ -99,7 +99,15 @@ impl Machine {
             let end = length.min(offset + count - registers.len());
             registers.extend(&self.image(block)[offset..end]);
         }
-        Ok(registers)
+        Ok(self.on_the_line(registers))
+    }
+
+    /// Puts the bytes of registers in the order in which they stand on the line, or back.
+    fn on_the_line(&self, mut registers: Vec<u16>) -> Vec<u16> {
+        if self.options.swaps_bytes {
+            registers.iter_mut().for_each(|register| *register = register.swap_bytes());
+        }
+        registers
     }
 
     /// Writes some registers; what they ask for is done before this returns.
@@ -110,6 +118,7 @@ impl Machine {
         if !(1..=123).contains(&values.len()) {
             return Err(Exception::Value);
         }
+        let values = &self.on_the_line(values.to_vec())[..];
         let (block, offset, length) = self.options.layout.find(address.into()).ok_or(Exception::Address)?;
         let writable = if block == Block::Sync { 2 } else { length };
         if offset + values.len() > writable {

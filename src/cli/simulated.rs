@@ -6,7 +6,7 @@ use std::time::SystemTime;
 
 use regrind::compensation::path::Pattern;
 use regrind::config::{CellConfig, Link, RotaryLetter};
-use regrind::device::{Coordinates, HitLine, HitLinesWire, IppdmeWire, Line, RegisterMap, Wire, WordOrder};
+use regrind::device::{Coordinates, HitLine, HitLinesWire, IppdmeWire, Line, RegisterMap, Wire};
 use regrind::formats::{AddedLines, FormatError, ResultFolder, ScratchFolder, place_link, remove_link};
 use regrind::journal::utc;
 use regrind::recipe::{Recipe, Wheel};
@@ -376,10 +376,8 @@ fn boot_id() -> u32 {
 fn options(link: &Link, speed: f64, seed: u64) -> MachineOptions {
     let RegisterMap { word_order, .. } = link.registers;
     MachineOptions {
-        word_order: match word_order {
-            WordOrder::Big => words::WordOrder::Big,
-            WordOrder::Little => words::WordOrder::Little,
-        },
+        word_order: if word_order.is_low_first() { words::WordOrder::Little } else { words::WordOrder::Big },
+        swaps_bytes: word_order.swaps_bytes(),
         layout: layout(&link.registers),
         speed,
         seed,

@@ -134,7 +134,7 @@ pub enum DeviceError {
     WrongDevice { machine: Arc<str>, expected: MachineKind, address: u16, required: u16, found: u16 },
     /// The identity block of the map, found otherwise than it must be: bytes exchanged, or addresses off by one.
     #[error("{machine} answers with the identity block of this map, {how}; nothing was written to it")]
-    OtherLayout { machine: Arc<str>, how: &'static str },
+    OtherLayout { machine: Arc<str>, how: std::borrow::Cow<'static, str> },
     /// The cell file names the machine as one kind, and it is the other.
     #[error(
         "{machine} is a {found}, and the cell file has it as the {expected}: the two addresses may be exchanged; nothing was written to it"
@@ -248,25 +248,32 @@ pub enum DeviceError {
     BadPayload { machine: Arc<str>, what: &'static str, field: String, value: f64, limit: &'static str },
 }
 
+/// Modbus exceptions of a machine that is busy, of a gateway that finds nobody, of a memory error.
+const BUSY: [u8; 6] = [4, 5, 6, 8, 10, 11];
+
 impl DeviceError {
     /// Whether it is the talking that failed, so that the machine itself may be as well as before. The other layer is a clear *no*.
     pub fn is_link(&self) -> bool {
-        matches!(
-            self,
-            Self::Unreachable { .. }
-                | Self::TimedOut { .. }
-                | Self::Disconnected { .. }
-                | Self::Corrupt { .. }
-                | Self::Frozen { .. }
-                | Self::NotAcknowledged { .. }
-                | Self::StartUnknown { .. }
-                | Self::Taken { .. }
-                // Busy, a gateway that finds nobody, a memory error: asked again it may go well.
-                | Self::Exception { code: 4 | 5 | 6 | 8 | 10 | 11, .. }
-                | Self::Folder { .. }
-                | Self::Unreadable { .. }
-                | Self::ControlTaken { .. }
-        )
+        self.is_busy()
+            || matches!(
+                self,
+                Self::Unreachable { .. }
+                    | Self::TimedOut { .. }
+                    | Self::Disconnected { .. }
+                    | Self::Corrupt { .. }
+                    | Self::Frozen { .. }
+                    | Self::NotAcknowledged { .. }
+                    | Self::StartUnknown { .. }
+                    | Self::Taken { .. }
+                    | Self::Folder { .. }
+                    | Self::Unreadable { .. }
+                    | Self::ControlTaken { .. }
+            )
+    }
+
+    /// Whether the machine, or what stands between, answers that it cannot do it just now: asked again it may go well.
+    pub(super) fn is_busy(&self) -> bool {
+        matches!(self, Self::Exception { code, .. } if BUSY.contains(code))
     }
 }
 

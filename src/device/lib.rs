@@ -35,6 +35,7 @@ mod modbus;
 mod no_machine;
 mod payload;
 mod place;
+mod range;
 mod table;
 mod wiring;
 mod words;
@@ -58,6 +59,7 @@ pub use payload::{
     Target, TargetKind,
 };
 pub use place::Place;
+pub use range::{RANGES, Range};
 pub use regrind_formats::result::Coordinates;
 pub use table::{AnyCmm, AnyGrinder, Wire};
 pub use wiring::{Making, MakingError, Timing, Wired};

@@ -7,8 +7,9 @@ use std::sync::{Arc, LazyLock, Mutex};
 use std::time::Duration;
 
 use regrind::device::{
-    Cmm, CorrectionMap, Grinder, Identified, Interrupt, Job, Line, Machine as _, ModbusCmm, ModbusGrinder,
-    ModbusSettings, Outcome, Plan, PointStatus, RegisterMap, State, Status, Target, TargetKind, WordOrder, digest,
+    Cmm, CorrectionMap, Grinder, Identified, Interrupt, Job, Line, Machine as Driver, ModbusCmm, ModbusGrinder,
+    ModbusSettings, Outcome, Plan, PointStatus, RANGES, Range, RegisterMap, State, Status, Target, TargetKind,
+    WordOrder, digest,
 };
 use regrind::geometry::Grid;
 use regrind_sim::body::Kind;
@@ -203,9 +204,9 @@ async fn measured_ahead(order: WordOrder, word_order: words::WordOrder) -> Vec<V
     record.lock().unwrap().clone()
 }
 
-async fn complete(cmm: &mut ModbusCmm) -> Status {
+async fn complete(machine: &mut impl Driver) -> Status {
     for _ in 0..200 {
-        let status = cmm.status().await.unwrap();
+        let status = machine.status().await.unwrap();
         if status.state == State::Complete {
             return status;
         }
@@ -214,12 +215,19 @@ async fn complete(cmm: &mut ModbusCmm) -> Status {
     panic!("the job does not end");
 }
 
-/// What goes over the wire while a map and a pass are handed over.
-async fn handed_over(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>> {
+/// What goes over the wire while a map and a pass are handed over, and the pass is ground.
+async fn ground(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>> {
     let (settings, record) = record(machine(Kind::Grinder, sim_order), order).await;
-    let mut grinder = ModbusGrinder::new(settings).unwrap();
+    let (mut grinder, calm) = (ModbusGrinder::new(settings).unwrap(), Interrupt::new());
+    let job = Job { job: JOB, cycle: CYCLE, digest: digest(&[map().identity(), pass().identity()]) };
     grinder.connect().await.unwrap();
-    grinder.load_pass(&map(), &pass(), &Interrupt::new()).await.unwrap();
+    grinder.claim().await.unwrap();
+    grinder.load_pass(&map(), &pass(), &calm).await.unwrap();
+    let armed = grinder.prepare(job).await.unwrap();
+    grinder.start(armed).await.unwrap();
+    complete(&mut grinder).await;
+    let record_of_pass = grinder.collect(job, &calm).await.unwrap();
+    assert_eq!((record_of_pass.path_mm, record_of_pass.removed_mm3), (Some(1234.5), Some(67.8)));
     record.lock().unwrap().clone()
 }
 
@@ -239,7 +247,9 @@ fn as_on_the_page(frame: &[u8]) -> Vec<u8> {
 }
 
 /// The pieces of the page that stand in one word order, and those that stand in both.
-const TURNED: [&str; 8] = ["claim", "status", "header", "page", "point", "beat", "ahead", "full"];
+const TURNED: [&str; 13] = [
+    "claim", "status", "header", "page", "point", "beat", "ahead", "full", "plan", "prepare", "start", "pass", "record",
+];
 const UNTURNED: [&str; 10] = [
     "ahead.request",
     "full.request",
@@ -261,8 +271,12 @@ async fn the_frames_of_the_page_are_those_on_the_wire() {
         [("big", WordOrder::Big, words::WordOrder::Big), ("little", WordOrder::Little, words::WordOrder::Little)]
     {
         let mut sent = measured(order, sim_order).await;
-        sent.extend(handed_over(order, sim_order).await);
+        sent.extend(ground(order, sim_order).await);
         sent.extend(measured_ahead(order, sim_order).await);
+        if std::env::var_os("REGRIND_VECTORS").is_some() {
+            print_vectors(name, &sent);
+            continue;
+        }
         let sent: BTreeSet<_> = sent.iter().map(|frame| as_on_the_page(frame)).collect();
         let names = TURNED.map(|frame| format!("{frame}.{name}")).into_iter().chain(UNTURNED.map(str::to_owned));
         for name in names {
@@ -275,6 +289,32 @@ async fn the_frames_of_the_page_are_those_on_the_wire() {
         assert_eq!(page[&format!("count.{name}")], point_in_counts(sim_order), "count.{name}");
     }
     assert_eq!(looked_at, page.into_keys().collect(), "frames that are looked at, and frames of the page");
+}
+
+/// Prints the frames of one job each that are long to write by hand, as they stand on the page (`REGRIND_VECTORS=1 cargo test --test device
+/// the_frames_of_the_page -- --nocapture`).
+fn print_vectors(order: &str, sent: &[Vec<u8>]) {
+    let word = |frame: &[u8], at: usize| u16::from_be_bytes([frame[at], frame[at + 1]]);
+    let is_write = |frame: &&Vec<u8>, address: u16, registers: u16| {
+        frame.len() > 13 && frame[7] == 16 && word(frame, 8) == address && word(frame, 10) == registers
+    };
+    let commands = |number: u16| move |frame: &&Vec<u8>| is_write(frame, 40, 20) && word(frame, 13 + 4) == number;
+    let found = [
+        ("plan", sent.iter().find(|frame| is_write(frame, 224, 8 + 60))),
+        ("prepare", sent.iter().find(commands(2))),
+        ("start", sent.iter().find(commands(3))),
+        ("pass", sent.iter().find(|frame| is_write(frame, 224, 8 + 64))),
+        ("record", sent.iter().find(|frame| frame[7..9] == [3, 2 * (4 + 32)])),
+    ];
+    for (name, frame) in found {
+        for (wire, frame) in [("rtu", rtu(frame.unwrap())), ("tcp", frame.unwrap().clone())] {
+            println!("```hex {name}.{order}.{wire}");
+            let lines =
+                frame.chunks(32).map(|line| line.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().join(" "));
+            lines.for_each(|line| println!("{line}"));
+            println!("```");
+        }
+    }
 }
 
 fn point_record() -> PointRecord {
@@ -312,6 +352,19 @@ fn the_check_numbers_in_the_text_are_those_of_the_frames() {
     let text = PAGE.split_whitespace().collect::<Vec<_>>().join(" ");
     for told in told {
         assert!(text.contains(&told), "the page does not say {told}");
+    }
+}
+
+#[test]
+fn the_ranges_of_the_page_are_those_of_the_program() {
+    let rows: Vec<_> = PAGE.lines().map(cells).filter(|cells| cells.len() == 4).collect();
+    for Range { figure, least, most, unit } in RANGES {
+        let is_it = |cells: &&Vec<&str>| {
+            cells[0] == figure
+                && cells[3].trim() == unit
+                && [cells[1], cells[2]].map(str::parse) == [Ok(least), Ok(most)]
+        };
+        assert!(rows.iter().any(|cells| is_it(&cells)), "{figure}: {least} to {most} {unit}");
     }
 }
 

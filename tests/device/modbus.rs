@@ -192,16 +192,26 @@ async fn a_pass_is_ground_and_recorded() {
 
 #[tokio::test]
 async fn low_words_first_and_other_addresses_are_as_good() {
-    let layout = Layout { status: 1064, command: 1040, outbox_page: 2462, ..Layout::default() };
-    let options = MachineOptions { word_order: words::WordOrder::Little, layout, ..MachineOptions::default() };
-    let serving = Serving::tcp("127.0.0.1:0", vec![(7, toy(Kind::Cmm, AT_ONCE, options))]).await.unwrap();
-    let word_order = WordOrder::Little;
-    let registers =
-        RegisterMap { word_order, status: 1064, command: 1040, outbox_page: 2462, ..RegisterMap::default() };
-    let settings = ModbusSettings { unit: 7, registers, ..settings(&serving) };
-    let mut cmm = connected(settings).await;
-    let plan = plan(50);
-    assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "low words first");
+    for word_order in [WordOrder::Little, WordOrder::Badc, WordOrder::Dcba] {
+        let layout = Layout { status: 1064, command: 1040, outbox_page: 2462, ..Layout::default() };
+        let of_sim = if word_order.is_low_first() { words::WordOrder::Little } else { words::WordOrder::Big };
+        let swaps_bytes = word_order.swaps_bytes();
+        let options = MachineOptions { word_order: of_sim, swaps_bytes, layout, ..MachineOptions::default() };
+        let serving = Serving::tcp("127.0.0.1:0", vec![(7, toy(Kind::Cmm, AT_ONCE, options))]).await.unwrap();
+        let registers =
+            RegisterMap { word_order, status: 1064, command: 1040, outbox_page: 2462, ..RegisterMap::default() };
+        let settings = ModbusSettings { unit: 7, registers, ..settings(&serving) };
+        let mut cmm = connected(settings.clone()).await;
+        let plan = plan(50);
+        assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), word_order.name());
+        // Taken in another order it is told which one is right.
+        for other in [word_order.other(), word_order.with_other_bytes(), word_order.with_other_bytes().other()] {
+            let registers = RegisterMap { word_order: other, ..registers };
+            let wrong = ModbusCmm::new(ModbusSettings { registers, ..settings.clone() }).unwrap().connect().await;
+            let told = wrong.unwrap_err().to_string();
+            assert!(told.contains(&format!("word_order = \"{}\"", word_order.name())), "{other:?}: {told}");
+        }
+    }
 }
 
 #[tokio::test]
@@ -289,6 +299,30 @@ async fn a_machine_that_another_client_has_taken_is_lost_in_these_words() {
     let taken = first.status().await.unwrap_err();
     assert!(matches!(taken, DeviceError::Taken { ours: 1, owner: 0xbeef, .. }) && taken.is_link(), "{taken}");
     assert!(taken.to_string().contains("belongs to another client now (owner 0000beef"), "{taken}");
+}
+
+#[tokio::test]
+async fn a_machine_that_is_busy_is_waited_for_and_one_that_stays_so_is_not() {
+    let few =
+        |serving: &Serving| ModbusSettings { retries: 3, lost_after: Duration::from_secs(2), ..settings(serving) };
+    // A controller that is still starting says so to more questions than a silent one has tries.
+    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    serving.faults().set(FaultPlan::new(0).times(1, 12, When::Any, Fault::Exception(6)));
+    let began = Instant::now();
+    let mut cmm = connected(few(&serving)).await;
+    assert!(began.elapsed() >= 12 * Duration::from_millis(50), "{:?}", began.elapsed());
+    // So does one at work; and what stays busy is lost after its time, and asked no more often than every 50 ms.
+    serving.faults().set(FaultPlan::new(0).times(1, 12, When::Any, Fault::Exception(6)));
+    cmm.status().await.unwrap();
+    serving.faults().set(FaultPlan::new(0).always(When::Any, Fault::Exception(6)));
+    let busy = cmm.status().await.unwrap_err();
+    assert!(matches!(busy, DeviceError::Exception { code: 6, .. }) && busy.is_link(), "{busy}");
+    assert!((4..=41).contains(&serving.faults().fired().len()), "{}", serving.faults().fired().len());
+    // A gateway that finds no machine says so too, and is not waited for as long when it is met.
+    let serving = serve(Kind::Cmm, AT_ONCE, FaultPlan::new(0).always(When::Any, Fault::Exception(11)).into()).await;
+    let met = ModbusCmm::new(few(&serving)).unwrap().connect().await.unwrap_err();
+    assert!(matches!(met, DeviceError::Exception { code: 11, .. }), "{met}");
+    assert!(serving.faults().fired().len() <= 41, "{}", serving.faults().fired().len());
 }
 
 #[tokio::test]
@@ -430,14 +464,20 @@ async fn what_is_not_the_machine_is_told_apart_and_never_written_to() {
     let e = refusal(|image| image[1] = 0x4432).await;
     assert!(matches!(e, DeviceError::WrongDevice { address: 1, .. }), "{e}");
     let e = refusal(|image| image.iter_mut().for_each(|word| *word = word.swap_bytes())).await;
-    assert!(matches!(e, DeviceError::OtherLayout { how, .. } if how.contains("bytes of each register")), "{e}");
+    assert!(matches!(&e, DeviceError::OtherLayout { how, .. } if how.contains("write word_order = \"badc\"")), "{e}");
+    let e = refusal(|image| {
+        (image[4], image[5]) = (image[5], image[4]);
+        image.iter_mut().for_each(|word| *word = word.swap_bytes());
+    })
+    .await;
+    assert!(matches!(&e, DeviceError::OtherLayout { how, .. } if how.contains("write word_order = \"dcba\"")), "{e}");
     let e = refusal(|image| image.insert(0, 7)).await;
-    assert!(matches!(e, DeviceError::OtherLayout { how, .. } if how.contains("one register later")), "{e}");
+    assert!(matches!(e, DeviceError::OtherLayout { ref how, .. } if how.contains("one register later")), "{e}");
     let e = refusal(|image| {
         image.remove(0);
     })
     .await;
-    assert!(matches!(e, DeviceError::OtherLayout { how, .. } if how.contains("one register earlier")), "{e}");
+    assert!(matches!(e, DeviceError::OtherLayout { ref how, .. } if how.contains("one register earlier")), "{e}");
     let e = refusal(|image| image[2] = 1).await;
     assert!(matches!(e, DeviceError::WrongVersion { required: 2, found: 1, .. }), "{e}");
     let said = e.to_string();

@@ -12,10 +12,7 @@ use regrind_core::geometry::Grid;
 impl WordOrder {
     fn bits(self, words: &[u16]) -> u64 {
         let shift_in = |bits: u64, word: &u16| (bits << 16) | u64::from(*word);
-        match self {
-            Self::Big => words.iter().fold(0, shift_in),
-            Self::Little => words.iter().rev().fold(0, shift_in),
-        }
+        if self.is_low_first() { words.iter().rev().fold(0, shift_in) } else { words.iter().fold(0, shift_in) }
     }
 }
 
@@ -90,9 +87,10 @@ impl Writer {
 
     fn bits(&mut self, bits: u64, registers: usize) -> &mut Self {
         let words = (0..registers).map(|k| (bits >> (16 * k)) as u16);
-        match self.order {
-            WordOrder::Big => self.words.extend(words.rev()),
-            WordOrder::Little => self.words.extend(words),
+        if self.order.is_low_first() {
+            self.words.extend(words)
+        } else {
+            self.words.extend(words.rev())
         }
         self
     }

@@ -22,6 +22,7 @@ use std::time::Duration;
 
 use tokio::time::{Instant, sleep};
 
+use super::range;
 use super::{
     Answer, Armed, Cmm, Command, Coordinates, CorrectionMap, DeviceError, Fault, Grinder, Identity, Interrupt, Job,
     Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Preliminary, Reconciled, SignalValue, Started,
@@ -48,6 +49,8 @@ const ACKNOWLEDGED_WITHIN: Duration = Duration::from_millis(500);
 const SETTLED_WITHIN: Duration = Duration::from_secs(5);
 /// The span over which a start has to be seen not taken.
 const SEEN_TWICE_OVER: Duration = Duration::from_millis(1050);
+/// The temperature in the status of a machine that has no thermometer.
+const NO_THERMOMETER: i16 = i16::MIN;
 /// More than this is no result of a measuring machine.
 const RESULT_BYTES: u32 = 64 << 20;
 
@@ -219,10 +222,13 @@ impl ModbusMachine {
             beat: words[28],
             last_begun: (block.u32(30), words[32]),
             begun_by: block.u32(36),
-            temperature_c: f64::from(block.i16(33)) / 100.0,
+            temperature_c: Some(block.i16(33))
+                .filter(|told| *told != NO_THERMOMETER)
+                .map(|told| f64::from(told) / 100.0),
             boot_id: block.u32(34),
         };
         self.check_alive(&block)?;
+        range::of_status(&machine, block.temperature_c, block.progress)?;
         Ok(block)
     }
 
@@ -273,7 +279,10 @@ impl ModbusMachine {
         let (value, cause) = match self.unit.read("signal", signal.address, signal.kind.registers()).await {
             Err(error @ DeviceError::Exception { .. }) => (None, Some(error.to_string())),
             words => {
-                let words = words?;
+                let mut words = words?;
+                if signal.word_order.swaps_bytes() != self.unit.map.word_order.swaps_bytes() {
+                    words.iter_mut().for_each(|word| *word = word.swap_bytes());
+                }
                 (Some(signal.value(&words, signal.word_order)).filter(|value| value.is_finite()), signal.cause(&words))
             }
         };
@@ -721,7 +730,9 @@ impl ModbusMachine {
         }
         let reals = [("the probe's radius", 12), ("the scale", 16), ("the mean temperature", 20), ("the duration", 24)];
         for (field, at) in reals {
-            if !block.f64(at).is_finite() {
+            // A machine without a thermometer tells no number as the temperature.
+            let is_untold = at == 20 && block.f64(at).is_nan();
+            if !is_untold && !block.f64(at).is_finite() {
                 return Err(DeviceError::NotFinite { machine, field: field.into(), value: block.f64(at) });
             }
         }
@@ -738,6 +749,9 @@ impl ModbusMachine {
             let expected = expected.min(RESULT_BYTES.into());
             return Err(DeviceError::Count { machine, what: "bytes of the result", expected, found: bytes.into() });
         }
+        if (kind, format) == (4, 2) {
+            range::of_counts(&machine, block.f64(16))?;
+        }
         Ok(Header {
             format,
             bytes,
@@ -747,7 +761,7 @@ impl ModbusMachine {
             coordinates: words[9],
             probe_radius_mm: block.f64(12),
             scale_mm: block.f64(16),
-            temperature_c: block.f64(20),
+            temperature_c: Some(block.f64(20)).filter(|told| !told.is_nan()),
             duration_s: block.f64(24),
             identity: block.identity(30),
         })
@@ -833,7 +847,8 @@ struct Block {
     last_begun: (u32, u16),
     /// The START that began the running or last job; 0 when there is none.
     begun_by: u32,
-    temperature_c: f64,
+    /// None where it has no thermometer.
+    temperature_c: Option<f64>,
     boot_id: u32,
 }
 
@@ -850,7 +865,7 @@ impl From<&Block> for Status {
             automatic: Some(block.automatic),
             fault: Some(block.fault),
             progress: Some(block.progress),
-            temperature_c: Some(block.temperature_c),
+            temperature_c: block.temperature_c,
             boot_id: Some(block.boot_id),
             signals: Vec::new(),
         }
@@ -874,7 +889,8 @@ struct Header {
     coordinates: u16,
     probe_radius_mm: f64,
     scale_mm: f64,
-    temperature_c: f64,
+    /// None where it has no thermometer.
+    temperature_c: Option<f64>,
     duration_s: f64,
     identity: [u8; 32],
 }
@@ -1061,7 +1077,7 @@ impl Cmm for ModbusCmm {
             points: points.collect::<Result<_, _>>()?,
             coordinates,
             probe_radius_mm: Some(header.probe_radius_mm),
-            temperature_c: Some(header.temperature_c),
+            temperature_c: header.temperature_c,
             duration_s: Some(header.duration_s),
             plan_identity: header.identity,
             job: job.job,
@@ -1102,7 +1118,7 @@ impl Grinder for ModbusGrinder {
             idle_share: Some(idle_share),
             spindle_load: Some(spindle_load),
             wheel_radius_mm: Some(wheel_radius_mm),
-            temperature_c: Some(header.temperature_c),
+            temperature_c: header.temperature_c,
             duration_s: Some(header.duration_s),
             map_identity: header.identity,
             job: job.job,

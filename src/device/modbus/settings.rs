@@ -22,6 +22,10 @@ pub enum WordOrder {
     Big,
     /// The low one.
     Little,
+    /// The high one, and in each register the low byte before the high one.
+    Badc,
+    /// The low one, and in each register the low byte before the high one.
+    Dcba,
 }
 
 impl WordOrder {
@@ -30,15 +34,47 @@ impl WordOrder {
         match self {
             Self::Big => "big",
             Self::Little => "little",
+            Self::Badc => "badc",
+            Self::Dcba => "dcba",
         }
     }
 
-    /// The other order.
+    /// The order with the other word first.
     pub fn other(self) -> Self {
         match self {
             Self::Big => Self::Little,
             Self::Little => Self::Big,
+            Self::Badc => Self::Dcba,
+            Self::Dcba => Self::Badc,
         }
+    }
+
+    /// The order with the other byte of each register first.
+    pub fn with_other_bytes(self) -> Self {
+        match self {
+            Self::Big => Self::Badc,
+            Self::Little => Self::Dcba,
+            Self::Badc => Self::Big,
+            Self::Dcba => Self::Little,
+        }
+    }
+
+    /// Whether the low word comes first.
+    pub fn is_low_first(self) -> bool {
+        matches!(self, Self::Little | Self::Dcba)
+    }
+
+    /// Whether the low byte of each register comes first.
+    pub fn swaps_bytes(self) -> bool {
+        matches!(self, Self::Badc | Self::Dcba)
+    }
+
+    /// Brings registers from the line into the order of bytes that the rest of the program knows, or back.
+    pub(super) fn bytes_in_order(self, mut words: Vec<u16>) -> Vec<u16> {
+        if self.swaps_bytes() {
+            words.iter_mut().for_each(|word| *word = word.swap_bytes());
+        }
+        words
     }
 }
 

@@ -22,10 +22,8 @@ impl Signal {
     pub(super) fn cause(&self, words: &[u16]) -> Option<String> {
         let is_good = |value: &f64| (self.range[0]..=self.range[1]).contains(value);
         let value = self.value(words, self.word_order);
-        let (other, name) = match self.word_order {
-            WordOrder::Big => (WordOrder::Little, "little"),
-            WordOrder::Little => (WordOrder::Big, "big"),
-        };
+        let other = self.word_order.other();
+        let name = other.name();
         let swapped =
             Some(self.value(words, other)).filter(|swapped| !is_good(&value) && words.len() > 1 && is_good(swapped));
         let hint = swapped.map(|swapped| {

@@ -3,6 +3,7 @@
 //!
 //! Everything that is asked through a unit may be asked twice: reads, and writes of values. Nothing here is a pulse.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,7 +11,7 @@ use tokio::time::{Instant, sleep};
 
 use super::codec::{Registers, Writer};
 use super::link::{Ask, Link, LinkFault};
-use super::settings::RegisterMap;
+use super::settings::{RegisterMap, WordOrder};
 use crate::{DeviceError, Identity, MachineKind};
 
 /// The first words of an identity block.
@@ -24,6 +25,8 @@ const SIMULATION: u16 = 1;
 const GIVES_AHEAD: u16 = 2;
 /// A machine that says it is busy is asked again after this.
 const BUSY_PAUSE: Duration = Duration::from_millis(50);
+/// A machine that is busy for so long when it is met is given up.
+const BUSY_WHEN_MET: Duration = Duration::from_secs(20);
 /// The sentinels that prove the order of words.
 const SENTINEL_WHOLE: u32 = 0x1234_5678;
 const SENTINEL_REAL: f64 = -2.5e-7;
@@ -91,8 +94,10 @@ impl Unit {
         for tries in 0.. {
             match self.prove().await {
                 Ok(_) => break,
+                // Its program may still be starting: it is there, and says so.
+                Err(error) if is_starting(&error) && began.elapsed() < BUSY_WHEN_MET => self.ask_again(&error).await,
                 Err(error) if self.gives_up(&error, tries, began) => return Err(error),
-                Err(_) => self.link.count_retry(),
+                Err(error) => self.ask_again(&error).await,
             }
         }
         self.identity.clone().ok_or(DeviceError::NotConnected { machine: self.name.clone(), what: "identity" })
@@ -113,8 +118,21 @@ impl Unit {
         let Some(generation) = self.trusted else {
             return Err(DeviceError::NotConnected { machine: self.name.clone(), what });
         };
-        let answer = self.link.ask(self.unit, Some(generation), ask).await;
+        let answer = self.ask(Some(generation), ask).await;
         answer.map(|(_, words)| words).map_err(|fault| self.failed(what, address, fault))
+    }
+
+    /// Asks one thing of it; the bytes of each register stand in the order of the contract here, and in the machine's on the line.
+    async fn ask(&self, generation: Option<u64>, ask: Ask) -> Result<(u64, Vec<u16>), LinkFault> {
+        let order = self.map.word_order;
+        let ask = match ask {
+            Ask::Write { address, words } if order.swaps_bytes() => {
+                Ask::Write { address, words: order.bytes_in_order(words.to_vec()).into() }
+            }
+            ask => ask,
+        };
+        let (generation, words) = self.link.ask(self.unit, generation, ask).await?;
+        Ok((generation, order.bytes_in_order(words)))
     }
 
     /// Gives the connection up because something that came over it does not hold, and says what.
@@ -126,8 +144,17 @@ impl Unit {
         DeviceError::Corrupt { machine: self.name.clone(), what, expected, found }
     }
 
+    /// Whether a question is not asked again. A machine that answers that it is busy has the whole time; one that does not answer, a few tries.
     fn gives_up(&self, error: &DeviceError, tries: u32, began: Instant) -> bool {
-        !error.is_link() || tries >= self.retries || began.elapsed() >= self.lost_after
+        !error.is_link() || (tries >= self.retries && !error.is_busy()) || began.elapsed() >= self.lost_after
+    }
+
+    /// Counts that a question is asked again, and leaves a busy machine alone before.
+    async fn ask_again(&self, error: &DeviceError) {
+        self.link.count_retry();
+        if error.is_busy() {
+            sleep(BUSY_PAUSE).await;
+        }
     }
 
     async fn exchange(&mut self, what: &'static str, address: u16, ask: Ask) -> Result<Vec<u16>, DeviceError> {
@@ -140,12 +167,7 @@ impl Unit {
             match self.attempt(what, address, &ask).await {
                 Ok(words) => return Ok(words),
                 Err(error) if self.gives_up(&error, tries, began) => return Err(error),
-                Err(error) => {
-                    self.link.count_retry();
-                    if matches!(error, DeviceError::Exception { .. }) {
-                        sleep(BUSY_PAUSE).await;
-                    }
-                }
+                Err(error) => self.ask_again(&error).await,
             }
             tries += 1;
         }
@@ -157,7 +179,7 @@ impl Unit {
                 Some(generation) => generation,
                 None => self.prove().await?,
             };
-            match self.link.ask(self.unit, Some(generation), ask.clone()).await {
+            match self.ask(Some(generation), ask.clone()).await {
                 Ok((_, words)) => return Ok(words),
                 // Another machine on the line has met an error; prove again and ask for the first time.
                 Err(LinkFault::Stale) => self.trusted = None,
@@ -187,11 +209,11 @@ impl Unit {
     async fn prove(&mut self) -> Result<u64, DeviceError> {
         let first = self.map.identity;
         let read = Ask::Read { address: first, count: IDENTITY_REGISTERS };
-        let asked = self.link.ask(self.unit, None, read.clone()).await;
+        let asked = self.ask(None, read.clone()).await;
         let (generation, words) = asked.map_err(|fault| self.failed("identity", first, fault))?;
         let identity = self.recognise(&words)?;
         self.synchronise(generation).await?;
-        let again = self.link.ask(self.unit, Some(generation), read).await;
+        let again = self.ask(Some(generation), read).await;
         let (_, again) = again.map_err(|fault| self.failed("identity", first, fault))?;
         self.trusted = Some(generation);
         if again != words {
@@ -215,9 +237,9 @@ impl Unit {
         let address = self.map.sync;
         let nonce: [u16; 2] = rand::random();
         let write = Ask::Write { address, words: Arc::from(&nonce[..]) };
-        let written = self.link.ask(self.unit, Some(generation), write).await;
+        let written = self.ask(Some(generation), write).await;
         written.map_err(|fault| self.failed("proof of sync", address, fault))?;
-        let read = self.link.ask(self.unit, Some(generation), Ask::Read { address, count: 4 }).await;
+        let read = self.ask(Some(generation), Ask::Read { address, count: 4 }).await;
         let (_, found) = read.map_err(|fault| self.failed("proof of sync", address, fault))?;
         let expected = [nonce[0], nonce[1], !nonce[0], !nonce[1]];
         if found != expected {
@@ -231,7 +253,7 @@ impl Unit {
     /// Reads an identity block, or says what it is that answers instead.
     pub(super) fn recognise(&self, words: &[u16]) -> Result<Identity, DeviceError> {
         let machine = self.name.clone();
-        if let Some(how) = layout_fault(words) {
+        if let Some(how) = layout_fault(words, self.map.word_order) {
             return Err(DeviceError::OtherLayout { machine, how });
         }
         for (at, required) in MAGIC.into_iter().enumerate() {
@@ -280,8 +302,14 @@ impl Unit {
     }
 }
 
-/// How an identity block that is there lies otherwise than it must; none where it lies right, or where there is none.
-fn layout_fault(words: &[u16]) -> Option<&'static str> {
+/// Whether a machine, and not a gateway that finds none, says that it cannot answer just now.
+fn is_starting(error: &DeviceError) -> bool {
+    matches!(error, DeviceError::Exception { code: 5 | 6, .. })
+}
+
+/// How an identity block that is there lies otherwise than it must, with the order of words that would be right where it is that; none where it
+/// lies right, or where there is none.
+fn layout_fault(words: &[u16], order: WordOrder) -> Option<Cow<'static, str>> {
     let begins = |from: usize, swap: fn(u16) -> u16| {
         let due = [MAGIC[0], MAGIC[1], VERSION];
         // One that begins a register early has lost its first word.
@@ -290,19 +318,26 @@ fn layout_fault(words: &[u16]) -> Option<&'static str> {
     };
     let (as_it_is, swapped) = (|word: u16| word, u16::swap_bytes);
     if begins(1, swapped) {
-        Some(
-            "with the two bytes of each register exchanged: have its server or the gateway send the high byte first; word_order orders words, and no \
-             bytes",
-        )
+        let exchanged: Vec<u16> = words.iter().copied().map(u16::swap_bytes).collect();
+        let other = order.with_other_bytes();
+        let is_whole = |order| Registers::new(&exchanged, order).u32(4) == SENTINEL_WHOLE;
+        let fits = if is_whole(other) { other } else { other.other() };
+        Some(format!(
+            "with the two bytes of each register the other way round than the cell file says: write word_order = \"{}\", or have its server or the \
+             gateway send the other one first",
+            fits.name()
+        ).into())
     } else if begins(2, as_it_is) || begins(2, swapped) {
         Some(
             "one register later than the cell file says: its server counts from 1 where the protocol counts from 0; correct its addresses, or add 1 to \
-             each in the table `registers` of the cell file",
+             each in the table `registers` of the cell file"
+                .into(),
         )
     } else if begins(0, as_it_is) || begins(0, swapped) {
         Some(
             "one register earlier than the cell file says: its server takes 1 off each address; correct its addresses, or take 1 off each in the table \
-             `registers` of the cell file",
+             `registers` of the cell file"
+                .into(),
         )
     } else {
         None

@@ -1,0 +1,167 @@
+//! The range of each figure that a machine tells of itself, of a measurement or of a pass, in one table. A figure outside of its range
+//! is refused, by whatever wire it came and whatever it is used for.
+
+use std::sync::Arc;
+
+use super::{DeviceError, Measurement, PassRecord, PointStatus};
+
+/// The least and the most that a figure can be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Range {
+    /// The figure, as messages and docs/modbus.md call it.
+    pub figure: &'static str,
+    /// The least that it can be.
+    pub least: f64,
+    /// The most that it can be.
+    pub most: f64,
+    /// Its unit.
+    pub unit: &'static str,
+}
+
+const fn range(figure: &'static str, least: f64, most: f64, unit: &'static str) -> Range {
+    Range { figure, least, most, unit }
+}
+
+const TEMPERATURE: Range = range("the temperature", -40.0, 120.0, "degrees Celsius");
+const DURATION: Range = range("the duration", 0.0, 1e6, "s");
+const PROBE_RADIUS: Range = range("the probe's radius", 0.01, 50.0, "mm");
+const COORDINATE: Range = range("a coordinate", -1e5, 1e5, "mm");
+const QUALITY: Range = range("the quality of a point", 0.0, 100.0, "");
+const COUNT: Range = range("the scale of counts", 1e-9, 0.1, "mm");
+const SPINDLE_LOAD: Range = range("the spindle load", 0.0, 10.0, "");
+const IDLE_SHARE: Range = range("the share of the path that cut nothing", 0.0, 1.0, "");
+
+/// Every range that holds for all machines. Those of a pass that depend on what was commanded are in `drive/pass_record.rs`.
+pub const RANGES: [Range; 8] =
+    [TEMPERATURE, DURATION, PROBE_RADIUS, COORDINATE, QUALITY, COUNT, SPINDLE_LOAD, IDLE_SHARE];
+
+impl Range {
+    fn has(&self, value: f64) -> bool {
+        (self.least..=self.most).contains(&value)
+    }
+
+    /// Says that a value is not in it; none where it is, or was not told.
+    fn flaw(&self, value: Option<f64>) -> Option<String> {
+        let value = value.filter(|value| !self.has(*value))?;
+        let Self { figure, least, most, unit } = self;
+        let unit = if unit.is_empty() { String::new() } else { format!(" {unit}") };
+        Some(format!("{figure} is {value}{unit}, and {least} to {most}{unit} are possible"))
+    }
+
+    fn refuse(&self, machine: &Arc<str>, value: f64) -> Result<(), DeviceError> {
+        if self.has(value) {
+            return Ok(());
+        }
+        let (field, unit) = (self.figure.to_owned(), self.unit.to_owned());
+        let Self { least, most, .. } = *self;
+        Err(DeviceError::OutOfRange { machine: Arc::clone(machine), field, value, least, most, unit })
+    }
+}
+
+/// Refuses a temperature, a progress in steps of a total, or a scale of counts that cannot be.
+pub(super) fn of_status(
+    machine: &Arc<str>,
+    temperature_c: Option<f64>,
+    progress: (u32, u32),
+) -> Result<(), DeviceError> {
+    temperature_c.map_or(Ok(()), |told| TEMPERATURE.refuse(machine, told))?;
+    let (done, total) = progress;
+    range("its progress", 0.0, f64::from(total), "of its job").refuse(machine, f64::from(done))
+}
+
+/// Refuses a scale of counts that cannot be.
+pub(super) fn of_counts(machine: &Arc<str>, scale_mm: f64) -> Result<(), DeviceError> {
+    COUNT.refuse(machine, scale_mm)
+}
+
+impl Measurement {
+    /// Names the first figure of a measurement that cannot be, with its range; what was not told is not judged.
+    pub fn flaw(&self) -> Option<String> {
+        let of_whole = TEMPERATURE
+            .flaw(self.temperature_c)
+            .or_else(|| DURATION.flaw(self.duration_s))
+            .or_else(|| PROBE_RADIUS.flaw(self.probe_radius_mm));
+        of_whole.or_else(|| {
+            let mut touched = self.points.iter().filter(|point| point.status == PointStatus::Touched);
+            touched.find_map(|point| {
+                let of_place = point.at_mm.into_iter().find_map(|at_mm| COORDINATE.flaw(Some(at_mm)));
+                let flaw = of_place.or_else(|| QUALITY.flaw(Some(f64::from(point.quality))))?;
+                Some(format!("target {}: {flaw}", point.index))
+            })
+        })
+    }
+}
+
+impl PassRecord {
+    /// Names the first figure of a pass record that no pass can have, with its range; what was not told is not judged.
+    pub fn flaw(&self) -> Option<String> {
+        TEMPERATURE
+            .flaw(self.temperature_c)
+            .or_else(|| DURATION.flaw(self.duration_s))
+            .or_else(|| SPINDLE_LOAD.flaw(self.spindle_load))
+            .or_else(|| IDLE_SHARE.flaw(self.idle_share))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Coordinates, MeasuredPoint};
+
+    fn measurement() -> Measurement {
+        let point = MeasuredPoint { index: 7, status: PointStatus::Touched, quality: 0, at_mm: [1.0, 2.0, 3.0] };
+        let missed = MeasuredPoint { index: 8, status: PointStatus::NotFound, quality: 0, at_mm: [f64::NAN; 3] };
+        Measurement {
+            points: vec![point, missed],
+            coordinates: Coordinates::Centres,
+            probe_radius_mm: Some(2.0),
+            temperature_c: Some(20.0),
+            duration_s: Some(60.0),
+            plan_identity: [0; 32],
+            job: 1,
+            cycle: 1,
+            done: 1,
+        }
+    }
+
+    #[test]
+    fn a_figure_of_a_measurement_that_cannot_be_is_named_with_its_range() {
+        assert_eq!(measurement().flaw(), None);
+        let untold = Measurement { temperature_c: None, duration_s: None, probe_radius_mm: None, ..measurement() };
+        assert_eq!(untold.flaw(), None);
+        let point = |quality, at_mm| {
+            let mut of = measurement();
+            (of.points[0].quality, of.points[0].at_mm) = (quality, at_mm);
+            of
+        };
+        let cases = [
+            (Measurement { temperature_c: Some(-327.0), ..measurement() }, "the temperature is -327 "),
+            (Measurement { temperature_c: Some(f64::NAN), ..measurement() }, "the temperature is NaN "),
+            (Measurement { duration_s: Some(-5.0), ..measurement() }, "the duration is -5 s"),
+            (
+                Measurement { probe_radius_mm: Some(0.0), ..measurement() },
+                "the probe's radius is 0 mm, and 0.01 to 50 mm",
+            ),
+            (point(101, [1.0; 3]), "target 7: the quality of a point is 101, and 0 to 100 are"),
+            (point(0, [1.0, 1e30, 1.0]), "target 7: a coordinate is 1000000000000000"),
+            (point(0, [1.0, 1.0, f64::NEG_INFINITY]), "target 7: a coordinate is -inf mm"),
+        ];
+        for (measurement, words) in cases {
+            let flaw = measurement.flaw().unwrap_or_else(|| panic!("nothing is found wrong, expected {words}"));
+            assert!(flaw.contains(words), "{flaw:?} without {words:?}");
+        }
+    }
+
+    #[test]
+    fn a_status_that_cannot_be_is_refused() {
+        let machine: Arc<str> = "a machine".into();
+        let of = |temperature_c, progress| of_status(&machine, temperature_c, progress).is_ok();
+        assert!(of(Some(20.0), (0, 0)) && of(None, (7, 7)) && of(Some(-40.0), (0, 1000)));
+        assert!(!of(Some(-327.68), (0, 0)) && !of(Some(20.0), (549, 1)) && !of(Some(20.0), (1, 0)));
+        assert!(
+            of_counts(&machine, 1e-6).is_ok()
+                && of_counts(&machine, 0.0).is_err()
+                && of_counts(&machine, f64::NAN).is_err()
+        );
+    }
+}
