@@ -61,7 +61,7 @@ catalogue! { german:
     WordOrder {
         "Die Maschine sendet ihre Register in anderer Wortfolge, als die Zellendatei sagt",
         "Jede Zahl wäre falsch; darum wurde nichts geschrieben, und der Lauf beginnt nicht.",
-        ["word_order in der Zellendatei auf den anderen Wert von big und little stellen.", "Den Lauf neu starten."]
+        ["word_order in der Zellendatei auf die genannte Reihenfolge stellen.", "Den Lauf neu starten."]
     }
     Inches {
         "Längen sind in Zoll", "Sie werden nicht verwendet: Regrind arbeitet in Millimetern.",
@@ -90,7 +90,7 @@ catalogue! { german:
     }
     ConditionLost {
         "Eine Voraussetzung für die Arbeit fehlt", "Die Zelle wartet und fährt von selbst fort, sobald sie wieder erfüllt ist.",
-        ["Druckluft, Kühlmittel oder Temperatur wiederherstellen.", "Warten: die Zelle fährt von selbst fort."]
+        ["Druckluft oder Kühlmittel wiederherstellen, oder das genannte Signal in seinen Bereich bringen.", "Gibt die Maschine keine Zahl für ein Signal: seine Adresse in der Zellendatei oder den Sensor berichtigen.", "Warten: die Zelle fährt von selbst fort."]
     }
     StaysSuspended {
         "Die Ursache der Unterbrechung ging nicht weg", "Die Zelle fährt nicht mehr von selbst fort.",
@@ -151,6 +151,17 @@ catalogue! { german:
         ["Maschine und Teil ansehen.", "RESUME fragt die Maschine, was aus dem Auftrag wurde.",
          "Kann sie es nicht sagen: den Auftrag für beendet erklären, mit dem, was zu sehen war, und mit RESUME das Teil messen."]
     }
+    JobVanished {
+        "Eine Maschine hat den Auftrag nicht mehr, an dem sie war", "Der Auftrag wird nicht noch einmal begonnen, und nichts bewegt sich auf Anweisung der Zelle.",
+        ["Die Maschine ansehen: steht sie still und frei vom Teil? Wurde das Teil berührt?", "RESUME fragt die Maschine noch einmal.",
+         "Kann sie es nicht sagen: den Auftrag für beendet erklären, mit dem, was zu sehen war; dann mit RESUME das Teil messen, wie es ist.",
+         "Oder den Lauf beenden."]
+    }
+    FailsAgain {
+        "Derselbe Schritt scheitert immer wieder", "Die Zelle ist angehalten und versucht es nicht mehr von selbst.",
+        ["Die letzte Antwort lesen: sie sagt, was nicht geht.", "Die Maschine, ihr Programm und ihre Leitung ansehen.",
+         "RESUME versucht es noch einmal; oder den Lauf beenden."]
+    }
     ProgramRestarted {
         "Das Programm wurde mitten im Lauf neu gestartet", "Die Zelle ist angehalten; die Maschinen werden gefragt, was aus ihren Aufträgen wurde, und was sich bewegt, wird angehalten.",
         ["Beide Maschinen ansehen: der Zustand sagt, was festgestellt wurde und was nicht.", "RESUME: die Zelle fährt von dort fort."]
@@ -189,7 +200,7 @@ catalogue! { german:
     }
     BrokenResult {
         "Das Ergebnis ist beschädigt", "Es wird nicht verwendet.",
-        ["Verbindung und Messprogramm prüfen.", "RESUME misst noch einmal."]
+        ["Lesen, was daran nicht sein kann: ein Wert oder Punkt, der nicht sein kann, kommt vom Taster oder vom Messprogramm, eine falsche Zahl von Punkten von seiner Liste der Ziele.", "Das berichtigen; RESUME misst noch einmal."]
     }
     Temperature {
         "Die Temperatur war während der Messung außerhalb ihrer Grenzen", "Diese Messung wird nicht verwendet.",
@@ -278,6 +289,12 @@ catalogue! { german:
         "Der Datenträger ist voll", "Keine neue Bewegung beginnt: was nicht im Protokoll steht, wird nicht getan.",
         ["Platz auf dem Datenträger des Laufs schaffen.", "RESUME drücken."]
     }
+    ControlLost {
+        "Der Weg, auf dem Anweisungen die Zelle erreichen, wurde weggenommen",
+        "Der Lauf geht weiter, und der Weg wird neu gemacht. Strg-C im Terminal des Laufs hält an, zweimal bricht ab.",
+        ["Feststellen, wer Dateien im Ordner des Laufs löscht oder verschiebt.", "`regrind status` zeigt, ob Anweisungen wieder ankommen.",
+         "Kommen keine an, den Lauf anhalten."]
+    }
     HoldNotConfirmed {
         "Eine Maschine hat nicht bestätigt, dass sie hält", "Beide Maschinen werden angewiesen, nach ihrem eigenen sicheren Ablauf zu enden.",
         ["An der Maschine nachsehen.", "Bewegt sie sich noch, den Not-Halt der Maschine benutzen."]
@@ -296,13 +313,13 @@ catalogue! { german:
 catalogue! { chinese:
     Unreachable { "无法连接到设备", "运行不会开始。", ["确认设备已通电且控制器正在运行。", "检查电缆和单元文件中的地址。", "重新启动运行。"] }
     WrongDevice { "应答的设备与单元文件所指的不同", "未写入任何内容；运行不会开始。", ["将单元文件中的地址与设备核对。", "确认没有其他设备使用该地址。", "重新启动运行。"] }
-    WordOrder { "设备的寄存器字序与单元文件不一致", "所有数值都会出错，因此未写入任何内容；运行不会开始。", ["将单元文件中的 word_order 改为 big 与 little 中的另一个。", "重新启动运行。"] }
+    WordOrder { "设备的寄存器字序与单元文件不一致", "所有数值都会出错，因此未写入任何内容；运行不会开始。", ["将单元文件中的 word_order 改为所指出的顺序。", "重新启动运行。"] }
     Inches { "长度单位是英寸", "这些数据不予使用：Regrind 以毫米工作。", ["将测量程序和控制器设为毫米。", "按 RESUME 重新测量，或重新启动运行。"] }
     Owned { "设备被另一个客户端占用", "运行不会开始。", ["找到占用设备的其他程序或面板并释放设备。", "重新启动运行。"] }
     NotIdle { "设备不空闲", "运行不会开始；设备上未作任何更改。", ["查看设备，在其面板上结束或清除正在进行的工作。", "如果它仍持有被中断的运行的任务，请继续那个运行。", "重新启动运行。"] }
     LinkLost { "与设备的连接中断", "不会开始新的动作。运动中的设备会自行保持；连接恢复后，单元会询问其任务的结果并继续。", ["检查电缆、交换机以及控制器是否运行。", "如果设备以异常应答：将单元文件的寄存器表与设备的核对。", "等待：单元会自行继续。", "如果无法修复，请结束或中止运行。"] }
     ProgramFailed { "本程序的一部分已失效，不再与设备通信", "设备收不到心跳，会按自身的静默时限保持。运行不能与它继续。", ["查看设备：在其面板上结束正在进行的工作。", "中止运行：另一台设备会收到，这一台不会。", "连同运行文件夹报告该故障。", "开始新的运行，先按现状测量工件。"] }
-    ConditionLost { "缺少工作条件", "单元等待，条件恢复后自行继续。", ["恢复气源、冷却液或温度。", "等待：单元会自行继续。"] }
+    ConditionLost { "缺少工作条件", "单元等待，条件恢复后自行继续。", ["恢复气源或冷却液，或使所指的信号回到其范围内。", "如果设备对某信号不给出数值：更正单元文件中的地址或传感器。", "等待：单元会自行继续。"] }
     StaysSuspended { "暂停的原因没有消失", "单元不再自行继续。", ["消除原因。", "按 RESUME，或结束运行。"] }
     MachineFault { "设备故障", "已要求两台设备按各自的安全流程结束；运行已结束。", ["首先查看设备。", "消除原因并在设备上清除故障。", "检查工件；已磨去的无法恢复。", "开始以测量为起点的新运行。"] }
     MachineHeldItself { "设备未经命令自行保持", "单元随之保持。", ["查明原因：面板上的进给保持、通信静默、防护门。", "在此处按 RESUME，不要在设备上操作。"] }
@@ -316,6 +333,8 @@ catalogue! { chinese:
     PassRecord { "磨床对该次磨削的报告不可能成立", "单元在其后保持。磨削不重复：按现状测量工件。", ["查看工件和砂轮：这次磨削是否用了此误差图和此砂轮？", "将该数值及其限值与设备程序和配方核对。", "按 RESUME 按现状测量工件，或结束运行。"] }
     StartUnknown { "不知道任务是否已启动", "绝不凭猜测重复 START。单元不命令任何动作。", ["查看设备：是否静止且离开工件？工件是否被触及？", "按 RESUME 再次询问设备。", "如果它无法说明：按所见声明任务已结束，再按 RESUME 测量工件。", "或结束运行。"] }
     MachineRestarted { "设备在运行中途重新启动", "它可能不知道自己做了什么。单元不命令任何动作。", ["查看设备和工件。", "按 RESUME 询问设备任务的结果。", "如果它无法说明：按所见声明任务已结束，再按 RESUME 测量工件。"] }
+    JobVanished { "设备不再有它正在执行的任务", "该任务不会再次启动。单元不命令任何动作。", ["查看设备：是否静止且离开工件？工件是否被触及？", "按 RESUME 再次询问设备。", "如果它无法说明：按所见声明任务已结束，再按 RESUME 按现状测量工件。", "或结束运行。"] }
+    FailsAgain { "同一步骤一再失败", "单元已保持，不再自行重试。", ["阅读最后的回答：它说明哪里不行。", "查看设备、其程序和线路。", "按 RESUME 重试，或结束运行。"] }
     ProgramRestarted { "程序在运行中途重新启动", "单元保持；询问设备其任务的结果，运动中的被保持。", ["查看两台设备：状态说明了哪些已查明、哪些没有。", "按 RESUME：单元从该处继续。"] }
     NotClear { "设备没有离开工件", "另一台设备不启动。", ["在其面板上将它移到停放位置。", "按 RESUME。"] }
     Coverage { "工件被测量的部分太少", "本次测量不予使用。", ["检查工件上是否有冷却液、切屑或压板，测针是否磨损或弯曲。", "按 RESUME 重新测量。"] }
@@ -324,7 +343,7 @@ catalogue! { chinese:
     ProbeRadius { "测头半径与配方不符", "本次测量不予使用：每个偏差都会因此出错。", ["清洁测球和标准球。", "在设备上校准测头，或换上正确的测针。", "按 RESUME 重新测量；半径不同的配方需要新的运行。"] }
     Contacts { "设备给出的是接触点，而应为测球中心", "本次测量不予使用：会有一个测头半径的误差。", ["关闭测量程序的半径补偿。", "按 RESUME 重新测量。"] }
     ForeignResult { "结果属于另一个工件、方案或循环", "不予使用。", ["查看设备执行了哪个任务。", "按 RESUME 重新测量。"] }
-    BrokenResult { "结果已损坏", "不予使用。", ["检查连接和测量程序。", "按 RESUME 重新测量。"] }
+    BrokenResult { "结果已损坏", "不予使用。", ["阅读其中哪一项不可能：不可能的数值或点来自测头或测量程序，点数不符来自其目标列表。", "更正后按 RESUME 重新测量。"] }
     Temperature { "测量期间温度超出允许范围", "本次测量不予使用。", ["等待工件和室温稳定。", "按 RESUME 重新测量。"] }
     RegistrationFailed { "测量无法与名义面配准", "本次测量不予使用。", ["确认工件与配方中的名义面相符。", "查看运行文件夹中本循环的点。", "按 RESUME 重新测量，或结束运行。"] }
     ComputationLate { "计算超时", "单元在其之前保持。", ["查看计算机是否过载。", "按 RESUME 重新计算。"] }
@@ -343,6 +362,7 @@ catalogue! { chinese:
     BudgetSpent { "允许去除的材料已用完", "不再磨削；运行结束，未达到公差。", ["由质量部门决定该工件：已磨去的无法恢复。", "下一个工件请留更多余量。"] }
     JournalUnwritable { "无法写入运行记录", "不开始新的动作：没有记录的就不做。", ["检查运行文件夹：权限、网络驱动器、磁盘。", "按 RESUME。"] }
     DiskFull { "磁盘已满", "不开始新的动作：没有记录的就不做。", ["释放运行文件夹所在磁盘的空间。", "按 RESUME。"] }
+    ControlLost { "指令到达单元的通道被移走", "运行继续，通道会重新建立。在运行终端按一次 Ctrl-C 保持，两次中止。", ["查明谁在删除或移动运行文件夹中的文件。", "`regrind status` 显示指令是否又能到达。", "如果不能，保持运行。"] }
     HoldNotConfirmed { "设备未确认已保持", "已要求两台设备按各自的安全流程结束。", ["查看设备。", "如果仍在运动，请使用设备自身的急停回路。"] }
     StopNotConfirmed { "停止未确认：设备没有报告已静止", "它可能仍在运动。", ["使用设备自身的急停回路。", "在看到设备静止之前不要靠近。", "然后查明它为何不应答。"] }
     WaitedTooLong { "无人及时应答", "运行有序结束。", ["消除保持的原因，并开始以测量为起点的运行。"] }

@@ -2,13 +2,15 @@
 
 use std::io;
 use std::net::IpAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use axum::Router;
-use axum::extract::{DefaultBodyLimit, State};
-use axum::http::HeaderMap;
-use axum::middleware::from_fn_with_state;
+use axum::extract::{DefaultBodyLimit, Request, State};
+use axum::http::header::CONNECTION;
+use axum::http::{HeaderMap, StatusCode};
+use axum::middleware::{Next, from_fn, from_fn_with_state};
+use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use hyper::body::Incoming;
 use hyper::service::{Service, service_fn};
@@ -16,15 +18,19 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpListener;
-use tokio::sync::Semaphore;
+use tokio::task::AbortHandle;
 
 use super::guard::{self, Entrance, Guard, Peer};
 use super::view::{self, PageOf};
 use super::{assets, sign_in};
 
-/// Most connections at a time, and the longest a client may take to say what it wants.
-const CONNECTIONS: usize = 512;
+/// Most connections at a time of those who are let in, of those who are not yet, and of the latter from one address.
+const KNOWN: usize = 512;
+const STRANGERS: usize = 384;
+const STRANGERS_OF_ADDRESS: usize = 64;
+/// The longest a client may take to say what it wants, its body too, and the longest until its answer begins.
 const PATIENCE: Duration = Duration::from_secs(10);
+const ANSWERS_WITHIN: Duration = Duration::from_secs(20);
 /// Longest body of an order.
 const LONGEST_BODY: usize = 4096;
 
@@ -58,40 +64,130 @@ impl Door {
 pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Router) {
     let tls = guard.entrance.tls.clone();
     let service = TowerToHyperService::new(guarded(guard, routes));
-    let places = Arc::new(Semaphore::new(CONNECTIONS));
-    loop {
-        let Ok(place) = Arc::clone(&places).acquire_owned().await else { return };
+    let connections = Arc::new(Connections::default());
+    for number in 0.. {
         let Ok((stream, peer)) = listener.accept().await else {
             // No descriptor is left, or the client has gone: that passes.
             tokio::time::sleep(Duration::from_millis(50)).await;
             continue;
         };
         let (service, tls) = (service.clone(), tls.clone());
-        tokio::spawn(async move {
+        let place = Place { connections: Arc::clone(&connections), number };
+        let (of, task) = (peer.ip(), Arc::clone(&connections));
+        let is_known: Arc<dyn Fn() + Send + Sync> = Arc::new(move || task.know(number));
+        let serving = tokio::spawn(async move {
             let _place = place;
             // A client that goes away or misbehaves is no concern of anybody else.
             match tls {
-                None => answer(stream, peer.ip(), service).await,
+                None => answer(stream, Peer(peer.ip(), is_known), service).await,
                 Some(tls) => {
                     if let Ok(Ok(stream)) = tokio::time::timeout(PATIENCE, tls.accept(stream)).await {
-                        answer(stream, peer.ip(), service).await;
+                        answer(stream, Peer(peer.ip(), is_known), service).await;
                     }
                 }
             }
         });
+        connections.add(number, of, serving.abort_handle());
+    }
+}
+
+/// The connections of a page. One more than there is room for of those who are not let in ends the oldest of them, of the same address first: whoever
+/// opens many and says nothing keeps out nobody but himself.
+#[derive(Default)]
+struct Connections(Mutex<Open>);
+
+#[derive(Default)]
+struct Open {
+    /// In the order in which they came, those of strangers.
+    strangers: Vec<(u64, IpAddr, AbortHandle)>,
+    known: Vec<(u64, AbortHandle)>,
+    /// Those that ended, or were known, before they were added.
+    early: Vec<(u64, bool)>,
+}
+
+impl Connections {
+    fn open(&self) -> MutexGuard<'_, Open> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn add(&self, number: u64, from: IpAddr, serving: AbortHandle) {
+        let mut open = self.open();
+        let early: Vec<bool> =
+            open.early.extract_if(.., |(of, _)| *of == number).map(|(_, has_ended)| has_ended).collect();
+        if early.contains(&true) {
+            return;
+        }
+        if early.contains(&false) {
+            return open.know(number, serving);
+        }
+        open.strangers.push((number, from, serving));
+        let of_address = open.strangers.iter().filter(|(_, of, _)| *of == from).count();
+        let oldest = match of_address > STRANGERS_OF_ADDRESS {
+            true => open.strangers.iter().position(|(_, of, _)| *of == from),
+            false => (open.strangers.len() > STRANGERS).then_some(0),
+        };
+        if let Some(oldest) = oldest {
+            open.strangers.remove(oldest).2.abort();
+        }
+    }
+
+    /// Whoever is at the other end has been let in.
+    fn know(&self, number: u64) {
+        let mut open = self.open();
+        if open.known.iter().any(|(of, _)| *of == number) {
+            return;
+        }
+        match open.strangers.iter().position(|(of, ..)| *of == number) {
+            Some(at) => {
+                let (_, _, serving) = open.strangers.remove(at);
+                open.know(number, serving);
+            }
+            None => open.early.push((number, false)),
+        }
+    }
+
+    fn end(&self, number: u64) {
+        let mut open = self.open();
+        let before = open.strangers.len() + open.known.len();
+        open.strangers.retain(|(of, ..)| *of != number);
+        open.known.retain(|(of, _)| *of != number);
+        if open.strangers.len() + open.known.len() == before {
+            open.early.push((number, true));
+        }
+    }
+}
+
+impl Open {
+    fn know(&mut self, number: u64, serving: AbortHandle) {
+        self.known.push((number, serving));
+        if self.known.len() > KNOWN {
+            self.known.remove(0).1.abort();
+        }
+    }
+}
+
+/// A connection, until it ends.
+struct Place {
+    connections: Arc<Connections>,
+    number: u64,
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.connections.end(self.number);
     }
 }
 
 /// Answers what comes over one connection.
 async fn answer(
     stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
-    from: IpAddr,
+    peer: Peer,
     service: TowerToHyperService<Router>,
 ) {
     let mut http = hyper::server::conn::http1::Builder::new();
     let http = http.timer(TokioTimer::new()).header_read_timeout(PATIENCE);
     let service = service_fn(move |mut request: hyper::Request<Incoming>| {
-        request.extensions_mut().insert(Peer(from));
+        request.extensions_mut().insert(peer.clone());
         service.call(request)
     });
     drop(http.serve_connection(TokioIo::new(stream), service).await);
@@ -110,4 +206,14 @@ fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
         .route("/assets/{name}", get(assets::asset))
         .layer(from_fn_with_state(guard, guard::names_this_page))
         .layer(DefaultBodyLimit::max(LONGEST_BODY))
+        .layer(from_fn(in_time))
+}
+
+/// Gives up a request whose answer does not begin in time, be it that its body does not come.
+async fn in_time(request: Request, next: Next) -> Response {
+    match tokio::time::timeout(ANSWERS_WITHIN, next.run(request)).await {
+        Ok(response) => response,
+        // The connection has half a request on it, and is of no more use.
+        Err(_) => (StatusCode::REQUEST_TIMEOUT, [(CONNECTION, "close")]).into_response(),
+    }
 }

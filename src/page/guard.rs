@@ -14,7 +14,8 @@ use std::time::{Duration, Instant};
 use axum::Extension;
 use axum::extract::{Request, State};
 use axum::http::header::{
-    CACHE_CONTROL, COOKIE, HOST, LOCATION, ORIGIN, REFERRER_POLICY, SET_COOKIE, X_CONTENT_TYPE_OPTIONS,
+    CACHE_CONTROL, COOKIE, HOST, LOCATION, ORIGIN, REFERRER_POLICY, SET_COOKIE, STRICT_TRANSPORT_SECURITY,
+    X_CONTENT_TYPE_OPTIONS,
 };
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
 use axum::middleware::Next;
@@ -64,7 +65,10 @@ impl Entrance {
     fn is_host(&self, named: &str) -> bool {
         let port = self.address.port();
         let (host, at) = match named.rsplit_once(':') {
-            Some((host, at)) if !at.ends_with(']') => (host, at.parse().ok()),
+            // A sign before it would be read as a number too.
+            Some((host, at)) if !at.ends_with(']') => {
+                (host, at.parse().ok().filter(|_| at.bytes().all(|byte| byte.is_ascii_digit())))
+            }
             // What browsers leave out.
             _ => (named, Some(if self.tls.is_some() { 443 } else { 80 })),
         };
@@ -116,6 +120,16 @@ impl Rate {
 
     pub(crate) fn is_over(&self) -> bool {
         self.began.elapsed() > MINUTE
+    }
+
+    /// How long ago the minute began.
+    pub(crate) fn age(&self) -> Duration {
+        self.began.elapsed()
+    }
+
+    /// How often it has happened since the minute began.
+    pub(crate) fn so_far(&self) -> u32 {
+        self.count
     }
 
     pub(crate) fn count(&mut self) -> u32 {
@@ -216,15 +230,28 @@ impl Guard {
         self.entrance.users.as_ref().is_none_or(|users| person(users) == session.person)
     }
 
-    /// Tells that something was refused, to who keeps it; returns whether it should be on record too.
+    /// Tells that something was refused, to who keeps it; returns whether it should be on record too. Of many within a minute the first are told, and
+    /// all are counted.
     pub(crate) fn refused(&self, what: &str) -> bool {
-        let told = self.refusals.lock().unwrap_or_else(PoisonError::into_inner).count();
+        let (told, untold) = {
+            let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
+            let untold = if refusals.is_over() { refusals.so_far().saturating_sub(TOLD) } else { 0 };
+            (refusals.count(), untold)
+        };
+        if untold > 0 {
+            (self.log)(&format!("{untold} more were refused in that minute"));
+        }
         if told <= TOLD {
             (self.log)(what);
         } else if told == TOLD + 1 {
-            (self.log)("more was refused within the same minute and is not told one by one");
+            (self.log)("more was refused within the same minute: it is counted, and not told one by one");
         }
         told <= TOLD
+    }
+
+    /// Tells who keeps it that somebody came in.
+    pub(crate) fn tell(&self, what: &str) {
+        (self.log)(what);
     }
 
     /// Has it told and on record that something was refused.
@@ -264,9 +291,9 @@ impl Guard {
     }
 }
 
-/// Where a request came from.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Peer(pub(crate) IpAddr);
+/// Where a request came from, and what is to be told of its connection once it is let in.
+#[derive(Clone)]
+pub(crate) struct Peer(pub(crate) IpAddr, pub(crate) Arc<dyn Fn() + Send + Sync>);
 
 /// The browser that a request comes from, and who sits at it where people sign in. Whatever is let in has one.
 #[derive(Clone, Debug)]
@@ -286,8 +313,9 @@ impl Session {
 
 /// Refuses a request that names another page than this one, and puts on every answer what a browser may make of it.
 pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
-    let host = text(request.headers(), HOST).unwrap_or_default();
-    let mut response = if guard.entrance.is_host(host) {
+    let mut hosts = request.headers().get_all(HOST).iter();
+    let host = hosts.next().and_then(|host| host.to_str().ok()).unwrap_or_default();
+    let mut response = if hosts.next().is_none() && guard.entrance.is_host(host) {
         next.run(request).await
     } else {
         guard.record_refusal(&format!("a request for the host {}", printable(host)));
@@ -299,13 +327,18 @@ pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Re
     headers.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
     // Without any, a form would be sent as from nowhere.
     headers.insert(REFERRER_POLICY, HeaderValue::from_static("same-origin"));
+    // What stands there now is of no use later, and who uses the computer next has no business with it.
+    headers.entry(CACHE_CONTROL).or_insert(HeaderValue::from_static("no-store"));
+    if guard.entrance.tls.is_some() {
+        headers.insert(STRICT_TRANSPORT_SECURITY, HeaderValue::from_static("max-age=31536000"));
+    }
     response
 }
 
 /// Lets in who has the key or has signed in, and turns a key in the address into a cookie.
 pub(crate) async fn let_in(
     State(guard): State<Arc<Guard>>,
-    Extension(Peer(from)): Extension<Peer>,
+    Extension(Peer(from, is_known)): Extension<Peer>,
     mut request: Request,
     next: Next,
 ) -> Response {
@@ -326,6 +359,7 @@ pub(crate) async fn let_in(
         Some(Session { id, person: None, from })
     };
     let Some(session) = session else { return not_signed_in(&guard, &request) };
+    is_known();
     request.extensions_mut().insert(session);
     next.run(request).await
 }

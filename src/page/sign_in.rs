@@ -23,10 +23,13 @@ use super::view;
 const LASTS: Duration = Duration::from_secs(12 * 3600);
 /// Most browsers that are signed in at a time; the one that signed in first goes.
 const MOST: usize = 256;
-/// Tries within a minute from one place; more are not looked at.
+/// Tries within a minute under one name from one place; more are not looked at. Others at that place sign in all the same.
 const TRIES: u32 = 10;
-/// Places of which the tries are counted.
-const PLACES: usize = 4096;
+/// Names and places of which the tries are counted; of one place only so many, the oldest forgotten first.
+const COUNTED: usize = 4096;
+const NAMES_OF_PLACE: usize = 64;
+/// Proofs that one place may have waiting: whoever else signs in is not kept behind its guesses.
+const WAITING_OF_PLACE: usize = 2;
 /// Longest time that somebody waits for the guesses of others.
 const WAITS: Duration = Duration::from_secs(5);
 
@@ -34,14 +37,21 @@ const WAITS: Duration = Duration::from_secs(5);
 pub(crate) struct SignedIn {
     /// By the session of the browser, in the order in which they came.
     sessions: Mutex<Vec<(String, Proven, Instant)>>,
-    tries: Mutex<HashMap<IpAddr, Rate>>,
+    tries: Mutex<HashMap<(IpAddr, String), Rate>>,
+    /// How many proofs each place has waiting.
+    waiting: Mutex<HashMap<IpAddr, usize>>,
     /// A proof costs time and memory by design: one at a time, so that guesses cost the computer no more than that.
     proving: Arc<Semaphore>,
 }
 
 impl Default for SignedIn {
     fn default() -> Self {
-        Self { sessions: Mutex::default(), tries: Mutex::default(), proving: Arc::new(Semaphore::new(1)) }
+        Self {
+            sessions: Mutex::default(),
+            tries: Mutex::default(),
+            waiting: Mutex::default(),
+            proving: Arc::new(Semaphore::new(1)),
+        }
     }
 }
 
@@ -66,19 +76,57 @@ impl SignedIn {
         self.sessions.lock().unwrap_or_else(PoisonError::into_inner).retain(|(id, ..)| id != session);
     }
 
-    /// Counts a try from a place; returns whether it is looked at.
-    fn may_try(&self, from: IpAddr) -> bool {
+    /// Counts a try under a name from a place; returns whether it is looked at.
+    fn may_try(&self, from: IpAddr, name: &str) -> bool {
         let mut tries = self.tries.lock().unwrap_or_else(PoisonError::into_inner);
-        if tries.len() >= PLACES {
-            tries.retain(|_, rate| !rate.is_over());
+        tries.retain(|_, rate| !rate.is_over());
+        let this = (place(from), name.to_owned());
+        if !tries.contains_key(&this) {
+            let of_place: Vec<_> = tries.iter().filter(|((place, _), _)| *place == this.0).collect();
+            let oldest = of_place.iter().max_by_key(|(_, rate)| rate.age()).map(|(tried, _)| (*tried).clone());
+            if let Some(oldest) = oldest.filter(|_| of_place.len() >= NAMES_OF_PLACE) {
+                tries.remove(&oldest);
+            }
+            if tries.len() >= COUNTED {
+                return false;
+            }
         }
-        let known = tries.contains_key(&place(from));
-        (known || tries.len() < PLACES) && tries.entry(place(from)).or_insert_with(Rate::new).count() <= TRIES
+        tries.entry(this).or_insert_with(Rate::new).count() <= TRIES
     }
 
     /// Who knows their password has all tries again.
-    fn forget_tries(&self, from: IpAddr) {
-        self.tries.lock().unwrap_or_else(PoisonError::into_inner).remove(&place(from));
+    fn forget_tries(&self, from: IpAddr, name: &str) {
+        self.tries.lock().unwrap_or_else(PoisonError::into_inner).remove(&(place(from), name.to_owned()));
+    }
+
+    /// Takes a place in the line of those whose passwords are looked at, until it is dropped; none where that place has its share.
+    fn wait(&self, from: IpAddr) -> Option<Waiting<'_>> {
+        let place = place(from);
+        let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
+        let count = waiting.entry(place).or_default();
+        if *count >= WAITING_OF_PLACE {
+            return None;
+        }
+        *count += 1;
+        Some(Waiting { of: self, place })
+    }
+}
+
+/// A place in the line of those whose passwords are looked at.
+struct Waiting<'s> {
+    of: &'s SignedIn,
+    place: IpAddr,
+}
+
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        let mut waiting = self.of.waiting.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(count) = waiting.get_mut(&self.place) {
+            *count -= 1;
+            if *count == 0 {
+                waiting.remove(&self.place);
+            }
+        }
     }
 }
 
@@ -99,7 +147,7 @@ pub(crate) struct Credentials {
 
 pub(crate) async fn sign_in(
     State(guard): State<Arc<Guard>>,
-    Extension(Peer(from)): Extension<Peer>,
+    Extension(Peer(from, _)): Extension<Peer>,
     headers: HeaderMap,
     Form(given): Form<Credentials>,
 ) -> Response {
@@ -113,8 +161,9 @@ pub(crate) async fn sign_in(
     if let Some(what) = foreign_origin(&guard, &headers) {
         return refuse(StatusCode::FORBIDDEN, what, Text::SignInRefused);
     }
-    let who = printable(&given.name);
-    if !guard.signed_in.may_try(from) {
+    let (who, name) = (printable(&given.name), given.name.trim().to_lowercase());
+    let waiting = guard.signed_in.wait(from);
+    if waiting.is_none() || !guard.signed_in.may_try(from, &name) {
         let what = format!("one of too many tries to sign in within a minute, as {who}, from {from}");
         return refuse(StatusCode::TOO_MANY_REQUESTS, what, Text::TooManyTries);
     }
@@ -122,8 +171,10 @@ pub(crate) async fn sign_in(
         let what = format!("a wrong name or password, {who}, from {from}");
         return refuse(StatusCode::UNAUTHORIZED, what, Text::SignInRefused);
     };
-    guard.signed_in.forget_tries(from);
-    guard.record(format!("{} signed in at the page, from {from}", proven.person()));
+    guard.signed_in.forget_tries(from, &name);
+    let signed_in = format!("{} signed in at the page, from {from}", proven.person());
+    guard.tell(&signed_in);
+    guard.record(signed_in);
     // A name of this sign-in alone: nobody can have known it before.
     let Ok(session) = random_word() else { return StatusCode::INTERNAL_SERVER_ERROR.into_response() };
     guard.signed_in.add(&session, proven);

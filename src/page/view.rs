@@ -370,13 +370,19 @@ fn control(is_elsewhere: bool, language: Language) -> Markup {
     }
 }
 
+/// The name of a run as a part of an address: a folder may be called anything.
+fn in_path(run: &str) -> String {
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-._~".contains(&byte);
+    run.bytes().map(|byte| if is_plain(byte) { char::from(byte).to_string() } else { format!("%{byte:02X}") }).collect()
+}
+
 /// The page of the run that is on; of the last one where none is.
 pub(crate) async fn home(State(page): State<Shared>) -> Response {
     let history = std::sync::Arc::clone(&page.history);
     let listed = spawn_blocking(move || history.list()).await.unwrap_or_default();
     let live = listed.iter().filter(|run| run.is_live).count();
     match listed.first().filter(|_| live <= 1) {
-        Some(first) => Redirect::to(&format!("/runs/{}", first.id)).into_response(),
+        Some(first) => Redirect::to(&format!("/runs/{}", in_path(&first.id))).into_response(),
         None => Redirect::to("/runs").into_response(),
     }
 }
@@ -428,7 +434,7 @@ fn cell(seen: &Seen, id: &str, session: &Session, has_control: bool, language: L
                 h2 { (say(Text::Figures)) }
                 div #figures { (piece(Piece::Figures)) }
                 div #about { (piece(Piece::About)) }
-                p { a href=(format!("/runs/{id}/report")) { (say(Text::Report)) } }
+                p { a href=(format!("/runs/{}/report", in_path(id))) { (say(Text::Report)) } }
             }
         }
         section #orders .orders {
@@ -560,7 +566,7 @@ fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> M
                 @let figures = summary.cycles.iter().rev().find_map(|of| of.figures);
                 tr {
                     td { input type="checkbox" name="run" value=(id) aria-label=(id); }
-                    td { a href=(format!("/runs/{id}")) { (id) } }
+                    td { a href=(format!("/runs/{}", in_path(id))) { (id) } }
                     td { (summary.part) } td { (summary.recipe) } td { (when(&summary.began)) }
                     td .n { (summary.cycles.len()) }
                     @for k in 0..2 {
@@ -602,7 +608,7 @@ pub(crate) async fn compare(
                 @let seen = Seen { summary: std::sync::Arc::clone(summary), ..Seen::default() };
                 @let tolerance = summary.tolerance.as_ref();
                 section data-compared=(id) {
-                    h2 { a href=(format!("/runs/{id}")) { (id) } }
+                    h2 { a href=(format!("/runs/{}", in_path(id))) { (id) } }
                     (banner(&seen, language))
                     canvas role="img" aria-label=(say(Text::Map)) {}
                     (chart(&summary.cycles, tolerance, false, language))
