@@ -3,7 +3,7 @@
 
     verify_journal.py RUN-FOLDER|EXPORT.jsonl ... [--anchor FILE] [--key PUBLIC]... [--json]
 
-Exit codes: 0 sound and whole; 1 broken, or not whole; 2 no such journal. Nothing in the folder is written.
+Exit codes: 0 sound and whole; 1 broken, or not whole; 2 no such journal; 4 sound so far, and under way. Nothing in the folder is written.
 """
 import argparse, fcntl, hashlib, json, os, shutil, sqlite3, sys, tempfile
 from pathlib import Path
@@ -19,6 +19,16 @@ COLUMNS = HASHED + ["prev_hash", "hash"]
 TEXTS = set(COLUMNS) - {"command_id", "cycle", "mono_ns", "seq"}
 KINDS = set("begin reopen event intent outcome artefact note seal end".split())
 OWN = ("journal.sqlite", "journal.anchor", ".lock")
+NOT_NULL = ", ".join(f"{k} {t} NOT NULL" for k, t in zip("utc boot_id mono_ns actor station kind part cycle".split(), "TEXT TEXT INTEGER TEXT TEXT TEXT TEXT INTEGER".split()))
+SCHEMA = (
+    f"CREATE TABLE record ( seq INTEGER PRIMARY KEY, {NOT_NULL}, command_id INTEGER, reason TEXT NOT NULL, payload TEXT NOT NULL, "
+    "prev_hash TEXT NOT NULL, hash TEXT NOT NULL UNIQUE ) STRICT",
+    "CREATE INDEX record_command ON record (command_id, kind) WHERE command_id IS NOT NULL",
+    "CREATE TRIGGER record_is_not_changed BEFORE UPDATE ON record BEGIN SELECT RAISE(ABORT, 'records are not changed'); END",
+    "CREATE TRIGGER record_is_not_deleted BEFORE DELETE ON record BEGIN SELECT RAISE(ABORT, 'records are not deleted'); END",
+    "CREATE TRIGGER record_follows_the_last BEFORE INSERT ON record WHEN NEW.seq IS NOT (SELECT coalesce(max(seq), 0) + 1 FROM record) "
+    "BEGIN SELECT RAISE(ABORT, 'records follow the last'); END",
+)
 
 
 class Broken(Exception):
@@ -128,7 +138,7 @@ class Chain:
         if self.folder is not None:
             path = self.folder.joinpath(*parts)
             hold(path.is_file(), f"the file {name} is missing")
-            content = path.read_bytes()
+            content = path.read_bytes() if path.stat().st_size == size else b""
             is_same = len(content) == size and hashlib.sha256(content).hexdigest() == sha256
             hold(is_same, f"the file {name} is not what was written")
         self.files += 1
@@ -179,6 +189,8 @@ def opened(folder, scratch, under_way):
         raise Absent("this is no journal of Regrind")
     if int.from_bytes(header[60:64], "big") not in (1, 2):
         raise Absent("the journal has a layout that is not known here")
+    if any(os.path.lexists(beside) and not beside.is_file() for beside in (folder / f"journal.sqlite-{k}" for k in ("wal", "shm", "journal"))):
+        raise Absent("what lies beside the database is no file")
     change = folder / "journal.sqlite-journal"
     if not under_way and change.is_file() and change.open("rb").read(1) not in (b"", b"\0"):
         raise Absent("its making was cut off, and nothing in it was committed")
@@ -188,6 +200,17 @@ def opened(folder, scratch, under_way):
             shutil.copy(file, scratch)
         database, how = Path(scratch) / database.name, "mode=rw"
     return sqlite3.connect(f"{database.absolute().as_uri()}?{how}", uri=True)
+
+
+def check_schema(connection):
+    """The tables are those of a record, and nothing else: a view can show anything, and without end."""
+    words = lambda sql: " ".join(sql.split())
+    found = list(connection.execute("SELECT type, name, sql FROM sqlite_schema"))
+    own = lambda kind, name, sql: sql is None and kind == "index" and name.startswith("sqlite_autoindex_record_")
+    if not all(own(*one) or one[2] is not None and words(one[2]) in SCHEMA for one in found):
+        raise Absent("it has a table, view, index or trigger that a record has not")
+    if ("table", "record") not in [one[:2] for one in found]:
+        raise Absent("it has no table of records")
 
 
 def rows_of(connection):
@@ -213,6 +236,8 @@ def lines_of(path):
 
 def is_driven(folder):
     try:
+        if not (folder / ".lock").is_file():
+            return False
         with open(folder / ".lock") as lock:
             fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
         return False
@@ -224,7 +249,7 @@ def is_driven(folder):
 
 def read_anchor(path):
     try:
-        anchor = parsed(path.read_text())
+        anchor = parsed(path.read_text()) if path.is_file() and path.stat().st_size <= 4096 else {}
         texts = all(isinstance(anchor.get(k), (str, type(None))) for k in ("run", "key", "signature"))
         if isinstance(anchor["records"], int) and isinstance(anchor["head"], str) and texts:
             return anchor
@@ -239,6 +264,8 @@ def walk(path, chain, anchors, under_way):
     with tempfile.TemporaryDirectory() as scratch:
         database = opened(path, scratch, under_way) if path.is_dir() else None
         try:
+            if database:
+                check_schema(database)
             for row in rows_of(database) if database else lines_of(path):
                 chain.take(record_of(row))
                 for anchor in anchors:
@@ -270,8 +297,8 @@ def verify(path, kept, trusted):
     if chain.no_author:
         return {"run": str(path), "sound": False, "record": None, "what": chain.no_author}
     closed = chain.ended is not None
-    lacks = None
-    if chain.keys and closed and not under_way and chain.signed != chain.ended:
+    lacks, is_sealed = None, not chain.keys or chain.signed == chain.ended
+    if closed and not is_sealed and (not under_way or trusted):
         lacks = "its end is not signed, and the run names a key"
     elif not anchored and (folder or not closed):
         lacks = "journal.anchor is missing: whether its end was cut off cannot be told"
@@ -280,7 +307,7 @@ def verify(path, kept, trusted):
     return {
         "run": str(path), "sound": True, "records": chain.records, "head": chain.head, "anchored": anchored, "closed": closed,
         "under_way": under_way, "artefacts": chain.files, "keys": chain.keys, "seals": chain.seals, "signed": chain.signed,
-        "lacks": lacks,
+        "lacks": lacks, "whole": not lacks and closed and is_sealed,
     }  # fmt: skip
 
 
@@ -292,7 +319,7 @@ def in_words(found):
     signed = f"signed up to record {found['signed']} by {', '.join(found['keys'])}" if found["keys"] else "not signed"
     if found["keys"] and Ed25519PublicKey is None:
         signed = "signature NOT CHECKED: python3 has no package `cryptography`"
-    end = found["lacks"] or ("closed" if found["closed"] else "under way")
+    end = found["lacks"] or ("closed" if found["whole"] else "under way")
     return f"{found['run']}: sound, {found['records']} records, {found['artefacts']} files, {end}; {signed}\nhead {found['head']}"
 
 
@@ -310,7 +337,7 @@ def main():
     for run in given.runs:
         try:
             found = verify(run, given.anchor, given.key)
-            code = max(code, 0 if found["sound"] and not found["lacks"] else 1)
+            code = max(code, 1 if not found["sound"] or found["lacks"] else 0 if found["whole"] else 4)
             print(json.dumps(found) if given.json else in_words(found))
         except Absent as absent:
             code = 2

@@ -349,10 +349,7 @@ fn comes_back<T: DeserializeOwned + Serialize>(bytes: &[u8]) -> bool {
 
 /// What a run leaves to the next part.
 pub fn learned(bytes: &[u8]) -> bool {
-    let folder = folder();
-    let file = folder.path().join("learned.json");
-    fs::write(&file, bytes).expect("a folder for temporary files");
-    let Ok(learned) = Learned::from_file(&file) else { return false };
+    let Ok(learned) = Learned::of(Path::new("learned.json"), bytes) else { return false };
     assert!(learned.correction.grid.is_sound());
     let grid = Grid { columns: 3, rows: 3, first_mm: [-1.0, -1.0], spacing_mm: [1.0, 1.0] };
     let first = learned.first_correction(Correction::none(grid, 0.05));

@@ -10,8 +10,8 @@ use super::event::{
     RecordFailure, Response,
 };
 use super::judge::{self, Judged, um};
-use super::memory::{Cause, Cell, Known};
-use super::plan::{Beginning, Disposal};
+use super::memory::{Cause, Cell, Known, Vain};
+use super::plan::{Beginning, Deadlines, Disposal};
 use super::state::{Device, JobStep, Phase, State};
 
 use Phase::{Compensate, Grind, Judge, Load, Measure, Register, Transfer};
@@ -19,6 +19,9 @@ use State::{
     Aborted, Aborting, Complete, Completing, Execute, Held, Holding, Idle, Starting, Stopped, Stopping, Suspended,
     Suspending, Unholding, Unsuspending,
 };
+
+/// Fewer failures than these are no sign that it is in vain to try on, however long that has been so.
+const FEW_FAILURES: u32 = 3;
 
 // Its vocabulary.
 impl Cell {
@@ -40,10 +43,44 @@ impl Cell {
         self.push(Command::Raise(alarm));
     }
 
-    fn withdraw(&mut self, alarm: AlarmId) {
+    pub(super) fn withdraw(&mut self, alarm: AlarmId) {
         if self.raised.remove(&alarm).is_some() {
             self.push(Command::Withdraw { alarm });
         }
+    }
+
+    /// Notes how far the cell has come: what failed before that is over.
+    pub(super) fn note_place(&mut self) {
+        let Some(phase) = self.state.phase() else { return };
+        let place = (self.cycle, phase.place());
+        if place > self.furthest {
+            self.furthest = place;
+            if let Some((device, _)) = phase.job() {
+                self.vain[device as usize] = Vain::default();
+            }
+        }
+    }
+
+    /// Notes that something of a machine has failed, and tells whether that is enough to try no further.
+    fn fails_again(&mut self, device: Device) -> bool {
+        let Deadlines { vain, vain_failures, .. } = self.plan.deadlines;
+        let now = self.now;
+        let Vain { failures, since, last } = &mut self.vain[device as usize];
+        // One that was long ago has nothing to do with this one.
+        if *failures == 0 || now.saturating_sub(*last) > vain.saturating_mul(2) {
+            (*failures, *since) = (0, now);
+        }
+        (*failures, *last) = (*failures + 1, now);
+        *failures >= vain_failures || *failures >= FEW_FAILURES && now.saturating_sub(*since) >= vain
+    }
+
+    fn raise_fails_again(&mut self, device: Device, phase: Phase, why: &str) {
+        let Vain { failures, since, .. } = self.vain[device as usize];
+        let seconds = self.now.saturating_sub(since).as_secs();
+        self.raise(
+            AlarmId::FailsAgain,
+            &format!("{device}, {phase}, {failures} times in {seconds} s, the last time: {why}"),
+        );
     }
 
     /// Takes a state, and the deadline that goes with it. The time to come to a stand counts from the first HOLD, whatever becomes of
@@ -348,6 +385,16 @@ impl Cell {
         }
     }
 
+    /// A person says that a machine has nothing more to be told of a result.
+    pub(super) fn given_up(&mut self, phase: Phase) {
+        self.withdraw(AlarmId::MachineRefused);
+        match phase {
+            Measure(JobStep::Acknowledge) => self.go(Held(Register)),
+            Measure(_) => self.measure_anew(),
+            _ => self.go(Held(Transfer)),
+        }
+    }
+
     pub(super) fn acknowledged(&mut self, phase: Phase) {
         match phase {
             Grind(JobStep::Acknowledge) => self.advance(Transfer),
@@ -605,11 +652,33 @@ impl Cell {
     }
 
     /// The job gives a sign of progress.
-    pub(super) fn progressed(&mut self) {
+    pub(super) fn progressed(&mut self, device: Device) {
+        self.vain[device as usize] = Vain::default();
         if let Some(last) = self.progressed.replace(self.now) {
             self.pace = self.pace.max(self.now.saturating_sub(last));
         }
         self.go(self.state);
+    }
+
+    /// A command that was to lead on was not given: the cell waits for no answer to it.
+    pub(super) fn not_on_record(&mut self, phase: Phase) {
+        let runs = matches!(phase.job(), Some((_, JobStep::Run)));
+        match self.state {
+            // What holds is given whether it is on record or not.
+            Execute(_) | Holding(_) | Suspending(_) if runs => {}
+            _ => self.go(Held(restart_of(phase))),
+        }
+    }
+
+    /// The machine shows no more of the job that it was seen at: it is asked what became of it, and nothing is concluded before.
+    pub(super) fn vanished(&mut self, device: Device, why: &str) {
+        self.raise(AlarmId::JobVanished, &format!("{device}, {why}"));
+        let asked = Phase::of(device, JobStep::Reconcile);
+        self.go(match self.state {
+            Execute(_) | Unholding(_) | Unsuspending(_) => Execute(asked),
+            _ => Holding(asked),
+        });
+        self.push(Command::Reconcile { device, cycle: self.cycle });
     }
 
     pub(super) fn resume(&mut self, phase: Phase) -> Result<(), String> {
@@ -640,6 +709,7 @@ impl Cell {
     }
 
     fn resume_connected(&mut self, phase: Phase) {
+        self.vain = [Vain::default(); 2];
         self.known.iter_mut().for_each(|known| known.astray = false);
         let standing: Vec<_> = self.raised.keys().copied().collect();
         for alarm in standing {
@@ -707,7 +777,15 @@ impl Cell {
     /// A machine that was told to hold is not called held before it has said that it stands.
     pub(super) fn link_lost(&mut self, phase: Phase, device: Device, why: &str, wait: fn(Phase) -> State) {
         self.note_link(device, true);
-        self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
+        let is_vain = self.fails_again(device);
+        // What is known to fail again and again is not told each time anew.
+        if !self.raised.contains_key(&AlarmId::FailsAgain) {
+            self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
+            if is_vain {
+                self.raise_fails_again(device, phase, why);
+            }
+        }
+        let wait = if is_vain { Held } else { wait };
         let needed = phase.job().map(|(job, _)| job) == Some(device) || awaits_clear(phase) == Some(device);
         let is_holding = matches!(self.state, Holding(_)) && phase.moving() == Some(device);
         if is_holding {
@@ -748,7 +826,11 @@ impl Cell {
         }
         self.cause_gone(Cause::Link(device), AlarmId::LinkLost);
         match self.state {
-            Holding(phase) | Held(phase) if same && phase.job() == Some((device, JobStep::Reconcile)) => {
+            Holding(phase) | Held(phase)
+                if same
+                    && phase.job() == Some((device, JobStep::Reconcile))
+                    && !self.raised.contains_key(&AlarmId::FailsAgain) =>
+            {
                 self.go(Holding(phase));
                 self.push(Command::Reconcile { device, cycle: self.cycle });
             }
@@ -871,14 +953,24 @@ impl Cell {
             }
             (Reconciliation::NotStarted, _) => {
                 self.not_started(device);
-                self.advance(Phase::of(device, JobStep::Send));
+                let next = Phase::of(device, JobStep::Send);
+                if self.fails_again(device) {
+                    self.raise_fails_again(
+                        device,
+                        Phase::of(device, JobStep::Start),
+                        "it says that it was not started",
+                    );
+                    return self.go(Held(next));
+                }
+                self.advance(next);
             }
             (Reconciliation::Unknown(message), _) => self.unknown(device, message),
         }
     }
 
     fn unknown(&mut self, device: Device, message: &str) {
-        self.raise(AlarmId::StartUnknown, &format!("{device}, {message}"));
+        let id = if self.begun[device as usize] { AlarmId::JobVanished } else { AlarmId::StartUnknown };
+        self.raise(id, &format!("{device}, {message}"));
         self.go(Held(Phase::of(device, JobStep::Reconcile)));
     }
 
@@ -1022,7 +1114,11 @@ impl Cell {
                 self.raise(AlarmId::StaysSuspended, "");
                 self.go(Held(phase));
             }
-            Stopping => self.abort("the orderly stop was not confirmed in time"),
+            Stopping => {
+                let names = self.stopping.map_or("no machine".to_owned(), |device| device.to_string());
+                self.raise(AlarmId::StopNotConfirmed, &format!("{names}, in the time that it has for a stop"));
+                self.abort("the orderly stop was not confirmed in time");
+            }
             Aborting => self.abort_is_due(),
             Completing => {
                 self.raise(AlarmId::NotClear, "not both were seen clear in time");

@@ -80,7 +80,7 @@ catalogue! {
     WordOrder {
         "The machine sends its registers in another word order than the cell file says",
         "Every number would be wrong, so nothing was written; the run does not begin.", ProcessEngineer,
-        ["Change word_order in the cell file to the other of big and little.", "Start the run again."]
+        ["Change word_order in the cell file to the order that is named.", "Start the run again."]
     }
     /// Inches.
     Inches {
@@ -115,7 +115,7 @@ catalogue! {
     /// Supplies or temperature.
     ConditionLost {
         "A condition for the work is missing", "The cell waits, and goes on by itself when the condition is back.", Nobody,
-        ["Restore air, coolant or temperature.", "Wait: the cell goes on by itself."]
+        ["Restore air or coolant, or bring the signal that is named into its range.", "If the machine gives no number for a signal: correct its address in the cell file, or the sensor.", "Wait: the cell goes on by itself."]
     }
     /// Suspended for too long.
     StaysSuspended {
@@ -182,8 +182,21 @@ catalogue! {
     StartUnknown {
         "It is not known whether a job was started", "START is never repeated on a guess. Nothing moves by order of the cell.", Operator,
         ["Look at the machine: does it stand still and clear of the part? Was the part touched?",
-         "Resume to ask the machine again.", "If it cannot tell: declare the job over with what you saw, and resume to measure the part.",
+         "Resume to ask the machine again.", "If it cannot tell: `regrind confirm over --machine NAME --evidence TEXT` with what you saw; then resume to measure the part as it is.",
          "Or stop the run."]
+    }
+    /// A job that the machine has no more.
+    JobVanished {
+        "A machine no longer has the job that it was at", "The job is not begun again, and nothing moves by order of the cell.", Operator,
+        ["Look at the machine: does it stand still and clear of the part? Was the part touched?", "Resume to ask the machine again.",
+         "If it cannot tell: `regrind confirm over --machine NAME --evidence TEXT` with what you saw; then resume to measure the part as it is.",
+         "Or stop the run."]
+    }
+    /// The same failure again and again.
+    FailsAgain {
+        "The same step fails again and again", "The cell is held and does not try it any more by itself.", Operator,
+        ["Read the last answer: it says what does not work.", "Look at the machine, its program and its line.",
+         "Resume to try it again, or stop the run."]
     }
     /// Reboot.
     MachineRestarted {
@@ -239,7 +252,7 @@ catalogue! {
     /// Broken result.
     BrokenResult {
         "The result is broken", "Nothing is made of it.", Operator,
-        ["Check the link and the measuring program.", "Resume to measure again."]
+        ["Read what of it cannot be: a figure or a point that cannot be comes from the probe or the measuring program, a wrong number of points from its list of targets.", "Correct that, and resume to measure again."]
     }
     /// Temperature gate.
     Temperature {
@@ -346,6 +359,13 @@ catalogue! {
     DiskFull {
         "The disk is full", "Nothing new begins to move: what is not recorded is not done.", Operator,
         ["Free space on the disk of the run folder.", "Resume."]
+    }
+    /// No way in for orders.
+    ControlLost {
+        "The way by which orders reach the cell was taken away", "The run goes on, and the way is made again. Ctrl-C in the terminal of the run holds, twice aborts.",
+        ProcessEngineer,
+        ["Find out who deletes or moves files of the run folder.", "`regrind status` shows whether orders come in again.",
+         "Hold the run if they do not."]
     }
     /// Hold not confirmed.
     HoldNotConfirmed {

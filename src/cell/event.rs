@@ -81,6 +81,8 @@ pub enum Event {
     PlanLoaded { cycle: u32 },
     /// The machine is prepared for this cycle. Answers `Prepare`.
     Prepared { device: Device, cycle: u32 },
+    /// The machine was seen at this run's job, and shows now that it is at none, or at another one, and tells of no end.
+    JobVanished { device: Device, why: String },
     /// START was taken. Answers `StartMachine`.
     Started { device: Device, cycle: u32 },
     /// It is not known whether START was taken. Answers `StartMachine`.
@@ -145,6 +147,12 @@ pub enum Event {
 
     /// The journal or the run folder cannot be written: nothing may begin to move.
     RecordFailed { why: RecordFailure },
+    /// A command that is answered was not given, for it did not come on record.
+    NotOnRecord { command: String },
+    /// The way by which orders come in is gone: who gives them may not find the cell.
+    ControlLost { why: String },
+    /// It was made again.
+    ControlBack,
     /// Time has passed; what is due is done.
     Deadline,
 }
@@ -590,6 +598,7 @@ impl Event {
             | Self::Prepared { device, .. }
             | Self::Started { device, .. }
             | Self::StartUnknown { device, .. }
+            | Self::JobVanished { device, .. }
             | Self::Progressed { device, .. }
             | Self::MachineHeld { device }
             | Self::MachineResumed { device }
@@ -674,6 +683,7 @@ impl Event {
             Self::Prepared { .. } => "prepared",
             Self::Started { .. } => "started",
             Self::StartUnknown { .. } => "start_unknown",
+            Self::JobVanished { .. } => "job_vanished",
             Self::Progressed { .. } => "progressed",
             Self::MachineHeld { .. } => "machine_held",
             Self::MachineResumed { .. } => "machine_resumed",
@@ -696,6 +706,9 @@ impl Event {
             Self::CompensationRefused { .. } => "compensation_refused",
             Self::NotSaved { .. } => "not_saved",
             Self::RecordFailed { .. } => "record_failed",
+            Self::NotOnRecord { .. } => "not_on_record",
+            Self::ControlLost { .. } => "control_lost",
+            Self::ControlBack => "control_back",
             Self::Deadline => "deadline",
         }
     }

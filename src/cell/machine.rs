@@ -43,6 +43,7 @@ impl Cell {
         if self.state.is_end() {
             self.deadline = None;
         }
+        self.note_place();
         answered
     }
 
@@ -101,6 +102,10 @@ impl Cell {
                 Held(Measure(JobStep::Reconcile | JobStep::Collect)),
                 Event::DeclaredOver { device: device @ Device::Cmm, .. },
             ) => self.declared_over(*device),
+            // A result that the machine will not be told to forget: whether it is gone shows when the next job is prepared.
+            (Held(phase), Event::DeclaredOver { device, .. }) if awaits_acknowledge(phase) == Some(*device) => {
+                self.given_up(phase);
+            }
             (Execute(Load), Event::LoadConfirmed { .. }) => self.first_cycle(),
             (state, Event::ClearConfirmed { device, .. })
                 if state.phase().is_some() && running(state) != Some(*device) =>
@@ -144,6 +149,17 @@ impl Cell {
             (_, Event::ConditionBack { device, condition }) => {
                 self.cause_gone(Cause::Condition(*device, *condition), AlarmId::ConditionLost)
             }
+
+            (Starting, Event::NotOnRecord { .. }) => self.go(Held(Load)),
+            (
+                Execute(phase) | Holding(phase) | Suspending(phase) | Unholding(phase) | Unsuspending(phase),
+                Event::NotOnRecord { .. },
+            ) => self.not_on_record(phase),
+            // Its result stays at the machine, which is told when the next run comes.
+            (Stopping, Event::NotOnRecord { .. }) => self.stopped(),
+            (_, Event::NotOnRecord { .. }) => {}
+            (_, Event::ControlLost { why }) => self.raise(AlarmId::ControlLost, why),
+            (_, Event::ControlBack) => self.withdraw(AlarmId::ControlLost),
 
             (_, Event::NotAutomatic { device, message }) => self.by_hand(*device, message),
             (_, Event::AutomaticAgain { device }) => self.automatic_again(*device),
@@ -197,8 +213,13 @@ impl Cell {
             {
                 self.reconcile(*device);
             }
+            (state, Event::JobVanished { device, why }) if state.phase() == Some(Phase::of(*device, JobStep::Run)) => {
+                self.vanished(*device, why);
+            }
+            // It is being asked already, or its end is known.
+            (_, Event::JobVanished { .. }) => {}
             (Execute(p), Event::Progressed { device, .. }) if p.job() == Some((*device, JobStep::Run)) => {
-                self.progressed()
+                self.progressed(*device)
             }
             (
                 Execute(p) | Holding(p) | Suspending(p) | Unholding(p) | Unsuspending(p),
@@ -254,6 +275,7 @@ impl Cell {
                 self.go(Held(p));
             }
             (Stopping, Event::Refused { device, what: Asked::Stop | Asked::Acknowledge, why }) => {
+                self.raise(AlarmId::StopNotConfirmed, &format!("{device}, {why}"));
                 self.abort(&format!("the {device} refused to stop: {why}"));
             }
             (Execute(p), Event::Obstructed { device, message }) if p.moving() == Some(device.other()) => {

@@ -40,6 +40,15 @@ pub(super) struct Known {
     pub(super) astray: bool,
 }
 
+/// What has been tried in vain.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Vain {
+    pub(super) failures: u32,
+    /// When the first and the last of them were.
+    pub(super) since: Duration,
+    pub(super) last: Duration,
+}
+
 /// A cell in the middle of a run. What is large is shared by its copies, of which [`super::table()`] makes millions.
 #[derive(Clone, Debug)]
 pub struct Cell {
@@ -79,6 +88,10 @@ pub struct Cell {
     pub(super) progressed: Option<Duration>,
     pub(super) pace: Duration,
     pub(super) still: bool,
+    /// How far the cell has come: the cycle, and the place in it.
+    pub(super) furthest: (u32, u8),
+    /// What failed of each machine in a row, without getting any further.
+    pub(super) vain: [Vain; 2],
     pub(super) commands: Vec<Command>,
 }
 
@@ -110,6 +123,8 @@ impl Cell {
             progressed: None,
             pace: Duration::ZERO,
             still: false,
+            furthest: (0, 0),
+            vain: [Vain::default(); 2],
             commands: Vec::new(),
         }
     }

@@ -136,6 +136,12 @@ pub struct Deadlines {
     /// a job gives no such signs.
     #[serde(default)]
     pub progress_notice: [Option<Duration>; 2],
+    /// Since the first of several failures at the same place, without getting any further, before the cell is held.
+    #[serde(default = "Deadlines::vain")]
+    pub vain: Duration,
+    /// How many failures in a row, without getting any further, are enough for that.
+    #[serde(default = "Deadlines::vain_failures")]
+    pub vain_failures: u32,
     /// From HOLD to the safe place of each machine: CMM, grinder.
     pub hold: [Duration; 2],
     /// From STOP to the end of the job of each machine: CMM, grinder.
@@ -150,6 +156,16 @@ pub struct Deadlines {
     pub held: Option<Duration>,
 }
 
+impl Deadlines {
+    fn vain() -> Duration {
+        Duration::from_secs(60)
+    }
+
+    fn vain_failures() -> u32 {
+        5
+    }
+}
+
 impl Default for Deadlines {
     fn default() -> Self {
         let s = Duration::from_secs;
@@ -160,6 +176,8 @@ impl Default for Deadlines {
             answer: s(10),
             progress: [s(60); 2],
             progress_notice: [Some(s(30)); 2],
+            vain: Self::vain(),
+            vain_failures: Self::vain_failures(),
             hold: [s(30); 2],
             stop: [s(60); 2],
             abort: s(2),

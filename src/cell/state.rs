@@ -116,6 +116,31 @@ impl Phase {
             .map(|(device, _)| device)
     }
 
+    /// Returns how far it is in a cycle: what comes later has a higher number. A job that is being found out about is not as far as one that is seen.
+    pub(super) fn place(self) -> u8 {
+        let step = |step: JobStep| match step {
+            JobStep::Send => 0,
+            JobStep::Clear => 1,
+            JobStep::Prepare => 2,
+            JobStep::Start => 3,
+            JobStep::Reconcile => 4,
+            JobStep::Run => 5,
+            JobStep::Collect => 6,
+            JobStep::Qualify => 7,
+            JobStep::Acknowledge => 8,
+            JobStep::Discard => 9,
+        };
+        match self {
+            Self::Load => 0,
+            Self::Grind(of) => 10 + step(of),
+            Self::Transfer => 20,
+            Self::Measure(of) => 30 + step(of),
+            Self::Register => 40,
+            Self::Judge => 41,
+            Self::Compensate => 42,
+        }
+    }
+
     /// Returns the name of the phase, without its step.
     pub fn name(self) -> &'static str {
         match self {

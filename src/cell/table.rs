@@ -16,7 +16,7 @@ use super::state::{Device, JobStep, Phase, State};
 
 /// The version of the table. A run is gone on with by a program of the version that began it only; a change of what follows from
 /// anything is another version.
-pub const TABLE_VERSION: u32 = 10;
+pub const TABLE_VERSION: u32 = 11;
 
 /// What an event does in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -141,7 +141,12 @@ fn plan(disposal: Disposal) -> CellPlan {
         removal_budget_mm: 1.0,
         least_depth_mm: 0.001,
         clear_at_start: disposal == Disposal::Stop,
-        deadlines: Deadlines::default(),
+        // One of the two tries nothing twice, so that it shows what follows when trying is in vain.
+        deadlines: Deadlines {
+            vain_failures: if disposal == Disposal::Stop { 1 } else { u32::MAX },
+            vain: Duration::MAX,
+            ..Deadlines::default()
+        },
     }
 }
 
@@ -154,6 +159,9 @@ pub fn samples(cycle: u32) -> Vec<Event> {
     events.extend(of_computations(cycle));
     events.push(Event::RecordFailed { why: RecordFailure::DiskFull(String::new()) });
     events.push(Event::RecordFailed { why: RecordFailure::Unwritable(String::new()) });
+    events.push(Event::NotOnRecord { command: String::new() });
+    events.push(Event::ControlLost { why: String::new() });
+    events.push(Event::ControlBack);
     events.push(Event::Deadline);
     events
 }
@@ -186,6 +194,7 @@ fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
         Event::Prepared { device, cycle },
         Event::Started { device, cycle },
         Event::StartUnknown { device, cycle, why: text() },
+        Event::JobVanished { device, why: text() },
         Event::Progressed { device, done: 1, total: 2 },
         Event::MachineHeld { device },
         Event::MachineResumed { device },

@@ -4,16 +4,19 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
-use regrind::journal::{Against, Anchor, JournalError, Kind, PublicKey, Reader, Record, Verified, verify_against};
+use regrind::journal::{
+    Against, Anchor, DATABASE, JournalError, Kind, PublicKey, Reader, Record, Verified, verify_against,
+};
 use regrind::report::{RUN_REPORT, run_report, words};
 use serde_json::{Value, json};
 
 use super::Outcome;
-use super::control::folder_of;
+use super::control::{folder_of, folders};
 use super::failure::Failure;
 use super::key;
 #[cfg(feature = "plant")]
 use super::plant::audit as plant;
+use super::succession;
 
 /// Verify, show or export the record of a run; make the key that signs it
 #[derive(Args, Debug)]
@@ -39,17 +42,20 @@ enum What {
 /// Prove that the record is what was written: every record, their order, the end, and every file by its hash
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; without it, the newest under runs/. A record whose end was cut off together with its anchor is
-found only with --anchor and a copy of journal.anchor that was kept elsewhere; one that was written anew from its beginning,
+RUN is the folder of a run; without it, the newest under runs/. A folder of runs has each of them proven, and names runs that are
+missing, renamed or exchanged: each run has a number and names the record of the one before. That the newest are missing shows
+only by an anchor that was kept elsewhere, or at a plant. A record whose end was cut off together with its anchor is found only with --anchor and a copy of journal.anchor that was kept elsewhere; one that was written anew from its beginning,
 only with that or with --key and the public key that was kept elsewhere. Without --key the signatures are held against the
 key that the record itself names. How to prove a record without this program: docs/journal.md.
 
 Examples:
+  regrind audit verify runs
   regrind audit verify runs/freeform-mirror-20260704T120000Z --key /mnt/quality/grinding-cell-2.key
   regrind audit verify runs/freeform-mirror-20260704T120000Z --anchor /mnt/quality/SN-0042.anchor
 
-Exit codes: 0 sound, and closed or under way; 1 broken: the first record that cannot be believed is named, or the run broke
-off, its anchor is missing, or its end is not signed and the run names a key; 2 no such run, or no record in it.")]
+Exit codes: 0 sound and closed; 1 broken: the first record that cannot be believed is named, or the run broke off, its anchor is
+missing, or its end is not signed and the run names a key; 2 no such run, or no record in it; 4 sound so far, and under way: a
+process holds the run, and its end is still to come.")]
 struct ToVerify {
     /// Folder of the run
     #[arg(value_name = "RUN")]
@@ -166,6 +172,9 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     #[cfg(not(feature = "plant"))]
     let copy: Option<Value> = None;
     let folder = folder_of(arguments.run.as_deref())?;
+    if is_folder_of_runs(&folder) {
+        return succession::prove(&folder, &arguments.key, arguments.json);
+    }
     let anchor = arguments.anchor.as_deref().map(read_anchor).transpose()?;
     let found = verify_against(&folder, &Against { anchor, keys: arguments.key.clone() });
     let not_sound = match &found {
@@ -193,16 +202,24 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
         super::print(&sound(&folder, &begin, &verified, !arguments.key.is_empty()))?;
     }
     let lacks = match &verified {
-        verified if verified.lacks_last_seal() => {
+        // Whoever holds the lock: with a key at hand, what is not signed by it is not believed.
+        verified if verified.lacks_last_seal() && (!verified.under_way || !arguments.key.is_empty()) => {
             "its end is not signed, and the run names a key: who has no key may have written what follows the last seal"
         }
         Verified { anchored: 0, .. } => "journal.anchor is missing: whether its end was cut off cannot be told",
         Verified { closed: false, under_way: false, .. } => {
             "the run broke off: nobody drives it, and it has no end; what happened behind its last record is not known"
         }
-        _ => return Ok(Outcome::Accepted),
+        Verified { closed: true, .. } if !verified.lacks_last_seal() => return Ok(Outcome::Accepted),
+        _ => return Ok(Outcome::UnderWay),
     };
     Err(Failure::NotWhole { run: folder, lacks })
+}
+
+/// Whether runs lie in a folder, and it is none itself.
+fn is_folder_of_runs(folder: &Path) -> bool {
+    let has_record = |folder: &Path| folder.join(DATABASE).exists();
+    !has_record(folder) && folders(folder).any(|run| has_record(&run))
 }
 
 /// Says what else lies in the folder of a run, of which its record knows nothing.

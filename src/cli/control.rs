@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use regrind::cell::Device;
 use regrind::drive::{CycleRow, JobProgress, Reply, Request, Snapshot, ask, is_live};
-use regrind::journal::{Kind, Reader};
+use regrind::journal::{Kind, MachineLock, Reader};
+use regrind_control::{ask_at, is_live_at};
 
 use super::Outcome;
 use super::choice::word_of;
@@ -25,7 +26,7 @@ system knows them.
 Example:
   {example}
 
-Exit codes: 0 the order was taken; 2 no such run; 3 the cell refused the order."
+Exit codes: 0 the order was taken; 2 no such run; 3 the cell refused the order, or did not answer."
     )
 }
 
@@ -54,7 +55,7 @@ Examples:
   regrind confirm clear --machine cmm
   regrind confirm over --machine grinder --evidence \"stands, wheel up, one pass was ground\"
 
-Exit codes: 0 it was taken; 2 no such run; 3 the cell refused it.")]
+Exit codes: 0 it was taken; 2 no such run; 3 the cell refused it, or did not answer.")]
 pub(super) struct Confirmation {
     /// What is so
     #[arg(value_enum)]
@@ -132,7 +133,7 @@ fn named_file(arguments: &Confirmation) -> Result<Option<PathBuf>, Failure> {
 
 pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<Outcome, Failure> {
     let folder = run.map_or_else(|| live(Path::new("runs")), |run| Ok(run.to_owned()))?;
-    let asked = |request: &Request| ask(&folder, request).map_err(|source| Failure::unreached(&folder, source));
+    let asked = |request: &Request| reached(&folder, request).map_err(|source| Failure::unreached(&folder, source));
     let reply = match request {
         // Meant for the state in which the cell is now: another terminal may hold it meanwhile, and then the hold stands.
         Request::Resume { reason, seen: None } => {
@@ -143,6 +144,36 @@ pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<
     };
     show(&reply, request, &folder, json)?;
     if reply.taken { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
+}
+
+/// Asks the cell of a run folder; where nobody listens there, by the door beside the lock of its machines.
+fn reached(folder: &Path, request: &Request) -> io::Result<Reply> {
+    match ask(folder, request) {
+        Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused) => {
+            door_beside_lock(folder).map_or(Err(error), |door| ask_at(&door, request))
+        }
+        asked => asked,
+    }
+}
+
+/// Whether a program drives the run of a folder, by the door in the folder or the one beside the lock of its machines.
+pub(super) fn is_driven(folder: &Path) -> bool {
+    is_live(folder) || door_beside_lock(folder).is_some()
+}
+
+fn door_beside_lock(folder: &Path) -> Option<PathBuf> {
+    let run = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
+    beside_locks().find(|(of, _)| is_same(of, &run)).map(|(_, door)| door)
+}
+
+/// The runs that have machines on this computer, and whose cell listens beside the lock of these.
+fn beside_locks() -> impl Iterator<Item = (PathBuf, PathBuf)> {
+    MachineLock::doors().into_iter().filter(|(_, door)| is_live_at(door))
+}
+
+/// Whether two paths are one, however they are written; what is gone is told by its name alone.
+fn is_same(a: &Path, b: &Path) -> bool {
+    a.components().eq(b.components())
 }
 
 fn show(reply: &Reply, request: &Request, folder: &Path, json: bool) -> Result<(), Failure> {
@@ -206,6 +237,13 @@ pub(super) fn live(runs: &Path) -> Result<PathBuf, Failure> {
 /// The same, with what is meant where none goes on.
 pub(super) fn live_or(runs: &Path, otherwise: fn(&Path) -> Option<PathBuf>) -> Result<PathBuf, Failure> {
     let mut live: Vec<_> = folders(runs).filter(|folder| is_live(folder)).collect();
+    if live.is_empty() {
+        // Its folder may be gone while the cell goes on.
+        let absolute = std::path::absolute(runs).unwrap_or_else(|_| runs.to_owned());
+        let of_these = |run: &PathBuf| run.parent().is_some_and(|above| is_same(above, &absolute));
+        live = beside_locks().map(|(run, _)| run).filter(of_these).collect();
+        live.dedup();
+    }
     match live.len() {
         0 => otherwise(runs).ok_or_else(|| Failure::NoRun { path: runs.to_owned() }),
         1 => Ok(live.remove(0)),

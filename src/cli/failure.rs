@@ -67,6 +67,13 @@ pub(super) enum Failure {
     /// The record was read and cannot be believed.
     #[error(transparent)]
     Broken(JournalError),
+    #[error("{}: {flaws} flaw(s) among the runs, the first: {first}", .runs.display())]
+    RunsLack { runs: PathBuf, flaws: usize, first: String },
+    #[error(
+        "{}: the cell file asks for a record that is signed (cell.require_signature), and this user has no key; `regrind audit key` makes one",
+        .cell.display()
+    )]
+    Unsigned { cell: PathBuf },
     #[error("{}: the record is not whole: {lacks}", .run.display())]
     NotWhole { run: PathBuf, lacks: &'static str },
     #[error("{path}: {reason}; give a copy of the journal.anchor of this run")]
@@ -93,6 +100,10 @@ pub(super) enum Failure {
         "{path}: whether a cell runs there is not known: this user may not ask it ({source}); ask as the user who runs the cell"
     )]
     MayNotAsk { path: PathBuf, source: io::Error },
+    #[error(
+        "{path}: the program of the cell is there and does not answer; what was asked is not carried out once it does. Its process stands still (SIGSTOP, a          debugger) or the computer is overloaded. A machine that hears nothing of it holds by itself: look at both machines"
+    )]
+    NoAnswer { path: PathBuf },
     #[error("{} runs go on: name one of {}", .runs.len(), .runs.iter().map(|run| run.display().to_string()).collect::<Vec<_>>().join(", "))]
     SeveralRuns { runs: Vec<PathBuf> },
     #[error("{}: the run is over, there is nothing to go on with; `regrind report` tells how it ended", .run.display())]
@@ -131,6 +142,12 @@ pub(super) enum Failure {
     NoUser { name: String, path: PathBuf },
     #[error("the two passwords are not alike; nothing was changed")]
     NotAlike,
+    #[error(
+        "{}: the end of its record may be lost: {what}. A machine may be at a job that the record does not know, so the run is not gone on with: look at \
+         both machines, bring them home by `regrind recover` and begin a new run; or go on by `regrind resume --despite-loss`",
+        .run.display()
+    )]
+    MayBeLost { run: PathBuf, what: String },
     #[error("{}: its program ended before anything was asked of a machine; begin a new run", .run.display())]
     NotBegun { run: PathBuf },
     #[error(
@@ -204,6 +221,7 @@ impl Failure {
         let path = folder.to_owned();
         match source.kind() {
             io::ErrorKind::PermissionDenied => Self::MayNotAsk { path, source },
+            io::ErrorKind::TimedOut => Self::NoAnswer { path },
             _ => Self::NotRunning { path, source },
         }
     }
@@ -220,12 +238,15 @@ impl Failure {
             | Self::Signals(_)
             | Self::Terminal(_)
             | Self::OrderRefused { .. }
+            | Self::NoAnswer { .. }
             | Self::Setup(SetupError::Machine {
                 source: MakingError::Line { .. } | MakingError::NoPort { .. }, ..
             })
             | Self::Ended { .. } => FAULT,
             Self::Broken(_)
             | Self::NotWhole { .. }
+            | Self::RunsLack { .. }
+            | Self::MayBeLost { .. }
             | Self::Report(ReportError::Record(JournalError::Broken { .. })) => NOT_AS_IT_SHOULD_BE,
             #[cfg(feature = "plant")]
             Self::OpenWork { .. } => NOT_AS_IT_SHOULD_BE,

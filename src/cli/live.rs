@@ -36,8 +36,7 @@ pub(super) struct Live<'a> {
 pub(super) struct Machines {
     cmm: AnyCmm,
     grinder: AnyGrinder,
-    /// Held, not read.
-    _taken: [Option<MachineLock>; 2],
+    taken: [Option<MachineLock>; 2],
 }
 
 /// What a run is made of besides its machines.
@@ -58,7 +57,7 @@ impl Live<'_> {
             [take(&cell.cmm.link, MachineKind::Cmm, folder)?, take(&cell.grinder.link, MachineKind::Grinder, folder)?];
         let client = [owner(&self.actor, folder), MachineLock::epoch(taken.iter().flatten(), now)];
         let (cmm, grinder) = setup::machines(recipe, cell, part, folder, client).map_err(Failure::Setup)?;
-        Ok(Machines { cmm, grinder, _taken: taken })
+        Ok(Machines { cmm, grinder, taken })
     }
 
     /// Lets the run go to its end and its report.
@@ -89,9 +88,15 @@ impl Live<'_> {
 /// Gives the run its machines and lets it go.
 async fn go(run: Run, machines: Machines, actor: Actor) -> Result<Ending, Failure> {
     let folder = run.journal.folder().to_owned();
-    let Machines { cmm, grinder, _taken } = machines;
-    let (drive, orders) =
+    let Machines { cmm, grinder, taken } = machines;
+    let (mut drive, orders) =
         Drive::with_cell(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
+    // One door beside the locks is enough, and a cell without one can be given orders all the same.
+    if let Some(door) = taken.iter().flatten().map(MachineLock::door).next()
+        && let Err(error) = drive.listen_beside(door)
+    {
+        eprintln!("{}: no orders come in there: {error}", regrind::document::visible(&door.display().to_string()));
+    }
     let endings = Endings::new().map_err(Failure::Signals)?;
     let heeding = [
         tokio::spawn(heed_ctrl_c(orders.clone(), actor.clone())),

@@ -35,6 +35,7 @@ mod show;
 mod simulate;
 mod simulated;
 mod states;
+mod succession;
 #[cfg(feature = "plant")]
 mod tell;
 mod users;
@@ -116,6 +117,8 @@ const EXIT_CODES: &str = "Exit codes: 0 accepted; 1 finished, not in tolerance; 
 enum Outcome {
     Accepted,
     NotInTolerance,
+    /// What was looked at goes on, and its end is still to come.
+    UnderWay,
 }
 
 /// Reads the arguments, carries the command out, and returns the exit code.
@@ -176,6 +179,7 @@ fn run() -> ExitCode {
     match ended {
         Ok(Outcome::Accepted) => ExitCode::SUCCESS,
         Ok(Outcome::NotInTolerance) => ExitCode::from(1),
+        Ok(Outcome::UnderWay) => ExitCode::from(4),
         Err(failure) => {
             let _ = writeln!(io::stderr(), "error: {}", countable(&visible(&failure.to_string())));
             ExitCode::from(failure.exit_code())

@@ -16,6 +16,7 @@ use serde_json::json;
 use super::failure::Failure;
 use super::live::{owner, take};
 use super::run::{epoch, free_folder, operator};
+use super::succession::Place;
 use super::{Outcome, check, control, key};
 
 /// Bring the machines of a cell home that hold what no run knows
@@ -51,6 +52,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let epoch = MachineLock::epoch(taken.iter().flatten(), epoch(began));
     let settings = |link| setup::modbus(link, cell.simulated, owner(&actor, &folder), epoch);
     let [cmm, grinder] = [settings(&cell.cmm.link), settings(&cell.grinder.link)];
+    let mut content = json!({ "recover": true, "cell": cell.path() });
+    let (place, turn) = Place::next(&arguments.runs)?;
+    place.in_record(&mut content);
     let header = Header {
         run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
         part: "unnamed".into(),
@@ -58,9 +62,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         station: actor.station.clone(),
         simulation: cell.simulated,
         first_command_id: 1,
-        content: json!({ "recover": true, "cell": cell.path() }),
+        content,
     };
     let journal = Journal::create_with(&folder, header, key::of_this_user()?).map_err(Failure::Journal)?;
+    drop(turn);
     let mut recovery = Recovery { actor, journal, folder, runs: arguments.runs.clone(), simulated: cell.simulated };
     super::runtime()?.block_on(async {
         let cmm = recovery.bring_home(Device::Cmm, &cell.cmm.link, cmm, ModbusCmm::new).await;

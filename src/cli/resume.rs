@@ -1,14 +1,15 @@
 //! `regrind resume`: let a held cell go on, or go on with a run whose program ended in the middle of it.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use clap::Args;
 use regrind::cell::{CellPlan, TABLE_VERSION};
 use regrind::config::CellConfig;
-use regrind::drive::{Interrupted, Request, Task, is_live};
+use regrind::drive::{Interrupted, Request, Task};
 use regrind::formats::{FormatError, Learned};
-use regrind::journal::{Journal, JournalError, Kind, Reader, RunLock, verify};
+use regrind::journal::{Artefact, Journal, JournalError, Kind, Reader, RunLock, may_be_lost, newest_cycle, verify};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde::Deserialize;
@@ -27,6 +28,8 @@ RUN is the folder of a run; without it, the one under runs/ that goes on now, or
 A run whose program has ended without an end on record (a crash, a cut of the power) is taken up in this terminal: the record is
 verified and done again without commanding anything, the machines are asked what became of their jobs, and the cell comes to
 Held, \"the program was started again\". Then look at the machines, and give the same command from another terminal: it goes on.
+Where the folder shows that records were lost (the log of the database or journal.anchor is gone, or damaged) nothing is taken
+up before somebody has looked at both machines and says so by --despite-loss; otherwise `regrind recover` brings them home.
 
 Examples:
   regrind resume
@@ -44,6 +47,9 @@ pub(super) struct Arguments {
     /// Who takes the run up
     #[arg(long, value_name = "NAME", value_parser = super::name)]
     operator: Option<String>,
+    /// Take up a run though its record may have lost its last lines: both machines were looked at, and are at no job that it does not know
+    #[arg(long)]
+    despite_loss: bool,
     /// Print the answer, or a line for everything that happens, as JSON
     #[arg(long)]
     json: bool,
@@ -54,7 +60,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         Some(run) => run.clone(),
         None => control::live_or(Path::new("runs"), control::unfinished)?,
     };
-    if is_live(&folder) {
+    if control::is_driven(&folder) {
         let request = Request::Resume { reason: arguments.reason.clone(), seen: None };
         return control::give(Some(&folder), &request, arguments.json);
     }
@@ -66,11 +72,11 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     let key = key::of_this_user()?;
     // Whoever else takes the run up, or verifies it, finds it driven from here on.
     let lock = RunLock::take(folder).map_err(Failure::Journal)?;
-    let begun = Begun::read(folder)?;
+    let begun = Begun::read(folder, arguments.despite_loss)?;
     // Where it is gone, a recipe that names no file from there needs none of it, and any other says which one is missing.
     let _ = std::env::set_current_dir(&begun.working_folder);
-    let recipe = check::or_show(Recipe::parse(&begun.recipe, &text(folder, "recipe.toml")?))?;
-    let mut cell = check::or_show(CellConfig::parse(&begun.cell, &text(folder, "cell.toml")?))?;
+    let recipe = check::or_show(Recipe::parse(&begun.recipe, &begun.text(folder, "recipe.toml")?))?;
+    let mut cell = check::or_show(CellConfig::parse(&begun.cell, &begun.text(folder, "cell.toml")?))?;
     cell.rehearsal = begun.rehearsal;
     if within(&cell) {
         return Err(Failure::WorldGone { run: folder.to_owned() });
@@ -93,12 +99,6 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     })
 }
 
-/// Reads a file that a run keeps.
-fn text(run: &Path, name: &str) -> Result<String, Failure> {
-    let path = run.join(name);
-    std::fs::read_to_string(&path).map_err(|source| Failure::File(FormatError::Unreadable { path, source }))
-}
-
 /// What the first record of a run tells of how to go on with it.
 #[derive(Deserialize)]
 struct Begun {
@@ -115,14 +115,21 @@ struct Begun {
     table_version: u32,
     #[serde(default)]
     rehearsal: bool,
+    /// The files that are on record, by their names: nothing else of the folder is read.
+    #[serde(skip)]
+    files: BTreeMap<String, Artefact>,
 }
 
 impl Begun {
-    /// Verifies the record of a run that has no end, and reads how it began.
-    fn read(run: &Path) -> Result<Self, Failure> {
+    /// Verifies the record of a run that has no end, and reads how it began. Where more was written than is there, that is told, and only who says that
+    /// he knows it goes on.
+    fn read(run: &Path, despite_loss: bool) -> Result<Self, Failure> {
         let reader = Reader::open(run).map_err(Failure::Journal)?;
-        if reader.records(0).next().is_none() {
-            return Err(Failure::NotBegun { run: run.to_owned() });
+        let lost = || may_be_lost(run).map_err(Failure::Journal);
+        let refused = |what: String| Failure::MayBeLost { run: run.to_owned(), what };
+        let first = reader.records(0).next();
+        if first.is_none() {
+            return Err(lost()?.map_or_else(|| Failure::NotBegun { run: run.to_owned() }, refused));
         }
         let verified = verify(run).map_err(|error| match error {
             JournalError::Broken { .. } => Failure::Broken(error),
@@ -131,6 +138,13 @@ impl Begun {
         if verified.closed {
             return Err(Failure::Over { run: run.to_owned() });
         }
+        let last = reader.last().map_err(Failure::Journal)?.map_or(0, |record| record.cycle);
+        let newest = newest_cycle(run);
+        let of_files = (newest > last + 1)
+            .then(|| format!("there are files of cycle {newest}, and the record ends in cycle {last}"));
+        if let Some(what) = lost()?.or(of_files).filter(|_| !despite_loss) {
+            return Err(refused(what));
+        }
         let records = || reader.records(0).filter_map(Result::ok);
         if !records().any(|record| record.kind == Kind::Event) {
             return Err(Failure::NotBegun { run: run.to_owned() });
@@ -138,7 +152,7 @@ impl Begun {
         let first = records().next().map(|record| record.value());
         let content = first.as_ref().map_or(Value::Null, |first| first["content"].clone());
         let program = first.as_ref().and_then(|first| first["regrind"].as_str()).unwrap_or("unknown").to_owned();
-        let begun: Self = serde_json::from_value(content).map_err(|error| Failure::EarlierRun {
+        let mut begun: Self = serde_json::from_value(content).map_err(|error| Failure::EarlierRun {
             run: run.to_owned(),
             program: program.clone(),
             what: error.to_string(),
@@ -148,7 +162,28 @@ impl Begun {
                 format!("it decides by table {}, and this program by table {TABLE_VERSION}", begun.table_version);
             return Err(Failure::EarlierRun { run: run.to_owned(), program, what });
         }
+        for record in records().filter(|record| record.kind == Kind::Artefact) {
+            let file: Artefact = serde_json::from_value(record.value()).map_err(|error| Failure::EarlierRun {
+                run: run.to_owned(),
+                program: program.clone(),
+                what: error.to_string(),
+            })?;
+            begun.files.insert(file.name.clone(), file);
+        }
         Ok(begun)
+    }
+
+    /// Reads a file that the run began with, as it is on record.
+    fn text(&self, run: &Path, name: &str) -> Result<String, Failure> {
+        let path = run.join(name);
+        let Some(file) = self.files.get(name) else {
+            let source = std::io::Error::new(std::io::ErrorKind::NotFound, "it is on no record of this run");
+            return Err(Failure::File(FormatError::Unreadable { path, source }));
+        };
+        String::from_utf8(file.read(run).map_err(Failure::Journal)?).map_err(|error| {
+            let source = std::io::Error::new(std::io::ErrorKind::InvalidData, error);
+            Failure::File(FormatError::Unreadable { path, source })
+        })
     }
 
     /// Makes the task and the plan of the run again, and sees that they are the same.
@@ -157,9 +192,9 @@ impl Begun {
         if let Some(seed) = self.seed {
             task.setting.push_str(&format!(", seed {seed}"));
         }
-        let learned = run.join(LEARNED_FROM);
-        if learned.is_file() {
-            let learned = Learned::from_file(&learned).map_err(Failure::Learned)?;
+        if let Some(learned) = self.files.get(LEARNED_FROM) {
+            let text = learned.read(run).map_err(Failure::Journal)?;
+            let learned = Learned::of(&run.join(LEARNED_FROM), &text).map_err(Failure::Learned)?;
             let from = learned.run.clone();
             task.begin_with(learned).map_err(|source| Failure::TooMuchLearned { run: from, source })?;
         }

@@ -17,6 +17,7 @@ use serde_json::json;
 
 use super::failure::Failure;
 use super::live::{Live, Work, outcome};
+use super::succession::Place;
 use super::{Outcome, check, key, outside, plan, serve, simulated};
 
 /// What a run began with of what an earlier one had learned, in its folder.
@@ -97,6 +98,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     };
     // A key that cannot be used is no reason to leave the record unsigned.
     let key = key::of_this_user()?;
+    if cell.require_signature && key.is_none() {
+        return Err(Failure::Unsigned { cell: arguments.cell.clone() });
+    }
     // What a run begins with is checked before anything opens; the path of any other pass when its map is made, and it may come to none.
     if plan.begin_with == Beginning::Grind {
         plan::first_path(&task, &recipe, &cell)?;
@@ -156,8 +160,16 @@ async fn carry_out(
     if let Some(work) = &arguments.work {
         work.begin(&folder).await?;
     }
-    let header = header(arguments, &live, (&task, &plan), earlier.as_ref());
+    if key.is_none() && !arguments.json {
+        super::print(
+            "not signed: nothing proves who wrote this record; `regrind audit key` makes the key that signs it\n",
+        )?;
+    }
+    let mut header = header(arguments, &live, (&task, &plan), earlier.as_ref());
+    let (place, turn) = Place::next(&arguments.runs)?;
+    place.in_record(&mut header.content);
     let mut journal = begin(header, &live, earlier.and_then(|earlier| earlier.learned), key)?;
+    drop(turn);
     let works_by_program = cell.grinder.link.wire.works_from_run() || cell.grinder.program.folder.is_some();
     if task.learned.is_some() || works_by_program {
         record_first_correction(&task, &mut journal)?;

@@ -17,6 +17,7 @@ use crate::model;
 pub(super) struct Checked {
     name: Option<String>,
     simulated: Option<bool>,
+    require_signature: bool,
     cmm: Option<Cmm>,
     grinder: Option<Grinder>,
 }
@@ -28,6 +29,7 @@ impl Checked {
             name: self.name?,
             simulated: self.simulated?,
             rehearsal: false,
+            require_signature: self.require_signature,
             cmm: self.cmm?,
             grinder: self.grinder?,
             path: path.to_owned(),
@@ -88,6 +90,7 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
     Checked {
         name: written.cell.name.clone(),
         simulated,
+        require_signature: written.cell.require_signature,
         cmm: cmm_link.filter(|_| complete).map(|link| Cmm {
             link,
             fixture_cmm_from_model: fixture(&cmm.fixture),

@@ -36,6 +36,8 @@ pub struct CellConfig {
     /// Whether people only play its machines, with no part: everything recorded is marked as that of simulated machines is, and the plan itself may be
     /// given back as what was measured. No cell file says it; who begins the run does.
     pub rehearsal: bool,
+    /// Whether no run is begun without a key that signs its record.
+    pub require_signature: bool,
     /// The measuring machine.
     pub cmm: Cmm,
     /// The grinder.

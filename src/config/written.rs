@@ -30,6 +30,8 @@ pub(super) struct CellTable {
     /// Whether its machines are simulated; everything recorded is marked so.
     #[schemars(extend("x-required" = true), example = false)]
     pub simulated: Option<bool>,
+    /// Whether no run is begun without a key that signs its record.
+    pub require_signature: bool,
 }
 
 /// The measuring machine.

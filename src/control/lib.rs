@@ -15,4 +15,4 @@ mod socket;
 
 pub use request::{OnBehalf, Reply, Request};
 pub use snapshot::{CycleRow, JobProgress, Next, PartVerdict, Snapshot, SoFar};
-pub use socket::{Control, Ordered, Watch, ask, ask_for, is_live, watch};
+pub use socket::{Control, DoorChange, Ordered, Watch, ask, ask_at, ask_for, is_live, is_live_at, watch};

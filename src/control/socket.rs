@@ -43,55 +43,151 @@ pub struct Ordered {
     pub answer: Option<oneshot::Sender<Reply>>,
 }
 
-/// A socket that goes away with its owner.
+/// Between two looks whether the door in the run folder is still there.
+const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
+
+/// What became of the door in the run folder.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum DoorChange {
+    /// It is gone or exchanged, and who gives orders may not find the cell; and why it could not be made again, where it could not.
+    Lost(String),
+    /// It was made again.
+    MadeAgain,
+}
+
+/// What is needed to serve those who come in.
+#[derive(Clone)]
+struct Desk {
+    orders: mpsc::Sender<Ordered>,
+    status: watch::Receiver<Snapshot>,
+    places: Arc<Semaphore>,
+}
+
+/// The doors of a cell, which go away with their owner.
 pub struct Control {
     folder: PathBuf,
-    task: tokio::task::JoinHandle<()>,
+    beside: Option<PathBuf>,
+    desk: Desk,
+    changes: mpsc::UnboundedReceiver<DoorChange>,
+    tasks: Vec<tokio::task::JoinHandle<()>>,
 }
 
 impl Control {
-    /// Listens in a run folder.
+    /// Listens in a run folder. Where it is `watched`, a door that somebody takes away is told and made again.
     ///
     /// # Errors
     /// A folder in which no socket can be made, such as one with a name too long for the operating system; a pipe that another program has.
-    pub fn listen(folder: &Path, orders: mpsc::Sender<Ordered>, status: watch::Receiver<Snapshot>) -> io::Result<Self> {
-        let mut door = Door::open(folder)?;
-        let places = Arc::new(Semaphore::new(WATCHERS));
-        let task = tokio::spawn(async move {
-            loop {
-                let Ok(caller) = door.let_in().await else {
-                    // No descriptor is left, or the client has gone: that passes, and orders must get through when it has.
-                    tokio::time::sleep(BETWEEN_TRIES).await;
-                    continue;
-                };
-                let (orders, status, places) = (orders.clone(), status.clone(), Arc::clone(&places));
-                // A client that misbehaves hurts itself only.
-                tokio::spawn(async move { drop(serve(caller, orders, status, &places).await) });
-            }
-        });
-        Ok(Self { folder: folder.to_owned(), task })
+    pub fn listen(
+        folder: &Path,
+        orders: mpsc::Sender<Ordered>,
+        status: watch::Receiver<Snapshot>,
+        watched: bool,
+    ) -> io::Result<Self> {
+        let door = Door::open(folder)?;
+        let desk = Desk { orders, status, places: Arc::new(Semaphore::new(WATCHERS)) };
+        let (tell, changes) = mpsc::unbounded_channel();
+        let (hand_over, made_again) = mpsc::channel(1);
+        let mut tasks = Vec::new();
+        match door.mark().filter(|_| watched) {
+            Some(mark) => tasks.push(tokio::spawn(keep_in_place(mark, tell, hand_over))),
+            None => drop(hand_over),
+        }
+        tasks.push(tokio::spawn(attend(door, made_again, desk.clone())));
+        Ok(Self { folder: folder.to_owned(), beside: None, desk, changes, tasks })
+    }
+
+    /// Listens at another place too, for the user of this program and root alone.
+    ///
+    /// # Errors
+    /// A place where no socket can be made.
+    pub fn listen_beside(&mut self, place: &Path) -> io::Result<()> {
+        let Some(door) = Door::open_for_user(place)? else { return Ok(()) };
+        self.beside = Some(place.to_owned());
+        let (_, none) = mpsc::channel(1);
+        self.tasks.push(tokio::spawn(attend(door, none, self.desk.clone())));
+        Ok(())
+    }
+
+    /// Waits until the door in the run folder is gone, or made again.
+    pub async fn changed(&mut self) -> DoorChange {
+        match self.changes.recv().await {
+            Some(change) => change,
+            // Nobody watches it.
+            None => std::future::pending().await,
+        }
     }
 }
 
 impl Drop for Control {
     fn drop(&mut self) {
-        self.task.abort();
+        self.tasks.iter().for_each(tokio::task::JoinHandle::abort);
         door::take_away(&self.folder);
+        if let Some(place) = &self.beside {
+            door::take_away_at(place);
+        }
+    }
+}
+
+/// Lets in who comes to a door, and to the one that is made in its place.
+async fn attend(mut door: Door, mut made_again: mpsc::Receiver<Door>, desk: Desk) {
+    loop {
+        let caller = tokio::select! {
+            caller = door.let_in() => caller,
+            Some(new) = made_again.recv() => {
+                door = new;
+                continue;
+            }
+        };
+        let Ok(caller) = caller else {
+            // No descriptor is left, or the client has gone: that passes, and orders must get through when it has.
+            tokio::time::sleep(BETWEEN_TRIES).await;
+            continue;
+        };
+        let desk = desk.clone();
+        // A client that misbehaves hurts itself only.
+        tokio::spawn(async move { drop(serve(caller, desk).await) });
+    }
+}
+
+/// Looks whether a door is still there, and makes it again where it is not. Disks are asked on a thread of their own: one that does not answer keeps
+/// nobody from an order.
+async fn keep_in_place(mut mark: door::Mark, tell: mpsc::UnboundedSender<DoorChange>, hand_over: mpsc::Sender<Door>) {
+    let mut looks = tokio::time::interval(BETWEEN_LOOKS);
+    let mut is_lost = false;
+    loop {
+        looks.tick().await;
+        let looked = tokio::task::spawn_blocking(move || {
+            let made = (!mark.is_in_place()).then(|| mark.open_again());
+            (mark, made)
+        });
+        let Ok((same, made)) = looked.await else { return };
+        mark = same;
+        let Some(made) = made else { continue };
+        if !std::mem::replace(&mut is_lost, true) {
+            let why = made.as_ref().map_or_else(io::Error::to_string, |_| String::new());
+            let _ = tell.send(DoorChange::Lost(why));
+        }
+        let Some((door, new)) = made.ok().and_then(|door| Some((door.mark()?, door))) else { continue };
+        (mark, is_lost) = (door, false);
+        let _ = tell.send(DoorChange::MadeAgain);
+        if hand_over.send(new).await.is_err() {
+            return;
+        }
     }
 }
 
 /// Lets a client say what it wants, and gives it that.
-async fn serve(
-    caller: Caller,
-    orders: mpsc::Sender<Ordered>,
-    mut status: watch::Receiver<Snapshot>,
-    places: &Semaphore,
-) -> io::Result<()> {
+async fn serve(caller: Caller, desk: Desk) -> io::Result<()> {
+    let Desk { orders, mut status, places } = desk;
     let peer = caller.actor()?;
     let (read, mut write) = caller.into_halves();
     let mut text = String::new();
     let mut read = BufReader::new(read).take(LONGEST_LINE);
     tokio::time::timeout(PATIENCE, read.read_line(&mut text)).await??;
+    if door::has_gone(read.get_ref().get_ref()) {
+        // This process stood still, and who asked has given up: an order that nobody waits for any more is not carried out.
+        return Ok(());
+    }
     let reply = match serde_json::from_str(&text) {
         Ok(Line { request: Request::Watch, .. }) => match places.try_acquire() {
             Ok(_place) => return told_on(&mut write, &mut status).await,
@@ -163,6 +259,11 @@ pub fn is_live(folder: &Path) -> bool {
     door::is_open(folder)
 }
 
+/// Whether a cell listens behind a door that does not lie in a run folder.
+pub fn is_live_at(place: &Path) -> bool {
+    door::is_open_at(place)
+}
+
 /// Asks a running cell; blocks for its answer.
 ///
 /// # Errors
@@ -177,6 +278,15 @@ pub fn ask(folder: &Path, request: &Request) -> io::Result<Reply> {
 /// Those of [`ask`].
 pub fn ask_for(folder: &Path, request: &Request, by: Option<OnBehalf>) -> io::Result<Reply> {
     let text = door::ask(folder, &line(request, by)?, PATIENCE)?;
+    Ok(serde_json::from_str(&text)?)
+}
+
+/// Asks the cell behind a door that does not lie in a run folder; blocks for its answer.
+///
+/// # Errors
+/// No cell behind it, one of another user, and one that does not answer.
+pub fn ask_at(place: &Path, request: &Request) -> io::Result<Reply> {
+    let text = door::ask_at(place, &line(request, None)?, PATIENCE)?;
     Ok(serde_json::from_str(&text)?)
 }
 

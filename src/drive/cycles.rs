@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::CycleRow;
-use super::task::{Cycle, Product, Task};
+use super::task::{Cycle, Points, Product, Task};
 use crate::cell::Tolerance;
 use crate::device::{CorrectionMap, Pass, Plan};
 use crate::geometry::Pose;
@@ -71,6 +71,11 @@ impl Cycles {
         let pass = self.get(number)?.correction.cycle;
         let earlier = |c: &&Cycle| c.is_judged() && c.known.is_some() && c.correction.cycle < pass;
         self.0.range(..number).rev().map(|(_, c)| c).find(earlier)
+    }
+
+    /// Returns the number and the points of the last measurement before a cycle.
+    pub(super) fn measured_before(&self, number: u32) -> Option<(u32, Arc<Points>)> {
+        self.0.range(..number).rev().find_map(|(earlier, cycle)| Some((*earlier, cycle.points.clone()?)))
     }
 
     /// Takes what was computed of a cycle.

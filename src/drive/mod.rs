@@ -60,7 +60,7 @@ use program::PROGRAM_FILE;
 pub use program::{ProgramError, Programs};
 pub use record::Ledger;
 use record::{Files, Recorder, Ticket, entry};
-use regrind_control::{Control, Ordered};
+use regrind_control::{Control, DoorChange, Ordered};
 pub use regrind_control::{CycleRow, JobProgress, Reply, Request, Snapshot, SoFar, ask, is_live};
 pub use replay::{Interrupted, ReplayError};
 use so_far::Touching;
@@ -180,7 +180,7 @@ pub struct Drive {
     left: Vec<String>,
     ending: Option<Ending>,
     stations: Vec<tokio::task::JoinHandle<()>>,
-    _control: Control,
+    control: Control,
 }
 
 /// What is computed for a cycle.
@@ -241,6 +241,14 @@ enum Then {
     Confirm { device: Device, word: Word, answer: oneshot::Sender<Result<(), String>> },
 }
 
+/// Tells the cell what became of the way by which orders come in.
+fn door_event(change: DoorChange) -> Event {
+    match change {
+        DoorChange::Lost(why) => Event::ControlLost { why },
+        DoorChange::MadeAgain => Event::ControlBack,
+    }
+}
+
 /// Makes a folder for results, where it is not there.
 fn made(folder: &Path) -> Result<(), FormatError> {
     ResultFolder::prepare(folder).map(ResultFolder::keep)
@@ -283,7 +291,7 @@ impl Drive {
         let serial = run.journal.part().to_owned();
         let recorder = Recorder::new(run.journal, &ids, &run.beside);
         let folder = recorder.folder().to_owned();
-        let control = Control::listen(&folder, orders.clone(), seen.clone())?;
+        let control = Control::listen(&folder, orders.clone(), seen.clone(), matches!(run.beside, Beside::Threads))?;
         let interrupts = [Interrupt::new(), Interrupt::new()];
         let aborts = [watch::Sender::new(0), watch::Sender::new(0)];
         let pulse = Pulse::new();
@@ -337,10 +345,18 @@ impl Drive {
             left: interrupted.left,
             ending: interrupted.ending,
             stations: vec![cmm_task, grinder_task],
-            _control: control,
+            control,
         };
         drive.status.send_replace(drive.snapshot());
         Ok((drive, Orders { orders, status: seen }))
+    }
+
+    /// Listens to orders at another place too, where the cell is found though its run folder is gone.
+    ///
+    /// # Errors
+    /// A place where no socket can be made.
+    pub fn listen_beside(&mut self, place: &Path) -> std::io::Result<()> {
+        self.control.listen_beside(place)
     }
 
     fn now(&self) -> Duration {
@@ -386,9 +402,11 @@ impl Drive {
                     Err(error) => self.panicked(error).await,
                 },
                 Some(report) = self.reports.recv() => self.reported(report).await,
+                change = self.control.changed() => drop(self.take(door_event(change), None).await),
                 () = deadline => drop(self.take(Event::Deadline, None).await),
                 _ = beats.tick() => {}
             }
+            self.withdraw_waiting().await;
         }
         self.end_run().await
     }
@@ -417,7 +435,7 @@ impl Drive {
             Err(why) => {
                 let reason = message_of(&why);
                 match then {
-                    Then::Execute(command) => self.not_carried_out(*command).await,
+                    Then::Execute(command) => self.not_on_record(*command).await,
                     Then::Answer { answer, message, .. } => {
                         let message = format!("{message}; it is not on record, {reason}");
                         drop(answer.send(Reply { taken: false, message, status: self.snapshot() }));
@@ -448,6 +466,17 @@ impl Drive {
         }
     }
 
+    /// Tells the cell that a command for whose answer it waits was not given, since it did not come on record.
+    async fn not_on_record(&mut self, command: Command) {
+        match command {
+            Command::StartMachine { .. } => self.not_carried_out(command).await,
+            command if outcome::is_answered(&command) => {
+                drop(self.take(Event::NotOnRecord { command: command.name() }, None).await);
+            }
+            _ => {}
+        }
+    }
+
     /// Lets the cell and people know that something cannot be recorded.
     async fn record_failed(&mut self, why: RecordFailure) {
         let message = message_of(&why);
@@ -458,6 +487,22 @@ impl Drive {
             self.take(Event::RecordFailed { why }, None).await;
         }
         self.answer_without_record();
+    }
+
+    /// While nothing comes on record no command waits to be carried out then: the cell would wait for its answer, and nobody could go on before the disk
+    /// does. What waits behind it is the cell's to ask for anew.
+    async fn withdraw_waiting(&mut self) {
+        if self.failing.is_none() || self.ending.is_some() {
+            return;
+        }
+        let leads_on = |then: &Then| matches!(then, Then::Execute(command) if outcome::is_answered(command));
+        let waiting = self.backlog.iter_mut().filter(|waiting| leads_on(&waiting.then));
+        let withdrawn: Vec<Then> = waiting.map(|waiting| std::mem::replace(&mut waiting.then, Then::Nothing)).collect();
+        for then in withdrawn {
+            if let Then::Execute(command) = then {
+                self.not_on_record(*command).await;
+            }
+        }
     }
 
     /// While nothing comes on record, who gave an order is not kept waiting, and is told what became of it and what did not.
@@ -960,8 +1005,9 @@ impl Drive {
     fn gate(&mut self, measurement: Box<Measurement>) {
         let number = Number::of(measurement.cycle).cycle;
         let cycle = self.cycles.get(number).cloned();
+        let earlier = self.cycles.measured_before(number);
         self.compute(Computation::Gate, number, move |task, files| {
-            work::gate_cycle(task, files, number, cycle.as_ref(), &measurement)
+            work::gate_cycle(task, files, number, cycle.as_ref(), (earlier.as_ref(), &measurement))
         });
     }
 

@@ -7,7 +7,11 @@ use crate::device::{Job, Outcome, Pass, PassRecord};
 /// Share of its stated radius by which a wheel may differ from the recipe's: wear and dressing, not another wheel.
 const WHEEL_SHARE: f64 = 0.01;
 /// Least share of the tracks over the whole rectangle that a pass travels: an aperture leaves corners and holes out.
-const LEAST_PATH_SHARE: f64 = 0.25;
+const LEAST_PATH_SHARE: f64 = 0.5;
+/// Most of them that it travels each time it goes over the part: with its ways through the air, and over the edges.
+const MOST_PATH_SHARE: f64 = 20.0;
+/// How much larger than the rectangle a surface is that the wheel can follow.
+const STEEPNESS: f64 = 2.0;
 /// What a pass may have taken off beyond the most that it is planned with: scatter, and the rounding of who measured it.
 const DEPTH_SHARE: f64 = 1.05;
 const DEPTH_SLACK_MM: f64 = 0.01;
@@ -36,17 +40,24 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
     if record.outcome != Outcome::Complete {
         return None; // A pass that did not come to its end is judged by that alone.
     }
+    if let Some(flaw) = record.flaw() {
+        return Some(flaw);
+    }
     let range = |value: Option<f64>, what: &str, least: f64, most: f64, unit: &str| {
         let value = value.filter(|value| !(least..=most).contains(value))?;
         let limits = match (least.is_finite(), most.is_finite()) {
-            (true, true) => format!("{least:.3} to {most:.3} {unit} are possible"),
-            (true, false) => format!("at least {least:.3} {unit} are needed"),
-            _ => format!("at most {most:.3} {unit} are allowed"),
+            (true, true) => format!("{} to {} {unit} are possible", figure(least), figure(most)),
+            (true, false) => format!("at least {} {unit} are needed", figure(least)),
+            _ => format!("at most {} {unit} are allowed", figure(most)),
         };
-        Some(format!("{what} is {value:.3} {unit}, and {limits}"))
+        Some(format!("{what} is {} {unit}, and {limits}", figure(value)))
     };
     let [width, height] = [pass.x_mm, pass.y_mm].map(|[low, high]| high - low);
-    let least_path_mm = LEAST_PATH_SHARE * width * height / pass.track_spacing_mm;
+    let tracks_mm = width * height / pass.track_spacing_mm;
+    let least_path_mm = LEAST_PATH_SHARE * tracks_mm;
+    // It goes over the part once for each cut of what it may take off, once to finish, and then to spark out.
+    let times = (largest_depth_mm / pass.depth_of_cut_mm).ceil() + 1.0 + f64::from(pass.spark_out_passes);
+    let most_path_mm = MOST_PATH_SHARE * tracks_mm * times;
     // Roughing and ways through the air may be faster than the feed; what the last tracks need, it needs at least.
     let least_s = least_path_mm / (pass.feed_mm_min / 60.0);
     // When a person says that a pass has begun and ended is no measure of it; who tells the path has a clock.
@@ -54,12 +65,26 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
     let wheel = [1.0 - WHEEL_SHARE, 1.0 + WHEEL_SHARE].map(|share| share * pass.wheel_radius_mm);
     let any = f64::INFINITY;
     let most_mm = DEPTH_SHARE * largest_depth_mm + DEPTH_SLACK_MM;
+    let most_mm3 = STEEPNESS * width * height * most_mm;
     range(record.path_mm, "the path travelled", least_path_mm, any, "mm")
+        .or_else(|| range(record.path_mm, "the path travelled", -any, most_path_mm, "mm"))
         .or_else(|| range(measured_s, "its duration", least_s, any, "s"))
         .or_else(|| range(record.deepest_mm, "the largest depth taken off", -any, most_mm, "mm"))
         .or_else(|| range(record.wheel_radius_mm, "the radius of the wheel", wheel[0], wheel[1], "mm"))
-        .or_else(|| range(record.removed_mm3, "the volume removed", 0.0, any, "mm3"))
-        .or_else(|| range(record.idle_share, "the share of the path that cut nothing", 0.0, 1.0, ""))
+        .or_else(|| range(record.removed_mm3, "the volume removed", 0.0, most_mm3, "mm3"))
+        .or_else(|| contradiction(record))
+}
+
+/// Tells where the figures of a record cannot be true together: a wheel that cut took something off.
+fn contradiction(record: &PassRecord) -> Option<String> {
+    let (removed_mm3, deepest_mm) = (record.removed_mm3?, record.deepest_mm?);
+    (removed_mm3 == 0.0 && deepest_mm > 0.0)
+        .then(|| format!("the volume removed is 0 mm3, and the largest depth taken off is {deepest_mm:.4} mm"))
+}
+
+/// A figure in a message: one that is absurd is not written out with hundreds of digits.
+fn figure(value: f64) -> String {
+    if value.abs() < 1e9 { format!("{value:.3}") } else { format!("{value:e}") }
 }
 
 /// A pass record as the journal keeps it.
@@ -120,21 +145,33 @@ mod tests {
     #[test]
     fn a_figure_that_cannot_be_is_named_with_its_limit() {
         assert_eq!(judged(&record()), None);
-        let cases: [(PassRecord, &str); 9] = [
+        let cases = [
             (PassRecord { map_identity: [4; 32], ..record() }, "map 04040404 was ground, and 03030303 was handed over"),
             (PassRecord { job: 40, ..record() }, "it is of job 40, cycle 2; 41, 2 was ground"),
             (PassRecord { cycle: 1, ..record() }, "it is of job 41, cycle 1; 41, 2 was ground"),
             (PassRecord { deepest_mm: Some(3.0), ..record() }, "3.000 mm, and at most 0.535 mm are allowed"),
             (
                 PassRecord { path_mm: Some(-1.0), ..record() },
-                "the path travelled is -1.000 mm, and at least 3162.000 mm",
+                "the path travelled is -1.000 mm, and at least 6324.000 mm",
             ),
+            (
+                PassRecord { path_mm: Some(6000.0), ..record() },
+                "the path travelled is 6000.000 mm, and at least 6324.000 mm",
+            ),
+            (PassRecord { path_mm: Some(1e300), ..record() }, "the path travelled is 1e300 mm"),
+            (PassRecord { removed_mm3: Some(1e30), ..record() }, "the volume removed is 1e30 mm3"),
+            (
+                PassRecord { removed_mm3: Some(0.0), ..record() },
+                "is 0 mm3, and the largest depth taken off is 0.2000 mm",
+            ),
+            (PassRecord { spindle_load: Some(-1.0), ..record() }, "the spindle load is -1, and 0 to 10"),
+            (PassRecord { temperature_c: Some(-327.0), ..record() }, "the temperature is -327 degrees Celsius"),
             (
                 PassRecord { wheel_radius_mm: Some(11.0), ..record() },
                 "is 11.000 mm, and 12.375 to 12.625 mm are possible",
             ),
-            (PassRecord { duration_s: Some(0.0), ..record() }, "its duration is 0.000 s, and at least 189.720 s"),
-            (PassRecord { idle_share: Some(1.5), ..record() }, "1.500 , and 0.000 to 1.000"),
+            (PassRecord { duration_s: Some(0.0), ..record() }, "its duration is 0.000 s, and at least 379.440 s"),
+            (PassRecord { idle_share: Some(1.5), ..record() }, "cut nothing is 1.5, and 0 to 1 are"),
             (PassRecord { removed_mm3: Some(-2.0), ..record() }, "the volume removed is -2.000 mm3"),
         ];
         for (record, words) in cases {

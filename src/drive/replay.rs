@@ -284,7 +284,10 @@ impl<'t> Replay<'t> {
     /// The points of a measurement as they were written.
     fn points(&self, number: u32) -> Result<super::task::Points, ReplayError> {
         let read = |name: &str| match self.files.get(&(number, name.to_owned())) {
-            Some(file) => formats::read_measured(self.run.join(&file.name)).map_err(ReplayError::from),
+            Some(file) => {
+                let bytes = file.read(self.run)?;
+                formats::parse_points(self.run.join(&file.name), &bytes[..]).map_err(ReplayError::from)
+            }
             None => Ok(Vec::new()),
         };
         let (part, sphere) = (read("measured.csv")?, read("reference_sphere.csv")?);
@@ -303,8 +306,7 @@ impl<'t> Replay<'t> {
     /// The newest document of a name that is on record of a cycle.
     fn read_json<T: DeserializeOwned>(&self, number: u32, name: &str) -> Result<Option<T>, ReplayError> {
         let Some(file) = self.files.get(&(number, name.to_owned())) else { return Ok(None) };
-        let path = self.run.join(&file.name);
-        let bytes = fs::read(&path).map_err(|source| ReplayError::Scratch { path, source })?;
+        let bytes = file.read(self.run)?;
         serde_json::from_slice(&bytes).map(Some).map_err(|error| self.differs(format!("{}: {error}", file.name)))
     }
 

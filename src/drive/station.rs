@@ -225,6 +225,16 @@ struct Seen {
     running: bool,
     next_try: Option<Instant>,
     tries: u32,
+    /// When the link came back last.
+    back: Option<Instant>,
+    /// Since START was given, or the job was found out about, the machine was seen at it.
+    at_job: bool,
+    /// Looks in a row that showed nothing of it.
+    absent: u32,
+    /// Looks at which the progress of a machine that says HELD had risen since the one before.
+    rises: u32,
+    /// When STOP was taken.
+    stop_taken: Option<Instant>,
 }
 
 /// Between two beats of the loop that decides.
@@ -235,6 +245,16 @@ const HUNG_AFTER: Duration = Duration::from_secs(2);
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 /// How long signals must be within their ranges before a machine goes on by them: one at its limit does not flap.
 const BELIEVED_AFTER: Duration = Duration::from_secs(1);
+/// A link that stood for so long is not the one that is lost again and again.
+const STEADY_AFTER: Duration = Duration::from_secs(10);
+/// Looks at which a machine shows nothing of its job, before that is believed.
+const ABSENT_AFTER: u32 = 2;
+/// Looks at which the progress of a machine rises that says HELD, before it is taken for moving: one may still count what it has just ended.
+const RISES_AFTER: u32 = 3;
+/// A machine that still says EXECUTE so long after it took a STOP does not do it.
+const STOPS_WITHIN: Duration = Duration::from_secs(5);
+/// Least share of a path that a machine has travelled when it calls its job complete.
+const COMPLETE_FROM: f64 = 0.95;
 /// Progress is told at most this often, so that the journal stays readable.
 const PROGRESS_EVERY: Duration = Duration::from_millis(250);
 
@@ -439,12 +459,14 @@ impl<B: StationDriver> MachineTask<B> {
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Prepare, why }).await;
         };
         let job = Job { job: self.job, cycle: number.seen(), digest };
-        if self.seen.state == Some(State::Prepared)
-            && let Err(error) = self.driver.machine().stop().await
-        {
-            return self.failed(Asked::Prepare, error).await;
-        }
-        match self.driver.machine().prepare(job).await {
+        let prepared = async {
+            // One whose answer was lost stands there too, unknown to who remembers: the machine is asked.
+            if self.driver.machine().status().await?.state == State::Prepared {
+                self.driver.machine().stop().await?;
+            }
+            self.driver.machine().prepare(job).await
+        };
+        match prepared.await {
             Ok(armed) => {
                 let detail = intent(&armed);
                 self.armed = Some(armed);
@@ -478,6 +500,7 @@ impl<B: StationDriver> MachineTask<B> {
         match self.driver.machine().start(armed).await {
             Ok(started) => {
                 self.seen.state = Some(State::Execute);
+                self.seen.at_job = started.status.state.moves();
                 let detail = serde_json::json!({ "start_sequence": started.start_sequence });
                 self.tell_with(Event::Started { device: B::DEVICE, cycle }, Some(detail)).await;
             }
@@ -528,7 +551,10 @@ impl<B: StationDriver> MachineTask<B> {
     async fn stop(&mut self) {
         self.seen.stopping = true;
         match self.driver.machine().stop().await {
-            Ok(status) => self.note(&status).await,
+            Ok(status) => {
+                self.seen.stop_taken = Some(Instant::now());
+                self.note(&status).await;
+            }
             Err(error) if error.is_link() => self.lost(&error).await,
             Err(error) => match self.driver.machine().status().await {
                 Ok(status) if !status.state.moves() => self.note(&status).await,
@@ -593,6 +619,7 @@ impl<B: StationDriver> MachineTask<B> {
                 if status.state == State::Complete && self.fetch_record().await.is_err() {
                     return;
                 }
+                self.doubt_early_end(&status).await;
                 self.seen.ended = true;
                 Reconciliation::Ended(job_result(status.outcome))
             }
@@ -608,6 +635,7 @@ impl<B: StationDriver> MachineTask<B> {
         if matches!(outcome, Reconciliation::Running | Reconciliation::Held) {
             self.seen.running = true;
             self.seen.ended = false;
+            (self.seen.at_job, self.seen.absent) = (true, 0);
         }
         self.tell(Event::Reconciled { device: B::DEVICE, cycle, outcome }).await;
     }
@@ -676,6 +704,11 @@ impl<B: StationDriver> MachineTask<B> {
 
     async fn lost(&mut self, error: &DeviceError) {
         if !std::mem::replace(&mut self.seen.lost, true) {
+            if self.seen.back.is_none_or(|back| back.elapsed() > STEADY_AFTER) {
+                self.seen.tries = 0;
+            } else {
+                self.pause_before_next_try();
+            }
             let answers = if error.is_link() {
                 ""
             } else {
@@ -736,16 +769,18 @@ impl<B: StationDriver> MachineTask<B> {
         match reached.await {
             Ok(identity) => {
                 self.seen.lost = false;
-                self.seen.tries = 0;
+                self.seen.back = Some(Instant::now());
                 self.seen.state = None;
                 self.tell(Event::LinkBack { device: B::DEVICE, boot_id: identity.boot_id }).await;
             }
-            Err(_) => {
-                let pause = Duration::from_millis(100) * 2u32.saturating_pow(self.seen.tries.min(10));
-                self.seen.tries += 1;
-                self.seen.next_try = Some(Instant::now() + pause.min(LONGEST_PAUSE));
-            }
+            Err(_) => self.pause_before_next_try(),
         }
+    }
+
+    fn pause_before_next_try(&mut self) {
+        let pause = Duration::from_millis(100) * 2u32.saturating_pow(self.seen.tries.min(10));
+        self.seen.tries += 1;
+        self.seen.next_try = Some(Instant::now() + pause.min(LONGEST_PAUSE));
     }
 
     /// Tells what has changed.
@@ -755,6 +790,8 @@ impl<B: StationDriver> MachineTask<B> {
         self.note_clear(status).await;
         self.note_supplies(status).await;
         self.note_signals(status).await;
+        self.note_absence(status).await;
+        self.note_contradiction(before, status).await;
         match status.state {
             State::Execute => {
                 if before == Some(State::Held) {
@@ -781,6 +818,61 @@ impl<B: StationDriver> MachineTask<B> {
                 self.tell(Event::Fault { device, code, message }).await;
             }
             _ => {}
+        }
+    }
+
+    /// Tells when a machine that was seen at this run's job shows that it is at none, or at another one, and tells of no end.
+    async fn note_absence(&mut self, status: &Status) {
+        let Seen { running, ended, stopping, clearing, aborting, .. } = self.seen;
+        if !running || ended || stopping || clearing || aborting {
+            return;
+        }
+        let is_another = status.job.is_some_and(|job| job.job != self.job);
+        let at_a_job = status.state.moves() || matches!(status.state, State::Held | State::Complete);
+        if at_a_job && !is_another {
+            (self.seen.at_job, self.seen.absent) = (true, 0);
+        }
+        if !self.seen.at_job || !(matches!(status.state, State::Idle | State::Prepared) || at_a_job && is_another) {
+            return;
+        }
+        self.seen.absent += 1;
+        if self.seen.absent == ABSENT_AFTER {
+            self.tell(Event::JobVanished { device: B::DEVICE, why: format!("it is {}", at_work(status)) }).await;
+        }
+    }
+
+    /// Tells when what a machine shows cannot be true together: it says that it is held and gets further, or took a STOP and goes on.
+    async fn note_contradiction(&mut self, before: Option<State>, status: &Status) {
+        let device = B::DEVICE;
+        let is_held = status.state == State::Held && before == Some(State::Held);
+        match status.progress.filter(|_| is_held) {
+            Some((done, total)) => {
+                let (last, _) = self.seen.progress.replace((done, total)).unwrap_or((done, total));
+                self.seen.rises += u32::from(done > last);
+                if done > last && self.seen.rises == RISES_AFTER {
+                    let why = format!("it says HELD, and its progress has risen to {done} of {total} meanwhile");
+                    self.tell(Event::Refused { device, what: Asked::Hold, why }).await;
+                }
+            }
+            None => self.seen.rises = 0,
+        }
+        let is_late = self.seen.stop_taken.is_some_and(|taken| taken.elapsed() > STOPS_WITHIN);
+        if self.seen.stopping && is_late && status.state == State::Execute {
+            self.seen.stop_taken = None;
+            let why = format!("it took the STOP, and is EXECUTE {} s later", STOPS_WITHIN.as_secs());
+            self.tell(Event::Refused { device, what: Asked::Stop, why }).await;
+        }
+    }
+
+    /// Doubts a pass that is called complete before the path is travelled.
+    async fn doubt_early_end(&mut self, status: &Status) {
+        let (Device::Grinder, Outcome::Complete, Some((done, total))) = (B::DEVICE, status.outcome, status.progress)
+        else {
+            return;
+        };
+        if f64::from(done) < COMPLETE_FROM * f64::from(total) {
+            let why = format!("the grinder calls it complete, with a progress of {done} of {total}");
+            self.tell(Event::RecordDoubted { cycle: self.cycle, why }).await;
         }
     }
 
@@ -864,6 +956,9 @@ impl<B: StationDriver> MachineTask<B> {
         }
         if !self.seen.ended && self.fetch_record().await.is_err() {
             return; // The next look tries again.
+        }
+        if !self.seen.ended {
+            self.doubt_early_end(status).await;
         }
         self.seen.stopping = false;
         self.seen.running = false;

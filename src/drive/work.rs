@@ -4,6 +4,7 @@
 //! the cell gets and the files for the run folder.
 
 use std::borrow::Cow;
+use std::collections::HashSet;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -36,7 +37,7 @@ pub(super) fn gate_cycle(
     files: &mut Files,
     number: u32,
     cycle: Option<&Cycle>,
-    measurement: &Measurement,
+    (earlier, measurement): (Option<&(u32, Arc<Points>)>, &Measurement),
 ) -> (Event, Product) {
     let unplanned = || Plan { targets: Vec::new(), ..task.plan(0.0, &task.fixture_cmm_from_model, false) };
     let plan = cycle.and_then(|cycle| cycle.plan.as_deref()).map_or_else(|| Cow::Owned(unplanned()), Cow::Borrowed);
@@ -45,7 +46,10 @@ pub(super) fn gate_cycle(
     let again = cycle.and_then(|cycle| Some((cycle.again.as_deref()?, cycle.points.as_deref()?)));
     let planned = plan.targets.iter().filter(|t| t.what == TargetKind::Part).count() as u32;
     let planned = planned + so_far.map_or(0, |points| points.tried.iter().map(Vec::len).sum::<usize>() as u32);
-    let (found, usable) = match foreign(task, &plan, measurement).or_else(|| out_of_window(task, measurement)) {
+    let unusable = foreign(task, &plan, measurement)
+        .or_else(|| given_again(task, earlier, measurement))
+        .or_else(|| out_of_window(task, measurement));
+    let (found, usable) = match unusable {
         Some(failure) => (0, Err(failure)),
         None => {
             if let Some((again, points)) = again {
@@ -222,15 +226,13 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
         let (found, planned) = (measurement.points.len(), plan.targets.len());
         return Some(GateFailure::Broken(format!("{found} points came for {planned} targets")));
     }
+    if let Some(flaw) = measurement.flaw() {
+        return Some(GateFailure::Broken(flaw));
+    }
     let order = measurement.points.iter().zip(&plan.targets).position(|(p, t)| p.index != t.index);
     if let Some(k) = order {
         let (found, planned) = (measurement.points[k].index, plan.targets[k].index);
         return Some(GateFailure::Broken(format!("point {} is of target {found}, and target {planned} is due", k + 1)));
-    }
-    let touched = |p: &&crate::device::MeasuredPoint| p.status == PointStatus::Touched;
-    if let Some(wrong) = measurement.points.iter().filter(touched).find(|p| !p.at_mm.iter().all(|v| v.is_finite())) {
-        let message = format!("the coordinates of target {} are not finite numbers", wrong.index);
-        return Some(GateFailure::Broken(message));
     }
     match plan.check(measurement).err()? {
         BesidePlan::GivenBack if task.rehearsal => None,
@@ -239,8 +241,31 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
     }
 }
 
+/// Fewer touches than these may be alike by chance, where a machine counts in coarse steps.
+const ALIKE_BY_CHANCE: usize = 8;
+
+/// The result of an earlier measurement, given once more: no probe finds every place again to the last bit.
+fn given_again(task: &Task, earlier: Option<&(u32, Arc<Points>)>, measurement: &Measurement) -> Option<GateFailure> {
+    let (number, points) = earlier.filter(|_| !task.rehearsal)?;
+    let touched = || measurement.points.iter().filter(|point| point.status == PointStatus::Touched);
+    // In whatever order the plan had them, and with those of the reference sphere among them.
+    let bits = |at_mm: [f64; 3]| at_mm.map(f64::to_bits);
+    let old: HashSet<_> = points.part.iter().map(|point| bits([point.x, point.y, point.z])).collect();
+    let is_same = touched().filter(|point| old.contains(&bits(point.at_mm))).count() >= old.len();
+    (is_same && old.len() >= ALIKE_BY_CHANCE).then(|| {
+        let message = format!(
+            "the points are those of cycle {number} to the last bit: the machine has given its old result again"
+        );
+        GateFailure::Foreign(message)
+    })
+}
+
 /// A temperature outside the recipe's window, or one that is not told where there is a window.
 fn out_of_window(task: &Task, measurement: &Measurement) -> Option<GateFailure> {
+    if task.expansion.is_some() && measurement.temperature_c.is_none() {
+        let message = "the measurement does not say its temperature, by which the expansion of the part is taken off (part.expansion_um_m_k)";
+        return Some(GateFailure::Temperature(message.to_owned()));
+    }
     let [least, most] = task.temperature_c?;
     let wanted = format!("and {least:.2} to {most:.2} degrees Celsius are wanted (measure.temperature_c)");
     match measurement.temperature_c {

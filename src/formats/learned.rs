@@ -149,14 +149,6 @@ impl Learned {
         Self::of(&path, &text).map(|learned| Some((learned, text)))
     }
 
-    /// Reads a copy that a run kept of what it began with.
-    ///
-    /// # Errors
-    /// Those of [`Learned::read`].
-    pub fn from_file(path: &Path) -> Result<Self, LearnedError> {
-        Self::of(path, &read_whole(path, MOST_BYTES)?)
-    }
-
     /// Reads what another cell's run left, of this kind and simulation; `from` says where it came from.
     ///
     /// # Errors
@@ -175,7 +167,11 @@ impl Learned {
         }
     }
 
-    fn of(path: &Path, text: &[u8]) -> Result<Self, LearnedError> {
+    /// Reads the copy that a run kept of what it began with; `path` is what messages call it.
+    ///
+    /// # Errors
+    /// A text that is none of ours, or whose numbers cannot be.
+    pub fn of(path: &Path, text: &[u8]) -> Result<Self, LearnedError> {
         let broken = |why| LearnedError::Broken { path: path.to_owned(), why };
         let learned: Self = serde_json::from_slice(text).map_err(|error| broken(error.to_string()))?;
         match learned.flaw() {

@@ -34,6 +34,20 @@ impl Artefact {
         sync_file(&path)?;
         describe(&path, name)
     }
+
+    /// Reads what the file of a run folder holds, if that is what stands on record.
+    ///
+    /// # Errors
+    /// A file that cannot be read; [`JournalError::OtherFile`] for one that holds something else.
+    pub fn read(&self, folder: &Path) -> Result<Vec<u8>, JournalError> {
+        let path = path_within(folder, &self.name)?;
+        let mut bytes = Vec::new();
+        // One that has grown is not read to its end.
+        let file = File::open(&path).map_err(JournalError::file(&path, "reading it"))?;
+        file.take(self.bytes + 1).read_to_end(&mut bytes).map_err(JournalError::file(&path, "reading it"))?;
+        let is_same = bytes.len() as u64 == self.bytes && hex(&Sha256::digest(&bytes)) == self.sha256;
+        if is_same { Ok(bytes) } else { Err(JournalError::OtherFile { path }) }
+    }
 }
 
 /// Returns the path of a file within a run folder, if the name cannot lead out of it and is not one of the journal's own.

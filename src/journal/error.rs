@@ -67,6 +67,11 @@ pub enum JournalError {
          which proves no author"
     )]
     NoAuthor { path: PathBuf, what: String },
+    /// A file that is on record holds something else than it did.
+    #[error(
+        "{path}: it is not the file that is on record: nothing of it was used; put that one back, from a copy of the run"
+    )]
+    OtherFile { path: PathBuf },
     /// The record lies no longer where it is written: what is written now would be lost with it.
     #[error(
         "{path}: this file of the record was deleted, renamed or exchanged while the run is on; put it back where it was, or stop the run"

@@ -5,7 +5,7 @@
 
 use std::fs::{File, TryLockError};
 use std::io::{Read, Seek, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::error::JournalError;
 use super::held::HeldFile;
@@ -25,6 +25,8 @@ pub struct MachineLock {
     holder: String,
     last_epoch: u32,
     notes: Vec<String>,
+    /// The place of a door beside the file of this user.
+    door: PathBuf,
 }
 
 const FOLDER: &str = "regrind-machines";
@@ -38,6 +40,10 @@ const MOST_TOLD: u64 = 4096;
 const OWN_FILES: usize = 16;
 /// So often a file is opened anew that was taken away while it was being locked.
 const TRIES: usize = 5;
+/// Ends the name of a door beside a lock.
+const DOOR: &str = "sock";
+/// Parts the run that has a machine from the process that has it, in what is told beside a lock.
+const PROCESS: &str = ", process ";
 
 /// How a file of a machine is opened.
 type Opens = fn(&LockFolder, &str) -> Result<LockFile, String>;
@@ -61,6 +67,31 @@ impl MachineLock {
         epoch
     }
 
+    /// Returns where the cell that has this machine can be reached though the folder of its run is gone: a place beside the lock.
+    pub fn door(&self) -> &Path {
+        &self.door
+    }
+
+    /// Returns the cells of this user that have machines on this computer: the folder of the run, and the place of the door beside its lock. A cell that
+    /// was killed may be among them: nobody is behind its door.
+    pub fn doors() -> Vec<(PathBuf, PathBuf)> {
+        system::place_of_locks(FOLDER).map_or_else(Vec::new, |place| Self::doors_in(&place.join(FOLDER)))
+    }
+
+    fn doors_in(folder: &Path) -> Vec<(PathBuf, PathBuf)> {
+        let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
+        let doors = entries.map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|end| end == DOOR));
+        let run_of = |door: &Path| {
+            let lock = door.with_extension("lock");
+            if !system::is_own_file(&lock) {
+                return None;
+            }
+            let told = text_of(&File::open(lock).ok()?);
+            told.lines().next()?.rsplit_once(PROCESS).map(|(run, _)| PathBuf::from(run))
+        };
+        doors.filter_map(|door| Some((run_of(&door)?, door))).collect()
+    }
+
     /// Returns what was found in the place of its files that should not be there: nothing of it was followed or believed.
     pub fn notes(&self) -> &[String] {
         &self.notes
@@ -77,9 +108,10 @@ impl MachineLock {
         let mut lock = Self {
             held: Vec::new(),
             told: Vec::new(),
-            holder: format!("{}, process {}", run.display(), std::process::id()),
+            holder: format!("{}{PROCESS}{}", run.display(), std::process::id()),
             last_epoch: 0,
             notes: Vec::new(),
+            door: PathBuf::new(),
         };
         let (shared, own): (Opens, Opens) = (LockFolder::shared, LockFolder::own);
         let name = format!("{machine}.lock");
@@ -93,6 +125,7 @@ impl MachineLock {
         for name in (0..OWN_FILES).map(own_name) {
             match lock.hold(&folder, (&name, own), (&path, address))? {
                 Ok(()) => {
+                    lock.door = path.join(&name).with_extension(DOOR);
                     lock.write(lock.last_epoch);
                     return Ok(lock);
                 }
@@ -196,6 +229,21 @@ mod tests {
         assert!(refused.contains("runs/a, process ") && refused.contains("10.0.0.6"), "{refused}");
         drop(first);
         take("grinder at 10.0.0.6:502, unit 1", "runs/b").unwrap();
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_cell_is_found_by_its_lock_where_a_door_lies_beside_it() {
+        let place = tempfile::tempdir().unwrap();
+        let run = Path::new("/home/anna/runs, old/a, process 7");
+        let lock = MachineLock::take_in(place.path(), "grinder at 10.0.0.6:502, unit 1", run).unwrap();
+        let folder = place.path().join(FOLDER);
+        assert_eq!(MachineLock::doors_in(&folder), []);
+        std::fs::write(lock.door(), "").unwrap();
+        // Another door, beside which no lock lies.
+        std::fs::write(folder.join("other.sock"), "").unwrap();
+        assert_eq!(MachineLock::doors_in(&folder), [(run.to_owned(), lock.door().to_owned())]);
+        assert_eq!(MachineLock::doors_in(&place.path().join("absent")), []);
     }
 
     #[test]

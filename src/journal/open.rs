@@ -62,6 +62,7 @@ pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
     let failed = JournalError::database(&path);
     let connection = Connection::open_with_flags(&path, flags).map_err(&failed)?;
     configure(&connection, &path)?;
+    check_schema(&connection, &path)?;
     bring_in_the_log(&connection).map_err(&failed)?;
     if layout < LAYOUT {
         // What is written from here on, an earlier version may not know.
@@ -74,7 +75,41 @@ pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
 /// bringing a part of the log to the disk, and show it all the same; what is written behind such a part is not found again
 /// after a power cut. While somebody reads, the log stays as it is.
 fn bring_in_the_log(connection: &Connection) -> rusqlite::Result<()> {
-    run(connection, "PRAGMA wal_checkpoint(TRUNCATE)")
+    // The file of the log stays as long as it is: that a run which broke off has none, or an empty one, says that somebody took it away.
+    run(connection, "PRAGMA wal_checkpoint(RESTART)")
+}
+
+/// Sees that the tables are those of a record, and nothing else: a view in the place of a table can show anything, and without end.
+fn check_schema(connection: &Connection, path: &Path) -> Result<(), JournalError> {
+    let failed = JournalError::database(path);
+    let mut statement = connection.prepare("SELECT type, name, sql FROM sqlite_schema").map_err(&failed)?;
+    let mut rows = statement.query([]).map_err(&failed)?;
+    let foreign = |what| JournalError::Foreign { path: path.to_owned(), what };
+    let mut has_table = false;
+    while let Some(row) = rows.next().map_err(&failed)? {
+        let (kind, name): (String, String) = (row.get(0).map_err(&failed)?, row.get(1).map_err(&failed)?);
+        let sql: Option<String> = row.get(2).map_err(&failed)?;
+        // SQLite makes an index of its own for what is unique.
+        let is_automatic = sql.is_none() && kind == "index" && name.starts_with("sqlite_autoindex_record_");
+        if !is_automatic && !sql.is_some_and(|sql| statements().any(|known| known == words(&sql))) {
+            return Err(foreign("it has a table, view, index or trigger that a record has not"));
+        }
+        has_table |= kind == "table" && name == "record";
+    }
+    if has_table { Ok(()) } else { Err(foreign("it has no table of records")) }
+}
+
+/// The statements of the schema, as the database keeps them.
+fn statements() -> impl Iterator<Item = String> {
+    // That of a trigger has a semicolon within.
+    SCHEMA
+        .split("\nCREATE ")
+        .skip(1)
+        .map(|statement| words(&format!("CREATE {}", statement.trim().trim_end_matches(';'))))
+}
+
+fn words(sql: &str) -> String {
+    sql.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 /// Opens the database of a run for reading, also where the folder cannot be written.
@@ -103,6 +138,7 @@ pub(super) fn read_only(folder: &Path) -> Result<Connection, JournalError> {
     }
     .map_err(&failed)?;
     harden(&connection, &path)?;
+    check_schema(&connection, &path)?;
     Ok(connection)
 }
 
@@ -134,6 +170,12 @@ fn address(path: &Path) -> String {
 fn recognise(folder: &Path, path: &Path) -> Result<u32, JournalError> {
     if !path.is_file() {
         return Err(JournalError::Absent { path: folder.to_owned() });
+    }
+    for beside in ["-wal", "-shm", "-journal"] {
+        let beside = folder.join(format!("{DATABASE}{beside}"));
+        if fs::symlink_metadata(&beside).is_ok_and(|found| !found.is_file()) {
+            return Err(JournalError::Foreign { path: beside, what: "it is no file" });
+        }
     }
     let failed = JournalError::file(path, "reading it");
     let mut header = Vec::new();

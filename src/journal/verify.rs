@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::io;
+use std::io::{self, Read};
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
@@ -88,10 +88,10 @@ pub struct Verified {
 }
 
 impl Verified {
-    /// Returns whether the run names a key and has its end, and that is not sealed although nobody drives it: who has no key may
-    /// have written it.
+    /// Returns whether the run names a key and has its end, and that is not sealed: who has no key may have written it. Where a process drives
+    /// the run, the seal may still be on its way.
     pub fn lacks_last_seal(&self) -> bool {
-        !self.keys.is_empty() && self.closed && !self.under_way && self.signed + 1 != self.records
+        !self.keys.is_empty() && self.closed && self.signed + 1 != self.records
     }
 }
 
@@ -114,16 +114,37 @@ pub fn verify_against(folder: impl AsRef<Path>, against: &Against) -> Result<Ver
     examine(folder, &anchors, &against.keys)
 }
 
+/// Returns the anchor beside a journal; none where there is none.
+///
+/// # Errors
+/// A file that cannot be read, or that is no anchor.
+pub fn anchor_of(folder: &Path) -> Result<Option<Anchor>, JournalError> {
+    read_anchor(folder)
+}
+
 /// Reads the anchor beside a journal.
 pub(super) fn read_anchor(folder: &Path) -> Result<Option<Anchor>, JournalError> {
     let path = folder.join(ANCHOR);
-    match fs::read(&path) {
+    match read_few(&path) {
         Ok(bytes) => {
             serde_json::from_slice(&bytes).map(Some).map_err(|_| broken(folder, 0, "journal.anchor is no anchor"))
         }
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
         Err(error) => Err(JournalError::file(&path, "reading it")(error)),
     }
+}
+
+/// Most bytes of an anchor.
+const MOST_OF_ANCHOR: u64 = 4096;
+
+/// Reads a small file, and nothing that is none or has no end.
+fn read_few(path: &Path) -> io::Result<Vec<u8>> {
+    if !fs::metadata(path)?.is_file() {
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no file"));
+    }
+    let mut bytes = Vec::new();
+    fs::File::open(path)?.take(MOST_OF_ANCHOR).read_to_end(&mut bytes)?;
+    Ok(bytes)
 }
 
 fn broken(folder: &Path, seq: u64, what: impl Into<String>) -> JournalError {
@@ -200,7 +221,11 @@ fn examine(folder: &Path, anchors: &[&Anchor], trusted: &[PublicKey]) -> Result<
 
 /// Whether somebody holds the lock of a run folder: its program is there, whether it is at its beginning, at work or at its end.
 pub fn is_driven(folder: &Path) -> bool {
-    let lock = fs::File::open(folder.join(LOCK));
+    let path = folder.join(LOCK);
+    if !fs::metadata(&path).is_ok_and(|found| found.is_file()) {
+        return false;
+    }
+    let lock = fs::File::open(path);
     lock.is_ok_and(|lock| matches!(lock.try_lock_shared(), Err(fs::TryLockError::WouldBlock)))
 }
 
@@ -379,7 +404,9 @@ impl<'a> Seen<'a> {
         if !path.is_file() {
             return wrong(format!("the file {} is missing", known.name));
         }
-        if describe(&path, &known.name)? != known {
+        // What has another length is not read: it may have no end.
+        let length = fs::metadata(&path).map(|found| found.len()).unwrap_or_default();
+        if length != known.bytes || describe(&path, &known.name)? != known {
             return wrong(format!("the file {} is not what was written", known.name));
         }
         self.artefacts += 1;

@@ -430,7 +430,7 @@ fn an_end_that_is_not_signed_ends_with_1_where_the_run_names_a_key() {
         content: Value::Null,
     };
     let journal = Journal::create_with(&folder, header, Some(AuditKey::new())).unwrap();
-    assert!(printed(home.path(), &["audit", "verify"], 0).contains("signed      up to record 1 of 2"));
+    assert!(printed(home.path(), &["audit", "verify"], 4).contains("signed      up to record 1 of 2"));
     journal.close(0, 0, json!("stopped")).unwrap();
     printed(home.path(), &["audit", "verify"], 0);
     let database = rusqlite::Connection::open(folder.join("journal.sqlite")).unwrap();
@@ -494,9 +494,47 @@ fn a_run_under_way_is_shown_and_its_open_end_is_said() {
     };
     let mut journal = Journal::create(home.path().join("runs/r"), header).unwrap();
     journal.append(Entry::new(Kind::Note, 0, 0, json!("a word"))).unwrap();
-    let proven = printed(home.path(), &["audit", "verify"], 0);
+    let proven = printed(home.path(), &["audit", "verify"], 4);
     assert!(proven.contains("not closed: nothing was cut off up to record 1"), "{proven}");
     assert!(printed(home.path(), &["audit", "show"], 0).ends_with("-  a word\n"));
+}
+
+#[test]
+fn who_holds_the_lock_of_a_run_does_not_make_it_sound() {
+    let home = tempfile::tempdir().unwrap();
+    let folder = home.path().join("runs/r");
+    let header = || Header {
+        run: "r".into(),
+        part: "SN 7".into(),
+        actor: "Ada".into(),
+        station: "console".into(),
+        simulation: false,
+        first_command_id: 1,
+        content: Value::Null,
+    };
+    let key = AuditKey::new();
+    let public = key.public().to_string();
+    drop(Journal::create_with(&folder, header(), Some(key)).unwrap());
+    // Gone on with, and brought to its end, by somebody without the key.
+    Journal::open(&folder).unwrap().close(9, 1, json!("accepted")).unwrap();
+    let path = folder.display().to_string();
+    let verified = |arguments: &[&str]| run(&[&["audit", "verify", &path], arguments].concat(), home.path()).0;
+    assert_eq!((verified(&[]), verified(&["--key", &public])), (1, 1));
+    // Anybody who may read the folder may hold its lock.
+    let lock = fs::File::open(folder.join(".lock")).unwrap();
+    lock.lock_shared().unwrap();
+    lock.unlock().unwrap();
+    lock.lock().unwrap();
+    assert_eq!(verified(&["--key", &public]), 1, "with the key at hand an end that nobody signed is not believed");
+    assert_eq!(verified(&[]), 4, "without it the seal may still be on its way");
+    // A run that broke off is not proven whole by it either.
+    let broken_off = home.path().join("runs/s");
+    drop(Journal::create(&broken_off, header()).unwrap());
+    let path = broken_off.display().to_string();
+    assert_eq!(run(&["audit", "verify", &path], home.path()).0, 1);
+    let lock = fs::File::open(broken_off.join(".lock")).unwrap();
+    lock.lock().unwrap();
+    assert_eq!(run(&["audit", "verify", &path], home.path()).0, 4);
 }
 
 #[test]

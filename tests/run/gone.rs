@@ -65,3 +65,63 @@ fn a_record_that_is_deleted_ends_with_the_run_and_no_further_pass_is_started() {
     let said = running.said.join("\n");
     assert!(!said.contains("ACCEPTED") && !said.contains("cycle 1: PV"), "{said}");
 }
+
+#[cfg(unix)]
+#[test]
+fn a_control_socket_that_is_deleted_is_told_and_made_again_and_orders_come_in_meanwhile() {
+    let home = tempfile::tempdir().unwrap();
+    let (mut running, folder) = grinding(home.path());
+    let (socket, path) = (folder.join("control.sock"), folder.display().to_string());
+    fs::remove_file(&socket).unwrap();
+    // By the door beside the lock of the machines, for as long as there is none in the folder.
+    let (code, told, errors) = run(&["hold", &path, "--reason", "the socket is gone"], home.path());
+    assert_eq!(code, 0, "{told}{errors}");
+    running.line("the alarm", |line| line.contains("The way by which orders reach the cell was taken away"));
+    running.until("a socket that is made again", |_| socket.exists().then_some(()));
+    // Something else in its place is no door, and is left alone.
+    fs::remove_file(&socket).unwrap();
+    fs::write(&socket, "mine").unwrap();
+    running.until("another alarm", |said| {
+        let alarms = said.iter().filter(|line| line.contains("The way by which orders reach the cell was taken away"));
+        (alarms.count() == 2).then_some(())
+    });
+    assert_eq!(fs::read_to_string(&socket).unwrap(), "mine");
+    let (code, told, errors) = run(&["resume", &path], home.path());
+    assert_eq!(code, 0, "{told}{errors}");
+    let (code, errors) = running.end();
+    assert_eq!(code, 0, "{errors}{:?}", running.said);
+    let orders = records_with(&folder, "event").into_iter().filter(|event| event["event"] == "hold");
+    assert_eq!(orders.map(|hold| hold["reason"].clone()).collect::<Vec<_>>(), ["the socket is gone"]);
+}
+
+#[cfg(unix)]
+#[test]
+fn a_cell_whose_runs_folder_is_deleted_takes_orders_all_the_same() {
+    let home = tempfile::tempdir().unwrap();
+    let (mut running, folder) = grinding(home.path());
+    fs::rename(home.path().join("runs"), home.path().join("moved")).unwrap();
+    // Found without its name, by its machines; what is not on record is told, and done.
+    let (code, told, errors) = run(&["abort"], home.path());
+    assert!(code == 3 && errors.contains("not on record"), "{code} {told}{errors}");
+    let (code, errors) = running.end();
+    assert!(code != 0 && !running.said.join("\n").contains("ACCEPTED"), "{errors}");
+    let (code, told, errors) = run(&["status", &folder.display().to_string()], home.path());
+    assert_eq!(code, 2, "{told}{errors}");
+}
+
+#[cfg(unix)]
+#[test]
+fn orders_to_a_process_that_stands_still_are_not_carried_out_later() {
+    let home = tempfile::tempdir().unwrap();
+    let (mut running, folder) = grinding(home.path());
+    let path = folder.display().to_string();
+    running.signal("STOP");
+    let (code, told, errors) = run(&["hold", &path, "--reason", "nobody hears this"], home.path());
+    running.signal("CONT");
+    assert!(code == 3 && errors.contains("does not answer"), "{code} {told}{errors}");
+    assert_eq!(run(&["stop", &path], home.path()).0, 0);
+    running.end();
+    let events = records_with(&folder, "event");
+    assert!(!events.iter().any(|event| event["event"] == "hold"), "{events:?}");
+    assert!(events.iter().any(|event| event["event"] == "stop"));
+}

@@ -134,6 +134,62 @@ fn over_a_serial_line_too() {
     assert!(began_once(home.path()) >= 4);
 }
 
+/// A run that was killed as it ground, and the folder of it.
+fn killed_at_work(home: &Path) -> PathBuf {
+    let arguments = ["run", "part.toml", "--cell", "cell.toml", "--json"];
+    let mut running = Running::new(regrind(&arguments, home));
+    let folder = || fs::read_dir(home.join("runs")).ok()?.next()?.ok().map(|entry| entry.path());
+    assert_eq!(follow(&mut running, &folder, 14), None, "it is killed in the middle");
+    folder().unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_file_that_is_on_no_record_decides_nothing() {
+    let (_rig, home) = cell_that_stays().await;
+    tokio::task::spawn_blocking(move || {
+        let folder = killed_at_work(&home);
+        // Somebody lays there what a run begins with that has learned from another one.
+        fs::write(folder.join("learned_from.json"), "{}").unwrap();
+        let path = folder.to_str().unwrap();
+        let mut running = Running::new(regrind(&["resume", path, "--json"], &home));
+        let found = || Some(folder.clone());
+        assert_eq!(follow(&mut running, &found, usize::MAX), Some(0), "{}", running.told);
+        let verified = verify(&folder).unwrap();
+        assert!(verified.closed && verified.unrecorded.contains(&"learned_from.json".to_owned()), "{verified:?}");
+    })
+    .await
+    .unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_record_whose_last_lines_are_lost_is_not_gone_on_with_unasked() {
+    let (_rig, home) = cell_that_stays().await;
+    tokio::task::spawn_blocking(move || {
+        let folder = killed_at_work(&home);
+        let path = folder.to_str().unwrap().to_owned();
+        let resumed = |more: &[&str]| {
+            let mut running = Running::new(regrind(&[&["resume", &path], more].concat(), &home));
+            running.end()
+        };
+        for name in ["journal.sqlite-wal", "journal.anchor"] {
+            let (there, away) = (folder.join(name), home.join("away"));
+            fs::rename(&there, &away).unwrap();
+            let (code, told) = resumed(&[]);
+            assert!(code == 1 && told.contains("may be lost") && told.contains("regrind recover"), "{name}: {told}");
+            fs::rename(&away, &there).unwrap();
+        }
+        // A cycle of which the record knows nothing.
+        fs::create_dir(folder.join("cycle-7")).unwrap();
+        let (code, told) = resumed(&[]);
+        assert!(code == 1 && told.contains("files of cycle 7"), "{told}");
+        let mut running = Running::new(regrind(&["resume", &path, "--despite-loss", "--json"], &home));
+        let found = || Some(folder.clone());
+        assert_eq!(follow(&mut running, &found, usize::MAX), Some(0), "{}", running.told);
+    })
+    .await
+    .unwrap();
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "takes minutes: for .ci/long"]
 async fn two_hundred_kills() {

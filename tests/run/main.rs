@@ -27,6 +27,7 @@ mod keep;
 mod killed;
 mod learning;
 mod linuxcnc;
+mod lying;
 mod manual;
 mod mirror_cell;
 mod mirror_run;

@@ -325,6 +325,7 @@ impl<'s> Happening<'s> {
             let outside = Outside {
                 plants: self.machines.plants.clone(),
                 nets: self.nets.clone(),
+                faults: self.faults.clone(),
                 disk: self.disk.clone(),
                 orders: self.orders.clone(),
                 given: self.person.given.clone(),
@@ -406,6 +407,8 @@ impl<'s> Happening<'s> {
             wires,
             hindered,
             clearance_mm: part::clearance_mm(),
+            disk_alone: self.schedule.disk_fails_alone(),
+            lies: self.schedule.lies(),
             freezes: self.schedule.acts.iter().any(|(_, act)| matches!(act, Act::Freeze { .. })),
             ended_well,
             effects: self.effects,

@@ -29,7 +29,7 @@ mod wire;
 use std::panic::AssertUnwindSafe;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use schedule::{FORGETFUL, OTHER_WIRES, Schedule, Tally};
+use schedule::{FORGETFUL, FULL_DISK, LIARS, OTHER_WIRES, Schedule, Tally};
 
 /// Seeds in which it shows that a guard is missing which hardly another one needs: a station asks again whether the loop lives (134); what
 /// waited behind a look that found the link lost is not sent, START (163) and RESUME (181); nothing may wait when a question is asked (264);
@@ -45,6 +45,9 @@ const SAMPLE: u64 = 40;
 const SAMPLE_BY_OTHER_WIRES: u64 = 10;
 
 const SAMPLE_OF_FORGETFUL: u64 = 24;
+const SAMPLE_OF_FULL_DISKS: u64 = 24;
+/// One for each register of the two blocks.
+const SAMPLE_OF_LIARS: u64 = 104;
 
 /// Every so many effects the program dies once.
 const STRIDE: usize = 151;
@@ -113,6 +116,27 @@ fn nor_one_by_other_wires() {
 #[test]
 fn nor_one_in_which_a_machine_forgets_its_job() {
     let seeds = (0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_FORGETFUL)).map(|k| FORGETFUL + k);
+    let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
+    let began = std::time::Instant::now();
+    let tally = run_all(&schedules);
+    println!("{} schedules in {:.1} s: {tally}", schedules.len(), began.elapsed().as_secs_f64());
+}
+
+/// A disk that is full for a while: the cell is held meanwhile, waits for no answer to what it has not asked, and goes on after.
+#[test]
+fn nor_one_in_which_the_disk_is_full_for_a_while() {
+    let seeds = (0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_FULL_DISKS)).map(|k| FULL_DISK + k);
+    let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
+    let began = std::time::Instant::now();
+    let tally = run_all(&schedules);
+    println!("{} schedules in {:.1} s: {tally}", schedules.len(), began.elapsed().as_secs_f64());
+}
+
+/// Machines of which each register of the status and of the header of a result says in its turn what is not so: nothing that was seen to begin is
+/// intended once more, nothing begins that is not on record, and the run comes to an end.
+#[test]
+fn nor_one_in_which_a_machine_says_what_is_not_so() {
+    let seeds = (0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_LIARS)).map(|k| LIARS + k);
     let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
     let began = std::time::Instant::now();
     let tally = run_all(&schedules);

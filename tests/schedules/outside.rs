@@ -11,6 +11,7 @@ use regrind_sim::options::Layout;
 use regrind_sim::rsh::Controller;
 use regrind_sim::wire::SharedMachine;
 use regrind_sim::wire::dme::SharedServer;
+use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
 use regrind_sim::wire::rsh::SharedController;
 use regrind_sim::words::WordOrder;
 use tokio::time::{Instant, sleep};
@@ -35,6 +36,7 @@ const SET_RIGHT: Duration = Duration::from_secs(3);
 pub struct Outside {
     pub plants: [Plant; 2],
     pub nets: [Net; 2],
+    pub faults: [Faults; 2],
     pub disk: SharedDisk,
     pub orders: Office,
     pub given: Arc<Mutex<Vec<Given>>>,
@@ -80,6 +82,12 @@ impl Outside {
                 Plant::Dme(server) => self.at_dme(&act, &server).await,
                 Plant::Rsh(controller) => self.at_rsh(&act, &controller).await,
             },
+            Act::Lie { machine, block, at, word, lasts } => {
+                let lie = FaultPlan::new(0).always(When::Reading(block), Fault::Lie(vec![(at, word)]));
+                self.faults[machine].set(lie);
+                sleep(lasts).await;
+                self.faults[machine].set(FaultPlan::new(0));
+            }
             Act::Suspend { lasts } => tokio::time::advance(lasts).await,
             Act::Order(what) => self.order(what).await,
         }

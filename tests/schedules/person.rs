@@ -18,6 +18,9 @@ use crate::machines::Plant;
 /// After so many resumes the person gives up in order, and after twice as many at once.
 const PATIENCE: u32 = 40;
 
+/// A run that has not come to its end by then is given up too: a machine that somebody else controls is not had back by waiting.
+const NO_LONGER_THAN: Duration = Duration::from_secs(1200);
+
 /// An order, and what the cell said.
 #[derive(Clone, Debug)]
 pub struct Given {
@@ -42,11 +45,12 @@ pub struct Person {
     pub given: Arc<Mutex<Vec<Given>>>,
     chance: StdRng,
     resumes: u32,
+    began: Instant,
 }
 
 impl Person {
     pub fn new(plants: [Plant; 2], seed: u64) -> Self {
-        Self { plants, given: Arc::default(), chance: StdRng::seed_from_u64(seed), resumes: 0 }
+        Self { plants, given: Arc::default(), chance: StdRng::seed_from_u64(seed), resumes: 0, began: Instant::now() }
     }
 
     /// Looks after the cell in one life of the program; never comes to an end.
@@ -66,7 +70,8 @@ impl Person {
                 continue;
             }
             self.resumes += 1;
-            if self.resumes > 2 * PATIENCE {
+            let is_long = self.began.elapsed() > NO_LONGER_THAN;
+            if self.resumes > 2 * PATIENCE || is_long {
                 self.give(orders, life, "abort", |reason| Request::Abort { reason }).await;
             } else if self.resumes > PATIENCE {
                 self.give(orders, life, "stop", |reason| Request::Stop { reason }).await;

@@ -12,6 +12,8 @@ use crate::checker::{Evidence, is_intent};
 
 /// A hold is on its way to a program that runs within this.
 const HOLDS_WITHIN: Duration = Duration::from_millis(100);
+/// A program that was told to run is looked at so soon after; before that nobody knows whether there is anything to hold.
+const SEEN_WITHIN: Duration = Duration::from_millis(130);
 /// What was in the way of lines is out of it after this.
 const RECOVERS_WITHIN: Duration = Duration::from_secs(12);
 
@@ -103,13 +105,13 @@ fn paused_at_once(evidence: &Evidence) -> Result<(), String> {
     for given in
         evidence.given.iter().filter(|given| matches!(given.what, "hold" | "stop") && given.done && given.moved[1])
     {
-        let by = given.at + HOLDS_WITHIN;
+        let moved = evidence.rsh_deeds.iter().rfind(|(at, deed)| *at <= given.at && *deed == Deed::Moves);
+        let since = moved.map_or(evidence.began, |(at, _)| *at);
+        let by = given.at.max(since + SEEN_WITHIN) + HOLDS_WITHIN;
         let is_hindered = hindered.iter().any(|(from, to)| *from <= by && given.at <= *to + RECOVERS_WITHIN);
         // A program that was started again has to meet the machines first.
         let ended = evidence.shown.iter().rfind(|shown| shown.at <= by && shown.state.is_none());
         let has_met = ended.is_none_or(|ended| ended.at + RECOVERS_WITHIN < given.at);
-        let moved = evidence.rsh_deeds.iter().rfind(|(at, deed)| *at <= given.at && *deed == Deed::Moves);
-        let since = moved.map_or(evidence.began, |(at, _)| *at);
         let stands = evidence.rsh_deeds.iter().any(|(at, deed)| given.at <= *at && *at <= by && *deed == Deed::Stands);
         let told = evidence.wires.lines.iter().any(|spoken| {
             let makes_safe = matches!(spoken.line.as_str(), "set pause" | "set abort");

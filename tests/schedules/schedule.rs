@@ -27,6 +27,16 @@ pub const OTHER_WIRES: u64 = 1_000_000;
 /// From this seed on a machine forgets its job.
 pub const FORGETFUL: u64 = 2_000_000;
 
+/// From this seed on nothing fails but the disk.
+pub const FULL_DISK: u64 = 3_000_000;
+
+/// From this seed on machines say of themselves and of their results what is not so.
+pub const LIARS: u64 = 4_000_000;
+
+/// The status block and the header of a result: the first register, and how many.
+const STATUS: (u16, usize) = (64, 48);
+const HEADER: (u16, usize) = (400, 56);
+
 /// What goes wrong at a server of I++ DME: at which command, after how many of them, what.
 pub type DmeFault = (&'static str, u32, OfDme);
 
@@ -116,6 +126,14 @@ pub enum Act {
     EmergencyStop {
         machine: usize,
     },
+    /// A register of a block that is read says something else.
+    Lie {
+        machine: usize,
+        block: u16,
+        at: usize,
+        word: u16,
+        lasts: Duration,
+    },
     Order(&'static str),
 }
 
@@ -135,10 +153,65 @@ impl Schedule {
     /// Draws the schedule of a seed. Every kind of fault is in some schedules and not in others, so that none hides another.
     pub fn drawn(seed: u64) -> Self {
         match seed {
+            LIARS.. => Self::lied_to(seed),
+            FULL_DISK.. => Self::on_a_full_disk(seed),
             FORGETFUL.. => Self::forgetful(seed),
             OTHER_WIRES.. => Self::by_other_wires(seed),
             _ => Self::by_modbus(seed),
         }
+    }
+
+    /// Draws a run in which nothing fails but the disk, for a while, now and then; and a person who has the run held, or ended, meanwhile.
+    fn on_a_full_disk(seed: u64) -> Self {
+        const CUES: [Cue; 7] =
+            [Cue::Loaded, Cue::Prepared, Cue::StartOnRecord, Cue::Begins, Cue::Complete, Cue::Complete, Cue::Ordered];
+        let mut chance = StdRng::seed_from_u64(seed);
+        let mut acts = Vec::new();
+        for _ in 0..chance.random_range(1..4) {
+            let (cue, nth) = (CUES[chance.random_range(0..CUES.len())], chance.random_range(1..=5));
+            let at = |pause| When::After(cue, nth, pause);
+            let pause = any_length(&mut chance, 1.0);
+            let lasts = Duration::from_secs_f64(chance.random_range(0.1..20.0));
+            acts.push((at(pause), Act::Disk { disk: Disk { failing_share: 1.0, ..Disk::SOUND }, lasts }));
+            if chance.random::<f64>() < 0.5 {
+                let order = ["hold", "resume", "resume", "stop"][chance.random_range(0..4)];
+                acts.push((at(pause + any_length(&mut chance, 8.0)), Act::Order(order)));
+            }
+        }
+        let speed = [2000.0, 400.0, 60.0][chance.random_range(0..3)];
+        Self { speed, acts, wanted: Wanted::Good, ..Self::with_deaths(seed, Vec::new()) }
+    }
+
+    /// Draws a run in which registers of the status and of the header of a result say for a while what is not so: one field after the other by the
+    /// number of the seed, and others beside it.
+    fn lied_to(seed: u64) -> Self {
+        let mut chance = StdRng::seed_from_u64(seed);
+        let mut acts = Vec::new();
+        for k in 0..chance.random_range(1..4_u64) {
+            let number = (seed - LIARS + 31 * k) as usize % (STATUS.1 + HEADER.1);
+            let (block, at) = match number.checked_sub(STATUS.1) {
+                None => (STATUS.0, number),
+                Some(of_header) => (HEADER.0, of_header),
+            };
+            let word = [0, 1, 2, 5, 7, 0x7fff, 0x8000, 0xffff, chance.random()][chance.random_range(0..9)];
+            let cue = [Cue::Loaded, Cue::Prepared, Cue::StartSent, Cue::Begins, Cue::Begins, Cue::Held, Cue::Complete]
+                [chance.random_range(0..7)];
+            let when = When::After(cue, chance.random_range(1..=4), any_length(&mut chance, 3.0));
+            let lasts = any_length(&mut chance, 20.0);
+            acts.push((when, Act::Lie { machine: chance.random_range(0..2), block, at, word, lasts }));
+        }
+        let speed = [2000.0, 400.0, 60.0][chance.random_range(0..3)];
+        Self { speed, acts, wanted: Wanted::Good, ..Self::with_deaths(seed, Vec::new()) }
+    }
+
+    /// Whether machines say what is not so.
+    pub fn lies(&self) -> bool {
+        self.seed >= LIARS
+    }
+
+    /// Whether nothing goes wrong but that the disk fails.
+    pub fn disk_fails_alone(&self) -> bool {
+        (FULL_DISK..LIARS).contains(&self.seed)
     }
 
     /// Draws what happens as for Modbus; once or twice a machine forgets the job that it is at, or has just done.

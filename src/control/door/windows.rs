@@ -45,6 +45,16 @@ impl Door {
         Ok(Self { name, next })
     }
 
+    /// Opens one that lies in no run folder: a pipe lies in none, and cannot be taken away.
+    pub(crate) fn open_for_user(_: &Path) -> io::Result<Option<Self>> {
+        Ok(None)
+    }
+
+    /// Returns by which it is known again: a pipe is not watched, for nobody can take it away.
+    pub(crate) fn mark(&self) -> Option<Mark> {
+        None
+    }
+
     /// Waits for the next client.
     pub(crate) async fn let_in(&mut self) -> io::Result<Caller> {
         if let Err(error) = self.next.connect().await {
@@ -55,6 +65,33 @@ impl Door {
         let next = regrind_windows::listen(&self.name, false)?;
         Ok(Caller(std::mem::replace(&mut self.next, next)))
     }
+}
+
+/// No door of this system has one.
+#[derive(Clone)]
+pub(crate) enum Mark {}
+
+impl Mark {
+    pub(crate) fn is_in_place(&self) -> bool {
+        match *self {}
+    }
+
+    pub(crate) fn open_again(&self) -> io::Result<Door> {
+        match *self {}
+    }
+}
+
+/// No door lies anywhere else.
+pub(crate) fn take_away_at(_: &Path) {}
+
+/// No door lies anywhere else.
+pub(crate) fn is_open_at(_: &Path) -> bool {
+    false
+}
+
+/// No door lies anywhere else.
+pub(crate) fn ask_at(_: &Path, _: &[u8], _: Duration) -> io::Result<String> {
+    Err(io::ErrorKind::NotFound.into())
 }
 
 /// Takes the door away: a pipe goes with its last end, and lies in no folder.
@@ -74,6 +111,11 @@ impl Caller {
     pub(crate) fn into_halves(self) -> (CallerSays, TellCaller) {
         tokio::io::split(self.0)
     }
+}
+
+/// Whether a client has closed its end: a process that is held up here is in a debugger, whose user knows of it.
+pub(crate) fn has_gone(_: &CallerSays) -> bool {
+    false
 }
 
 /// The name of the pipe of a run folder, however the folder is called by who asks.

@@ -86,6 +86,11 @@ pub(crate) fn free_bytes(folder: &Path) -> io::Result<u64> {
     Ok(room.f_bavail.saturating_mul(room.f_frsize))
 }
 
+/// Whether a file, and no link, belongs to the user of this program or to root.
+pub(crate) fn is_own_file(path: &Path) -> bool {
+    fs::symlink_metadata(path).is_ok_and(|found| found.is_file() && is_trusted(found.uid()))
+}
+
 /// The first place for locks that is there, that every user can write, and in which nobody can take away what is another's; none where there is no such place.
 pub(crate) fn place_of_locks(folder: &str) -> Option<PathBuf> {
     // One that root has set up, as the package does, comes before any other.

@@ -30,8 +30,12 @@ fn records(folder: &Path) -> Vec<Record> {
     Reader::open(folder).unwrap().records(1).map(Result::unwrap).collect()
 }
 
+/// The numbers of the seals, also while the database has a trigger that no record has.
 fn seals(folder: &Path) -> Vec<u64> {
-    records(folder).iter().filter(|record| record.kind == Kind::Seal).map(|record| record.seq).collect()
+    let database = Connection::open(folder.join("journal.sqlite")).unwrap();
+    let mut seals = database.prepare("SELECT seq FROM record WHERE kind = 'seal' ORDER BY seq").unwrap();
+    let seals = seals.query_map([], |row| row.get::<_, i64>(0)).unwrap();
+    seals.map(|seq| seq.unwrap().try_into().unwrap()).collect()
 }
 
 fn anchor(folder: &Path) -> Anchor {

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use regrind_disk::Drawn;
-use regrind_journal::{JournalError, Verified, verify};
+use regrind_journal::{JournalError, Reader, Verified, verify};
 use rusqlite::Connection;
 use rusqlite::types::Value;
 
@@ -180,6 +180,44 @@ fn a_row_in_front_of_the_first_record_is_found() {
         let found = verify(&folder);
         assert!(matches!(found, Err(JournalError::Broken { seq: 0, .. })), "{number}: {found:?}");
     }
+}
+
+#[test]
+fn a_database_with_anything_but_the_table_of_a_record_is_none() {
+    let view = "ALTER TABLE record RENAME TO kept; CREATE VIEW record AS SELECT * FROM kept";
+    let endless = "ALTER TABLE record RENAME TO kept; CREATE VIEW record AS WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n) \
+                   SELECT k AS seq, utc, boot_id, mono_ns, actor, station, kind, part, cycle, command_id, reason, payload, prev_hash, hash FROM n, kept";
+    for sql in
+        [view, endless, "CREATE TABLE other (k INTEGER)", "CREATE INDEX other ON record (part)", "DROP TABLE record"]
+    {
+        let (_home, folder, _) = closed();
+        tamper(&folder, sql);
+        for error in [verify(&folder).unwrap_err(), Reader::open(&folder).map(drop).unwrap_err()] {
+            assert!(matches!(error, JournalError::Foreign { .. }), "{sql}: {error}");
+        }
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn what_is_no_file_is_not_waited_for() {
+    let pipe = |path: &Path| {
+        let _ = fs::remove_file(path);
+        assert!(std::process::Command::new("mkfifo").arg(path).status().unwrap().success());
+    };
+    let (_home, folder, _) = closed();
+    pipe(&folder.join(".lock"));
+    assert!(!verify(&folder).unwrap().under_way);
+    pipe(&folder.join("journal.anchor"));
+    assert!(matches!(verify(&folder), Err(JournalError::File { .. })));
+    let (_home, folder, _) = closed();
+    pipe(&folder.join("journal.sqlite-wal"));
+    assert!(matches!(verify(&folder), Err(JournalError::Foreign { .. })));
+    let (_home, folder, _) = closed();
+    let file = folder.join("cycle-1/measured.csv");
+    // One that is said to be large is not read: it has another length than the one on record.
+    fs::File::options().write(true).open(&file).unwrap().set_len(1 << 40).unwrap();
+    assert!(matches!(verify(&folder), Err(JournalError::Broken { .. })));
 }
 
 #[test]

@@ -1,0 +1,190 @@
+//! The runs of a folder in the order in which they were begun. Each has a number and names the record of the one before, so that a run that is
+//! taken away, or renamed, is missed.
+
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+
+use regrind::formats::ResultFolder;
+use regrind::journal::{Against, Anchor, JournalError, PublicKey, Reader, anchor_of, verify_against};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::Outcome;
+use super::control::folders;
+use super::failure::Failure;
+
+/// Runs whose folders changed last, of which the numbers are read when the next one begins.
+const NEWEST: usize = 200;
+
+/// The place of a run among those of its folder.
+#[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct Place {
+    /// Its number, from 1 on.
+    number: u64,
+    /// The run before it, as it was then; none where there was none, or it was not there any more.
+    before: Option<Before>,
+}
+
+/// What is known of a run when the next one begins.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Before {
+    run: String,
+    records: u64,
+    head: String,
+}
+
+/// Keeps others from beginning a run in a folder, until it is dropped: two that begin at once have numbers of their own. None where the system
+/// locks no folders.
+pub(super) struct Turn(Option<File>);
+
+impl Drop for Turn {
+    fn drop(&mut self) {
+        // Closing would not do: a child that another thread has just forked shares the lock until its exec.
+        self.0.iter().for_each(|folder| drop(folder.unlock()));
+    }
+}
+
+impl Place {
+    /// Takes the next place in a folder of runs, to be kept until the run has its first record.
+    pub(super) fn next(runs: &Path) -> Result<(Self, Turn), Failure> {
+        ResultFolder::prepare(runs).map(ResultFolder::keep).map_err(Failure::File)?;
+        let folder = File::open(runs).ok().filter(|folder| folder.lock().is_ok());
+        let last = numbered_newest_first(runs).take(NEWEST).max_by_key(|(number, _)| *number);
+        let before = last.as_ref().and_then(|(_, folder)| {
+            let Anchor { records, head, .. } = anchor_of(folder).ok()??;
+            Some(Before { run: name_of(folder), records, head })
+        });
+        Ok((Self { number: 1 + last.map_or(0, |(number, _)| number), before }, Turn(folder)))
+    }
+
+    /// As the first record of a run keeps it.
+    pub(super) fn in_record(&self, content: &mut Value) {
+        content["number"] = json!(self.number);
+        content["before"] = json!(self.before);
+    }
+
+    /// Reads it from the first record of a run; none of one that was begun before runs had numbers.
+    fn of(folder: &Path) -> Option<Self> {
+        let first = Reader::open(folder).ok()?.records(0).next()?.ok()?;
+        serde_json::from_value(first.value()["content"].clone()).ok()
+    }
+}
+
+fn name_of(folder: &Path) -> String {
+    folder.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// The runs of a folder that have a number, those whose folders changed last first; no record of the others is read before it is asked for.
+fn numbered_newest_first(runs: &Path) -> impl Iterator<Item = (u64, PathBuf)> {
+    let changed = |folder: &PathBuf| fs::metadata(folder).and_then(|found| found.modified()).ok();
+    let mut all: Vec<_> = folders(runs).collect();
+    all.sort_by_cached_key(|folder| std::cmp::Reverse(changed(folder)));
+    all.into_iter().filter_map(|folder| Some((Place::of(&folder)?.number, folder)))
+}
+
+/// What is wrong among the runs of a folder, and how each of them stands.
+#[derive(Debug, Default)]
+struct Proof {
+    told: Vec<Value>,
+    flaws: Vec<String>,
+    are_under_way: bool,
+}
+
+/// Proves every run of a folder, and that none of them is missing, renamed, or another than the next one names.
+pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outcome, Failure> {
+    let mut proof = Proof::default();
+    let mut all: Vec<(Option<Place>, PathBuf)> = folders(runs).map(|folder| (Place::of(&folder), folder)).collect();
+    all.sort_by_key(|(place, folder)| (place.as_ref().map_or(0, |place| place.number), folder.clone()));
+    let mut last: Option<(u64, &Path)> = None;
+    for (place, folder) in &all {
+        proof.take(place.as_ref(), folder, keys);
+        let Some(Place { number, before }) = place else { continue };
+        proof.follows((*number, folder), before.as_ref(), last, runs);
+        last = Some((*number, folder));
+    }
+    let Proof { told, flaws, are_under_way } = &proof;
+    if json {
+        super::print_json(&json!({ "runs": runs, "sound": flaws.is_empty(), "flaws": flaws, "each": told }))?;
+    } else {
+        let lines =
+            told.iter().map(|told| format!("{}\n", told["words"].as_str().unwrap_or_default())).collect::<String>();
+        super::print(&format!("{lines}{} runs, {} flaws\n", told.len(), flaws.len()))?;
+    }
+    match flaws.first() {
+        Some(first) => Err(Failure::RunsLack { runs: runs.to_owned(), flaws: flaws.len(), first: first.clone() }),
+        None if *are_under_way => Ok(Outcome::UnderWay),
+        None => Ok(Outcome::Accepted),
+    }
+}
+
+impl Proof {
+    /// Takes a run by itself.
+    fn take(&mut self, place: Option<&Place>, folder: &Path, keys: &[PublicKey]) {
+        let name = name_of(folder);
+        let number = place.map_or("-".to_owned(), |place| place.number.to_string());
+        let stands = match verify_against(folder, &Against { anchor: None, keys: keys.to_vec() }) {
+            Err(JournalError::Absent { .. }) => return,
+            Err(error) => {
+                self.flaws.push(error.to_string());
+                "not sound".to_owned()
+            }
+            Ok(found) if found.under_way => {
+                self.are_under_way = true;
+                "sound so far, under way".to_owned()
+            }
+            Ok(found) if !found.closed || found.anchored == 0 || found.lacks_last_seal() => {
+                self.flaws.push(format!(
+                    "{name}: its record is not whole; `regrind audit verify` of this run alone says what it lacks"
+                ));
+                "not whole".to_owned()
+            }
+            Ok(found) => {
+                format!("sound, {} records{}", found.records, if found.keys.is_empty() { ", not signed" } else { "" })
+            }
+        };
+        let begun_as = Reader::open(folder)
+            .ok()
+            .and_then(|reader| Some(reader.records(0).next()?.ok()?.value()["run"].as_str()?.to_owned()));
+        if let Some(begun_as) = begun_as.filter(|begun_as| *begun_as != name) {
+            self.flaws.push(format!("{name}: the run was begun as {begun_as}: its folder was renamed"));
+        }
+        let words = format!("{number:>6}  {name}  {stands}");
+        self.told
+            .push(json!({ "number": place.map(|place| place.number), "run": name, "stands": stands, "words": words }));
+    }
+
+    /// Sees that a run follows the one before it, and that this one is what it was then.
+    fn follows(
+        &mut self,
+        (number, folder): (u64, &Path),
+        before: Option<&Before>,
+        last: Option<(u64, &Path)>,
+        runs: &Path,
+    ) {
+        let name = name_of(folder);
+        let due = last.map_or(1, |(last, _)| last + 1);
+        if number > due {
+            let named = before.map_or(String::new(), |before| {
+                format!("; the last of them was {} with {} records or more", before.run, before.records)
+            });
+            let missing = if number == due + 1 {
+                format!("number {due} is missing")
+            } else {
+                format!("numbers {due} to {} are missing", number - 1)
+            };
+            self.flaws.push(format!("{missing} before {name}{named}"));
+        } else if number < due {
+            self.flaws.push(format!("{name}: another run has its number {number} too"));
+        }
+        let Some(Before { run, records, head }) = before else { return };
+        let there = runs.join(run);
+        let anchor = Some(Anchor::new(*records, head.clone()));
+        let is_there = matches!(last, Some((_, last)) if last == there);
+        if is_there
+            && let Err(JournalError::Broken { what, .. }) =
+                verify_against(&there, &Against { anchor, keys: Vec::new() })
+        {
+            self.flaws.push(format!("{run}: it is not the run that {name} followed: {what}"));
+        }
+    }
+}

@@ -1,0 +1,159 @@
+//! What the folder of a run shows that its record does not have: the last records stand in the log of the database only, and go with it.
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::Path;
+
+use super::error::JournalError;
+use super::verify::read_anchor;
+use super::{ANCHOR, DATABASE};
+
+/// Bytes of the header of a log, and of that of a frame in it (sqlite.org/fileformat.html, "The Write-Ahead Log").
+const LOG_HEADER: usize = 32;
+const FRAME_HEADER: usize = 24;
+/// Most bytes of a log that are looked at.
+const MOST_OF_LOG: u64 = 256 << 20;
+
+/// Says why records of a run that has no end may be lost, of which the program that wrote them had seen that they are on the disk; none where nothing
+/// shows it. Nothing may drive the run.
+///
+/// # Errors
+/// A file that cannot be read; an anchor that is none.
+pub fn may_be_lost(folder: &Path) -> Result<Option<String>, JournalError> {
+    if read_anchor(folder)?.is_none() {
+        return Ok(Some(format!("{ANCHOR} is missing, which is written as a run begins")));
+    }
+    let log = folder.join(format!("{DATABASE}-wal"));
+    // Whoever reads a database whose log is gone makes an empty one.
+    if !fs::metadata(&log).is_ok_and(|found| found.is_file() && found.len() > 0) {
+        return Ok(Some(format!(
+            "{DATABASE}-wal is missing or empty, which a program that ends in the middle of a run leaves behind"
+        )));
+    }
+    let mut bytes = Vec::new();
+    let read = File::open(&log).and_then(|file| file.take(MOST_OF_LOG).read_to_end(&mut bytes));
+    read.map_err(JournalError::file(&log, "reading it"))?;
+    Ok(damage(&bytes).map(|behind| {
+        format!(
+            "{DATABASE}-wal is damaged: {behind} changes that were on the disk stand behind a place that does not hold"
+        )
+    }))
+}
+
+/// Returns the highest number of a cycle of which there are files in the folder of a run; 0 where there is none.
+pub fn newest_cycle(folder: &Path) -> u32 {
+    let names = fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.file_name());
+    let number = |name: std::ffi::OsString| name.to_str()?.strip_prefix("cycle-")?.parse().ok();
+    names.filter_map(number).max().unwrap_or(0)
+}
+
+/// Returns how many changes were committed in a log behind its first frame that does not hold; none where all hold, or what does not is the
+/// end that a cut of the power left.
+fn damage(log: &[u8]) -> Option<usize> {
+    if log.len() < LOG_HEADER {
+        return None;
+    }
+    let word = |at: usize| u32::from_be_bytes(log[at..at + 4].try_into().expect("four bytes"));
+    let is_big_endian = word(0) & 1 != 0;
+    let page = word(8) as usize;
+    let sum = |[mut a, mut b]: [u32; 2], bytes: &[u8]| {
+        for pair in bytes.as_chunks::<8>().0 {
+            let [x, y] = [0, 4].map(|at| {
+                let four = pair[at..at + 4].try_into().expect("four bytes");
+                if is_big_endian { u32::from_be_bytes(four) } else { u32::from_le_bytes(four) }
+            });
+            a = a.wrapping_add(x).wrapping_add(b);
+            b = b.wrapping_add(y).wrapping_add(a);
+        }
+        [a, b]
+    };
+    let mut so_far = sum([0, 0], &log[..24]);
+    // Frames of an earlier filling of the log stand behind its end, under other numbers.
+    let frames = log[LOG_HEADER..].chunks_exact(FRAME_HEADER + page.max(1));
+    let is_of_this = |frame: &[u8]| frame[8..16] == log[16..24];
+    let commits = |frame: &[u8]| frame[4..8] != [0; 4];
+    let holds_header = so_far == [word(24), word(28)];
+    let mut committed_behind = 0;
+    let mut holds = holds_header;
+    for frame in frames.take_while(|frame| is_of_this(frame)) {
+        if holds {
+            so_far = sum(sum(so_far, &frame[..8]), &frame[FRAME_HEADER..]);
+            let stated = [16, 20].map(|at| u32::from_be_bytes(frame[at..at + 4].try_into().expect("four bytes")));
+            holds = so_far == stated;
+            continue;
+        }
+        committed_behind += usize::from(commits(frame));
+    }
+    (committed_behind > 0 || !holds_header && log.len() > LOG_HEADER).then_some(committed_behind)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::super::record::{Entry, Kind};
+    use super::super::write::{Header, Journal};
+    use super::*;
+
+    /// The folder of a run that broke off, with what its log holds.
+    fn broken_off(records: u64) -> (tempfile::TempDir, std::path::PathBuf, Vec<u8>) {
+        let home = tempfile::tempdir().unwrap();
+        let driven = home.path().join("driven");
+        let header = Header {
+            run: "run-1".into(),
+            part: "SN 7".into(),
+            actor: "Ada".into(),
+            station: "console".into(),
+            simulation: true,
+            first_command_id: 1,
+            content: json!({}),
+        };
+        let mut journal = Journal::create(&driven, header).unwrap();
+        for k in 0..records {
+            journal.append(Entry::new(Kind::Note, k, 1, json!({ "k": k }))).unwrap();
+        }
+        // As a kill leaves it: copied while it is open.
+        let folder = home.path().join("run");
+        fs::create_dir(&folder).unwrap();
+        for entry in fs::read_dir(&driven).unwrap().map(Result::unwrap) {
+            fs::copy(entry.path(), folder.join(entry.file_name())).unwrap();
+        }
+        let log = fs::read(folder.join("journal.sqlite-wal")).unwrap();
+        (home, folder, log)
+    }
+
+    #[test]
+    fn a_log_that_a_kill_left_is_whole_and_one_that_is_damaged_or_gone_is_told() {
+        let (_home, folder, log) = broken_off(12);
+        assert_eq!(may_be_lost(&folder).unwrap(), None);
+        let path = folder.join("journal.sqlite-wal");
+        let told = |bytes: &[u8]| {
+            fs::write(&path, bytes).unwrap();
+            may_be_lost(&folder).unwrap()
+        };
+        // Nothing of it is committed behind what a cut of the power tears at the end.
+        assert_eq!(told(&log[..log.len() - 700]), None);
+        let mut flipped = log.clone();
+        flipped[LOG_HEADER + FRAME_HEADER + 77] ^= 1;
+        let what = told(&flipped).expect("one flipped bit in the first frame");
+        assert!(what.contains("is damaged"), "{what}");
+        let mut header = log.clone();
+        header[17] ^= 1;
+        assert!(told(&header).is_some(), "one flipped bit in the header");
+        assert_eq!(told(&log), None);
+        fs::remove_file(&path).unwrap();
+        assert!(may_be_lost(&folder).unwrap().unwrap().contains("-wal is missing or empty"));
+        fs::remove_file(folder.join(ANCHOR)).unwrap();
+        assert!(may_be_lost(&folder).unwrap().unwrap().contains("journal.anchor is missing"));
+    }
+
+    #[test]
+    fn the_newest_cycle_is_that_of_the_highest_number() {
+        let home = tempfile::tempdir().unwrap();
+        assert_eq!(newest_cycle(home.path()), 0);
+        for name in ["cycle-2", "cycle-10", "cycle-x", "other-30"] {
+            fs::create_dir(home.path().join(name)).unwrap();
+        }
+        assert_eq!(newest_cycle(home.path()), 10);
+    }
+}

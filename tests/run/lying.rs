@@ -1,0 +1,271 @@
+//! Machines that say what is not so, or lose what they had: each is believed only as far as its words can be true, and a person is offered
+//! a way on that works.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use crate::rig::{PATIENCE, Ready, Rig, event, order, small, until};
+use regrind::cell::{AlarmId, Device, Ending};
+use regrind::device::{
+    Armed, Cmm, CorrectionMap, DeviceError, Grinder, Identity, Interrupt, Job, Machine, Measurement, ModbusCmm,
+    ModbusGrinder, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status,
+};
+use regrind::drive::{Drive, Notice, Request};
+use tokio::sync::mpsc::UnboundedReceiver;
+
+/// Changes what a machine says of itself.
+type Says = Box<dyn FnMut(&mut Status) + Send>;
+
+/// A grinder that says of itself what it is told to say, and whose first answers to PREPARE are lost.
+struct Told {
+    grinder: ModbusGrinder,
+    says: Says,
+    lost: u32,
+}
+
+impl Told {
+    fn saying(grinder: ModbusGrinder, says: impl FnMut(&mut Status) + Send + 'static) -> Self {
+        Self { grinder, says: Box::new(says), lost: 0 }
+    }
+}
+
+impl Machine for Told {
+    crate::through::through!(grinder: name, connect, claim, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
+
+    async fn status(&mut self) -> Result<Status, DeviceError> {
+        let mut status = self.grinder.status().await?;
+        (self.says)(&mut status);
+        Ok(status)
+    }
+
+    async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
+        let armed = self.grinder.prepare(job).await?;
+        if self.lost == 0 {
+            return Ok(armed);
+        }
+        self.lost -= 1;
+        Err(DeviceError::TimedOut { machine: "the grinder".into(), what: "status", limit: Duration::from_millis(500) })
+    }
+}
+
+impl Grinder for Told {
+    async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, interrupt: &Interrupt) -> Result<(), DeviceError> {
+        self.grinder.load_pass(map, pass, interrupt).await
+    }
+    async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<PassRecord, DeviceError> {
+        self.grinder.collect(job, interrupt).await
+    }
+}
+
+/// What becomes of the result of a measurement.
+type Fate = Box<dyn FnMut(&mut Measurement) + Send>;
+
+/// A measuring machine whose results have one fate after the other; the first of them may be discarded at its panel before they are read.
+struct Odd {
+    cmm: ModbusCmm,
+    discarded: u32,
+    fates: VecDeque<Fate>,
+}
+
+impl Machine for Odd {
+    crate::through::through!(cmm: name, connect, status, claim, prepare, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
+}
+
+impl Cmm for Odd {
+    async fn load_plan(&mut self, plan: &Plan, interrupt: &Interrupt) -> Result<(), DeviceError> {
+        self.cmm.load_plan(plan, interrupt).await
+    }
+
+    async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<Measurement, DeviceError> {
+        if self.discarded > 0 {
+            self.discarded -= 1;
+            let done = self.cmm.status().await?.done;
+            self.cmm.acknowledge(done).await?;
+        }
+        let mut measured = self.cmm.collect(job, interrupt).await?;
+        if let Some(mut fate) = self.fates.pop_front() {
+            fate(&mut measured);
+        }
+        Ok(measured)
+    }
+}
+
+/// Waits for the next alarm.
+async fn alarm(notices: &mut UnboundedReceiver<Notice>) -> (AlarmId, String) {
+    let told = async {
+        loop {
+            match notices.recv().await.expect("the run goes on") {
+                Notice::Alarm(alarm) => return (alarm.id, alarm.what),
+                Notice::Finished { ending, .. } => panic!("over: {ending:?}"),
+                _ => {}
+            }
+        }
+    };
+    tokio::time::timeout(PATIENCE, told).await.expect("an alarm")
+}
+
+async fn resume(folder: &std::path::Path) {
+    let (reply, ..) = order(folder, Request::Resume { reason: "seen to".into(), seen: None }).await;
+    assert!(reply.taken, "{reply:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_preparation_whose_answer_was_lost_is_taken_back_and_made_anew() {
+    let mut rig = Rig::new(small(20, 10, 5000.0)).await;
+    let Ready { run, cmm, grinder, mut notices, .. } = rig.next(true);
+    let (drive, _orders) = Drive::new(run, cmm, Told { lost: 2, ..Told::saying(grinder, |_| ()) }).unwrap();
+    let ending = tokio::time::timeout(PATIENCE, tokio::spawn(drive.run())).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Accepted { .. }), "{ending:?}");
+    let mut alarms = Vec::new();
+    while let Ok(notice) = notices.try_recv() {
+        alarms.extend(if let Notice::Alarm(alarm) = notice { Some(alarm.id) } else { None });
+    }
+    // Its link was lost twice, and nothing was refused.
+    assert!(alarms.iter().all(|id| *id == AlarmId::LinkLost) && !alarms.is_empty(), "{alarms:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_that_a_machine_shows_no_more_ends_by_a_persons_word_and_is_not_ground_twice() {
+    let mut rig = Rig::new(small(20, 10, 400.0)).await;
+    let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
+    let seen = Arc::new(Mutex::new(0));
+    let count = Arc::clone(&seen);
+    // For some looks after it has begun it shows that it is idle, at no job; its own work goes on.
+    let says = move |status: &mut Status| {
+        let mut seen = count.lock().unwrap();
+        *seen += u32::from(status.state == State::Execute);
+        if *seen > 3 && *seen < 12 {
+            *status = Status { state: State::Idle, job: None, progress: Some((0, 0)), ..status.clone() };
+        }
+    };
+    let (drive, _orders) = Drive::new(run, cmm, Told::saying(grinder, says)).unwrap();
+    let running = tokio::spawn(drive.run());
+    let (id, what) = alarm(&mut notices).await;
+    assert_eq!(id, AlarmId::JobVanished, "{what}");
+    assert!(what.contains("grinder, it is IDLE"), "{what}");
+    // It is asked, and is found at its job: nothing is lost, and nothing is begun once more.
+    let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Accepted { .. }), "{ending:?}");
+    let starts = regrind::journal::Reader::open(&folder).unwrap();
+    let starts: Vec<_> = starts.records(1).map(|record| record.unwrap().value()).collect();
+    let of = |value: &&serde_json::Value| value["command"] == "start_machine" && value["device"] == "grinder";
+    let cycles: Vec<_> = starts.iter().filter(of).map(|start| start["cycle"].clone()).collect();
+    let mut once = cycles.clone();
+    once.dedup();
+    assert_eq!(cycles, once);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_result_that_was_discarded_at_the_panel_is_measured_once_more_by_a_persons_word() {
+    let mut rig = Rig::new(small(20, 10, 5000.0)).await;
+    let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
+    let cmm = Odd { cmm, discarded: 1, fates: VecDeque::new() };
+    let (drive, _orders) = Drive::new(run, cmm, grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    let (id, what) = alarm(&mut notices).await;
+    assert_eq!(id, AlarmId::MachineRefused, "{what}");
+    until(&folder, |words| words.starts_with("Held (Measure, Collect)")).await;
+    let over = Request::Over { device: Device::Cmm, evidence: "its panel shows no result".into() };
+    assert!(order(&folder, over).await.0.taken);
+    until(&folder, |words| words.starts_with("Held (Measure, Send)")).await;
+    resume(&folder).await;
+    let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Accepted { .. }), "{ending:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_machine_that_says_held_and_gets_further_is_aborted() {
+    let mut rig = Rig::new(small(20, 10, 20.0)).await;
+    let Ready { run, cmm, grinder, mut notices, .. } = rig.next(true);
+    let says = |status: &mut Status| {
+        if status.state == State::Execute {
+            status.state = State::Held;
+        }
+    };
+    let (drive, _orders) = Drive::new(run, cmm, Told::saying(grinder, says)).unwrap();
+    let running = tokio::spawn(drive.run());
+    assert_eq!(alarm(&mut notices).await.0, AlarmId::MachineHeldItself);
+    let (id, what) = alarm(&mut notices).await;
+    assert_eq!(id, AlarmId::HoldNotConfirmed, "{what}");
+    assert!(what.contains("it says HELD, and its progress has risen"), "{what}");
+    let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Aborted { .. }), "{ending:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_that_is_taken_and_not_done_is_told_and_aborted() {
+    let mut rig = Rig::new(small(20, 10, 1.0)).await;
+    let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
+    let says = |status: &mut Status| {
+        if matches!(status.state, State::Stopping | State::Complete) {
+            status.state = State::Execute;
+        }
+    };
+    let (drive, _orders) = Drive::new(run, cmm, Told::saying(grinder, says)).unwrap();
+    let running = tokio::spawn(drive.run());
+    event(&mut notices, "started", 1).await;
+    assert!(order(&folder, Request::Stop { reason: "enough".into() }).await.0.taken);
+    let (id, what) = alarm(&mut notices).await;
+    assert_eq!(id, AlarmId::StopNotConfirmed, "{what}");
+    assert!(what.contains("it took the STOP, and is EXECUTE"), "{what}");
+    let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Aborted { .. }), "{ending:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_pass_that_is_called_complete_at_40_percent_of_its_path_is_not_believed() {
+    let mut rig = Rig::new(small(20, 10, 5000.0)).await;
+    let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
+    let says = |status: &mut Status| {
+        if status.state == State::Complete && status.outcome == Outcome::Complete {
+            status.progress = Some((400, 1000));
+        }
+    };
+    let (drive, _orders) = Drive::new(run, cmm, Told::saying(grinder, says)).unwrap();
+    let running = tokio::spawn(drive.run());
+    let (id, what) = alarm(&mut notices).await;
+    assert_eq!(id, AlarmId::PassRecord, "{what}");
+    assert!(what.contains("a progress of 400 of 1000"), "{what}");
+    until(&folder, |words| words.starts_with("Held (Transfer)")).await;
+    order(&folder, Request::Abort { reason: "seen enough".into() }).await;
+    running.await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn figures_of_a_measurement_that_cannot_be_make_nothing_of_it() {
+    let mut rig = Rig::new(small(20, 10, 5000.0)).await;
+    let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
+    let kept: Arc<Mutex<Option<Measurement>>> = Arc::default();
+    let given = Arc::clone(&kept);
+    let fates: Vec<(Fate, AlarmId, &str)> = vec![
+        (Box::new(|of| of.temperature_c = Some(-327.0)), AlarmId::BrokenResult, "the temperature is -327"),
+        (Box::new(|of| of.duration_s = Some(-5.0)), AlarmId::BrokenResult, "the duration is -5 s"),
+        (Box::new(|of| of.probe_radius_mm = Some(0.0)), AlarmId::BrokenResult, "the probe's radius is 0 mm"),
+        (Box::new(|of| of.points[3].quality = 101), AlarmId::BrokenResult, "the quality of a point is 101"),
+        (Box::new(|of| of.points[40].at_mm[2] = 1e30), AlarmId::BrokenResult, "a coordinate is 1000000"),
+    ];
+    let told: Vec<_> = fates.iter().map(|(_, id, words)| (*id, *words)).collect();
+    let mut fates: VecDeque<Fate> = fates.into_iter().map(|(fate, ..)| fate).collect();
+    // A good one, and then the same again under the next cycle's numbers.
+    fates.push_back(Box::new(move |of| *kept.lock().unwrap() = Some(of.clone())));
+    fates.push_back(Box::new(move |of| {
+        let old = given.lock().unwrap().clone().expect("the one before");
+        of.points.clone_from(&old.points);
+    }));
+    let cmm = Odd { cmm, discarded: 0, fates };
+    let (drive, _orders) = Drive::new(run, cmm, grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    for (expected, words) in told {
+        let (id, what) = alarm(&mut notices).await;
+        assert_eq!(id, expected, "{what}");
+        assert!(what.contains(words), "{what} without {words}");
+        until(&folder, |words| words.starts_with("Held (Measure, Send)")).await;
+        resume(&folder).await;
+    }
+    let (id, what) = alarm(&mut notices).await;
+    assert_eq!(id, AlarmId::ForeignResult, "{what}");
+    assert!(what.contains("the points are those of cycle 6 to the last bit"), "{what}");
+    order(&folder, Request::Abort { reason: "seen enough".into() }).await;
+    running.await.unwrap();
+}
