@@ -329,7 +329,7 @@ def main():
     options.add_argument("--anchor", action="append", type=Path, default=[], help="copy of journal.anchor that was kept elsewhere")
     options.add_argument("--key", action="append", default=[], help="public key that may have signed, 64 digits")
     options.add_argument("--json", action="store_true", help="a line of JSON for each run")
-    given, code = options.parse_args(), 0
+    given, codes = options.parse_args(), set()
     if not all(is_hex(key, 64) for key in given.key) or not all(anchor.is_file() for anchor in given.anchor):
         options.error("--key takes 64 small hexadecimal digits, --anchor a file")
     if given.key and Ed25519PublicKey is None:
@@ -337,12 +337,13 @@ def main():
     for run in given.runs:
         try:
             found = verify(run, given.anchor, given.key)
-            code = max(code, 1 if not found["sound"] or found["lacks"] else 0 if found["whole"] else 4)
+            codes.add(1 if not found["sound"] or found["lacks"] else 0 if found["whole"] else 4)
             print(json.dumps(found) if given.json else in_words(found))
         except Absent as absent:
-            code = 2
+            codes.add(2)
             print(json.dumps({"run": str(run), "absent": str(absent)}) if given.json else f"{run}: {absent}")
-    return code
+    # The worst of them.
+    return next(code for code in (1, 2, 4, 0) if code in codes)
 
 
 if __name__ == "__main__":

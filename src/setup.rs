@@ -69,6 +69,11 @@ pub enum SetupError {
     )]
     NeedsPlan { recipe: PathBuf, cell: PathBuf },
     #[error(
+        "{}: {key} needs the temperature of each measurement, and {} reaches its CMM over a wire that tells none; leave the key out, or use \
+         another wire", .recipe.display(), .cell.display()
+    )]
+    NoTemperature { recipe: Box<Path>, cell: Box<Path>, key: &'static str },
+    #[error(
         "{recipe}: grinding.track_mm is missing, and cannot be chosen by the scallops between the tracks, because no path is laid over this part: \
          {source}; add grinding.track_mm"
     )]
@@ -444,6 +449,16 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     beyond("compensation.depth_of_cut_um", depth_um, 0.0, most_um, "1000 times grinder.limits.largest_depth_mm")?;
     if targets.is_empty() && !cell.cmm.link.wire.is_by_person() {
         return Err(SetupError::NeedsPlan { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() });
+    }
+    let of_temperature = [
+        ("part.expansion_um_m_k", recipe.part.expansion_um_m_k.is_some()),
+        ("measure.temperature_c", recipe.measure.temperature_c.is_some()),
+    ];
+    // Found out here, and not at the first measurement, when the part has been ground.
+    if let Some((key, _)) = of_temperature.into_iter().find(|(_, is_there)| *is_there)
+        && !cell.cmm.link.wire.tells_temperature()
+    {
+        return Err(SetupError::NoTemperature { recipe: recipe.path().into(), cell: cell.path().into(), key });
     }
     check_travel(recipe, cell, targets)
 }

@@ -56,8 +56,16 @@ impl Cell {
         if place > self.furthest {
             self.furthest = place;
             if let Some((device, _)) = phase.job() {
-                self.vain[device as usize] = Vain::default();
+                self.succeeds(device);
             }
+        }
+    }
+
+    /// What failed of a machine before is over.
+    fn succeeds(&mut self, device: Device) {
+        let was_told = std::mem::take(&mut self.vain[device as usize]).told;
+        if was_told && !self.vain.iter().any(|vain| vain.told) {
+            self.withdraw(AlarmId::FailsAgain);
         }
     }
 
@@ -65,9 +73,11 @@ impl Cell {
     fn fails_again(&mut self, device: Device) -> bool {
         let Deadlines { vain, vain_failures, .. } = self.plan.deadlines;
         let now = self.now;
-        let Vain { failures, since, last } = &mut self.vain[device as usize];
-        // One that was long ago has nothing to do with this one.
-        if *failures == 0 || now.saturating_sub(*last) > vain.saturating_mul(2) {
+        let in_sight = matches!(self.state, Execute(phase) if phase == Phase::of(device, JobStep::Run));
+        let Vain { failures, since, last, .. } = &mut self.vain[device as usize];
+        // One that was long ago has nothing to do with this one, nor has one behind which the job ran in sight for a while.
+        let over = if in_sight { vain / 2 } else { vain.saturating_mul(2) };
+        if *failures == 0 || now.saturating_sub(*last) > over {
             (*failures, *since) = (0, now);
         }
         (*failures, *last) = (*failures + 1, now);
@@ -75,6 +85,7 @@ impl Cell {
     }
 
     fn raise_fails_again(&mut self, device: Device, phase: Phase, why: &str) {
+        self.vain[device as usize].told = true;
         let Vain { failures, since, .. } = self.vain[device as usize];
         let seconds = self.now.saturating_sub(since).as_secs();
         self.raise(
@@ -352,7 +363,10 @@ impl Cell {
             self.not_started(device);
         }
         self.raise(AlarmId::MachineRefused, &format!("{device}, {what}: {why}"));
-        self.go(Held(restart_of(phase)));
+        self.keeps[device as usize] = what == Asked::Acknowledge;
+        // What a person called over is not: it is asked once more what became of it.
+        let still_there = what == Asked::Discard && phase == Phase::of(device, JobStep::Discard);
+        self.go(Held(if still_there { Phase::of(device, JobStep::Reconcile) } else { restart_of(phase) }));
     }
 
     pub(super) fn ended(&mut self, device: Device, result: JobResult) {
@@ -377,6 +391,7 @@ impl Cell {
     /// the next job: it is asked to forget it, now if it can be.
     pub(super) fn declared_over(&mut self, device: Device) {
         let discard = Phase::of(device, JobStep::Discard);
+        self.keeps[device as usize] = false;
         if self.knows(device).ready && !self.causes.contains(&Cause::Link(device)) {
             self.go(Holding(discard));
             self.push(Command::Acknowledge { device });
@@ -388,6 +403,7 @@ impl Cell {
     /// A person says that a machine has nothing more to be told of a result.
     pub(super) fn given_up(&mut self, phase: Phase) {
         self.withdraw(AlarmId::MachineRefused);
+        self.keeps = [false; 2];
         match phase {
             Measure(JobStep::Acknowledge) => self.go(Held(Register)),
             Measure(_) => self.measure_anew(),
@@ -653,7 +669,7 @@ impl Cell {
 
     /// The job gives a sign of progress.
     pub(super) fn progressed(&mut self, device: Device) {
-        self.vain[device as usize] = Vain::default();
+        self.succeeds(device);
         if let Some(last) = self.progressed.replace(self.now) {
             self.pace = self.pace.max(self.now.saturating_sub(last));
         }
@@ -666,6 +682,14 @@ impl Cell {
         match self.state {
             // What holds is given whether it is on record or not.
             Execute(_) | Holding(_) | Suspending(_) if runs => {}
+            // That a START was not given is told as a refusal; without one it may have moved the machine.
+            _ if matches!(phase.job(), Some((_, JobStep::Start))) => {}
+            // A machine that has to come to a stand has to, whether or not it was found out what it does.
+            Holding(_) if self.hold_due.is_some() => {
+                if let Some(device) = phase.moving() {
+                    self.push(Command::HoldMachine { device });
+                }
+            }
             _ => self.go(Held(restart_of(phase))),
         }
     }
@@ -716,6 +740,12 @@ impl Cell {
             if !matches!(alarm, AlarmId::LinkLost | AlarmId::ConditionLost) || self.causes.is_empty() {
                 self.withdraw(alarm);
             }
+        }
+        // While it failed again and again it was not told each time.
+        if !self.raised.contains_key(&AlarmId::LinkLost)
+            && let Some(Cause::Link(device)) = self.causes.iter().find(|cause| matches!(cause, Cause::Link(_))).copied()
+        {
+            self.raise(AlarmId::LinkLost, &format!("{device}, it is not back"));
         }
         match phase.job() {
             Some((_, JobStep::Run)) if !self.causes.is_empty() => self.go(Suspended(phase)),
@@ -777,19 +807,29 @@ impl Cell {
     /// A machine that was told to hold is not called held before it has said that it stands.
     pub(super) fn link_lost(&mut self, phase: Phase, device: Device, why: &str, wait: fn(Phase) -> State) {
         self.note_link(device, true);
-        let is_vain = self.fails_again(device);
+        let needed = phase.job().map(|(job, _)| job) == Some(device) || awaits_clear(phase) == Some(device);
+        let fails_again = self.fails_again(device);
+        // The cell does without a machine that it does not need.
+        let is_vain = fails_again && needed;
         // What is known to fail again and again is not told each time anew.
-        if !self.raised.contains_key(&AlarmId::FailsAgain) {
+        let was_told = self.vain[device as usize].told && (!needed || self.raised.contains_key(&AlarmId::FailsAgain));
+        if !(fails_again && was_told) {
             self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
             if is_vain {
                 self.raise_fails_again(device, phase, why);
             }
+            self.vain[device as usize].told = fails_again;
         }
         let wait = if is_vain { Held } else { wait };
-        let needed = phase.job().map(|(job, _)| job) == Some(device) || awaits_clear(phase) == Some(device);
-        let is_holding = matches!(self.state, Holding(_)) && phase.moving() == Some(device);
-        if is_holding {
+        let stands = matches!(self.state, Held(_) | Suspended(_));
+        let is_holding = matches!(self.state, Holding(_)) || is_vain && !stands;
+        if is_holding && phase.moving() == Some(device) {
             self.go(Holding(out_of_sight(phase)));
+            if is_vain {
+                // However often the line comes back meanwhile.
+                self.hold_due = self.hold_due.or(self.deadline);
+                self.deadline = self.hold_due;
+            }
         } else if needed {
             self.go(wait(out_of_sight(phase)));
         }
@@ -829,7 +869,7 @@ impl Cell {
             Holding(phase) | Held(phase)
                 if same
                     && phase.job() == Some((device, JobStep::Reconcile))
-                    && !self.raised.contains_key(&AlarmId::FailsAgain) =>
+                    && !(matches!(self.state, Held(_)) && self.vain[device as usize].told) =>
             {
                 self.go(Holding(phase));
                 self.push(Command::Reconcile { device, cycle: self.cycle });
@@ -933,6 +973,9 @@ impl Cell {
 
     pub(super) fn reconciled(&mut self, device: Device, outcome: &Reconciliation) {
         let run = Phase::of(device, JobStep::Run);
+        if !matches!(outcome, Reconciliation::NotStarted | Reconciliation::Unknown(_)) {
+            self.withdraw(AlarmId::JobVanished);
+        }
         self.begun[device as usize] |= !matches!(outcome, Reconciliation::NotStarted | Reconciliation::Unknown(_));
         match (outcome, self.state) {
             (Reconciliation::Running, Holding(_) | Suspending(_)) => {
@@ -1224,7 +1267,7 @@ pub(super) fn awaits(phase: Phase, device: Device, what: Asked) -> bool {
         Asked::Prepare => &[JobStep::Prepare],
         Asked::Start => &[JobStep::Start],
         Asked::Collect => &[JobStep::Collect],
-        Asked::Acknowledge => &[JobStep::Acknowledge, JobStep::Discard],
+        Asked::Acknowledge | Asked::Discard => &[JobStep::Acknowledge, JobStep::Discard],
         Asked::Hold | Asked::Resume | Asked::Stop | Asked::Abort | Asked::Clear => &[],
     };
     phase.job().is_some_and(|(job, step)| job == device && steps.contains(&step))

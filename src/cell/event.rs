@@ -222,6 +222,8 @@ pub enum Asked {
     Collect,
     /// To forget its result.
     Acknowledge,
+    /// To forget the result of a job at which it still is.
+    Discard,
 }
 
 /// How a job of a machine ended.
@@ -542,6 +544,7 @@ impl fmt::Display for Asked {
             Self::Clear => "to be cleared",
             Self::Collect => "to give its result",
             Self::Acknowledge => "to forget its result",
+            Self::Discard => "to forget a job at which it still is",
         })
     }
 }

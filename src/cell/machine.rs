@@ -104,7 +104,8 @@ impl Cell {
             ) => self.declared_over(*device),
             // A result that the machine will not be told to forget: whether it is gone shows when the next job is prepared.
             (Held(phase), Event::DeclaredOver { device, .. }) if awaits_acknowledge(phase) == Some(*device) => {
-                self.given_up(phase);
+                let was_asked = self.keeps[*device as usize] || phase == Phase::of(*device, JobStep::Acknowledge);
+                if was_asked { self.given_up(phase) } else { self.declared_over(*device) }
             }
             (Execute(Load), Event::LoadConfirmed { .. }) => self.first_cycle(),
             (state, Event::ClearConfirmed { device, .. })
@@ -156,7 +157,7 @@ impl Cell {
                 Event::NotOnRecord { .. },
             ) => self.not_on_record(phase),
             // Its result stays at the machine, which is told when the next run comes.
-            (Stopping, Event::NotOnRecord { .. }) => self.stopped(),
+            (Stopping, Event::NotOnRecord { command }) if command.starts_with("acknowledge") => self.stopped(),
             (_, Event::NotOnRecord { .. }) => {}
             (_, Event::ControlLost { why }) => self.raise(AlarmId::ControlLost, why),
             (_, Event::ControlBack) => self.withdraw(AlarmId::ControlLost),
@@ -274,7 +275,7 @@ impl Cell {
                 self.raise(AlarmId::MachineRefused, &format!("{device}, resume: {why}"));
                 self.go(Held(p));
             }
-            (Stopping, Event::Refused { device, what: Asked::Stop | Asked::Acknowledge, why }) => {
+            (Stopping, Event::Refused { device, what: Asked::Stop | Asked::Acknowledge | Asked::Discard, why }) => {
                 self.raise(AlarmId::StopNotConfirmed, &format!("{device}, {why}"));
                 self.abort(&format!("the {device} refused to stop: {why}"));
             }

@@ -47,6 +47,8 @@ pub(super) struct Vain {
     /// When the first and the last of them were.
     pub(super) since: Duration,
     pub(super) last: Duration,
+    /// Whether a person was told that it fails again and again.
+    pub(super) told: bool,
 }
 
 /// A cell in the middle of a run. What is large is shared by its copies, of which [`super::table()`] makes millions.
@@ -79,6 +81,8 @@ pub struct Cell {
     pub(super) repeated: bool,
     /// The machine that is being stopped, while the cell is.
     pub(super) stopping: Option<Device>,
+    /// Whether each machine was asked to give its result back, and would not.
+    pub(super) keeps: [bool; 2],
     /// The time of the event that is being handled, and when the next deadline is due.
     pub(super) now: Duration,
     pub(super) deadline: Option<Duration>,
@@ -117,6 +121,7 @@ impl Cell {
             ordered: false,
             repeated: false,
             stopping: None,
+            keeps: [false; 2],
             now: Duration::ZERO,
             deadline: None,
             hold_due: None,

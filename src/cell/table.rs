@@ -16,7 +16,7 @@ use super::state::{Device, JobStep, Phase, State};
 
 /// The version of the table. A run is gone on with by a program of the version that began it only; a change of what follows from
 /// anything is another version.
-pub const TABLE_VERSION: u32 = 11;
+pub const TABLE_VERSION: u32 = 12;
 
 /// What an event does in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -103,8 +103,10 @@ fn key(cell: &Cell) -> impl Eq + Hash + use<> {
     let by_hand = cell.known.iter().any(|known| known.manual);
     // Only what became of a job is asked by it.
     let asked = cell.state().phase().and_then(Phase::job).filter(|(_, step)| *step == JobStep::Reconcile);
-    let begun = asked.map(|(device, _)| cell.begun[device as usize]);
-    let memory = (memory, cell.hold_due.is_some(), grinds && cell.doubted, cell.still, by_hand, begun);
+    let begun = asked.map(|(device, _)| (cell.begun[device as usize], cell.vain[device as usize].told));
+    let discarded = cell.state().phase().and_then(Phase::job).filter(|(_, step)| *step == JobStep::Discard);
+    let keeps = discarded.is_some_and(|(device, _)| cell.keeps[device as usize]);
+    let memory = (memory, cell.hold_due.is_some(), grinds && cell.doubted, cell.still, by_hand, begun, keeps);
     (cell.state, known, clear, cell.causes.is_empty(), memory, cell.plan.on_stall == Disposal::Hold)
 }
 
@@ -159,7 +161,8 @@ pub fn samples(cycle: u32) -> Vec<Event> {
     events.extend(of_computations(cycle));
     events.push(Event::RecordFailed { why: RecordFailure::DiskFull(String::new()) });
     events.push(Event::RecordFailed { why: RecordFailure::Unwritable(String::new()) });
-    events.push(Event::NotOnRecord { command: String::new() });
+    events.push(Event::NotOnRecord { command: Command::Acknowledge { device: Device::Cmm }.name() });
+    events.push(Event::NotOnRecord { command: Command::ResumeMachine { device: Device::Cmm }.name() });
     events.push(Event::ControlLost { why: String::new() });
     events.push(Event::ControlBack);
     events.push(Event::Deadline);
@@ -227,8 +230,8 @@ fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
     for outcome in outcomes.into_iter().chain([Reconciliation::Unknown(text())]) {
         events.push(Event::Reconciled { device, cycle, outcome });
     }
-    use Asked::{Abort, Acknowledge, Clear, Collect, Hold, Load, Prepare, Resume, Start, Stop};
-    for what in [Load, Prepare, Start, Hold, Resume, Stop, Abort, Clear, Collect, Acknowledge] {
+    use Asked::{Abort, Acknowledge, Clear, Collect, Discard, Hold, Load, Prepare, Resume, Start, Stop};
+    for what in [Load, Prepare, Start, Hold, Resume, Stop, Abort, Clear, Collect, Acknowledge, Discard] {
         events.push(Event::Refused { device, what, why: text() });
     }
     events

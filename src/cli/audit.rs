@@ -173,6 +173,10 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     let copy: Option<Value> = None;
     let folder = folder_of(arguments.run.as_deref())?;
     if is_folder_of_runs(&folder) {
+        if let Some(anchor) = &arguments.anchor {
+            let reason = "it is of one run, and a folder of runs was given: name the run".to_owned();
+            return Err(Failure::Anchor { path: anchor.clone(), reason });
+        }
         return succession::prove(&folder, &arguments.key, arguments.json);
     }
     let anchor = arguments.anchor.as_deref().map(read_anchor).transpose()?;
@@ -201,19 +205,26 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     } else {
         super::print(&sound(&folder, &begin, &verified, !arguments.key.is_empty()))?;
     }
-    let lacks = match &verified {
+    match is_whole(&verified, &arguments.key) {
+        Ok(true) => Ok(Outcome::Accepted),
+        Ok(false) => Ok(Outcome::UnderWay),
+        Err(lacks) => Err(Failure::NotWhole { run: folder, lacks }),
+    }
+}
+
+/// Returns whether a sound run is whole or still under way, or what it lacks.
+pub(super) fn is_whole(verified: &Verified, keys: &[PublicKey]) -> Result<bool, &'static str> {
+    match verified {
         // Whoever holds the lock: with a key at hand, what is not signed by it is not believed.
-        verified if verified.lacks_last_seal() && (!verified.under_way || !arguments.key.is_empty()) => {
-            "its end is not signed, and the run names a key: who has no key may have written what follows the last seal"
-        }
-        Verified { anchored: 0, .. } => "journal.anchor is missing: whether its end was cut off cannot be told",
-        Verified { closed: false, under_way: false, .. } => {
-            "the run broke off: nobody drives it, and it has no end; what happened behind its last record is not known"
-        }
-        Verified { closed: true, .. } if !verified.lacks_last_seal() => return Ok(Outcome::Accepted),
-        _ => return Ok(Outcome::UnderWay),
-    };
-    Err(Failure::NotWhole { run: folder, lacks })
+        verified if verified.lacks_last_seal() && (!verified.under_way || !keys.is_empty()) => Err(
+            "its end is not signed, and the run names a key: who has no key may have written what follows the last seal",
+        ),
+        Verified { anchored: 0, .. } => Err("journal.anchor is missing: whether its end was cut off cannot be told"),
+        Verified { closed: false, under_way: false, .. } => Err(
+            "the run broke off: nobody drives it, and it has no end; what happened behind its last record is not known",
+        ),
+        verified => Ok(verified.closed && !verified.lacks_last_seal()),
+    }
 }
 
 /// Whether runs lie in a folder, and it is none itself.

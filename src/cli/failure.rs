@@ -101,7 +101,8 @@ pub(super) enum Failure {
     )]
     MayNotAsk { path: PathBuf, source: io::Error },
     #[error(
-        "{path}: the program of the cell is there and does not answer; what was asked is not carried out once it does. Its process stands still (SIGSTOP, a          debugger) or the computer is overloaded. A machine that hears nothing of it holds by itself: look at both machines"
+        "{path}: the program of the cell is there and does not answer; what was asked is not carried out once it does. Its process stands \
+         still (SIGSTOP, a debugger) or the computer is overloaded. A machine that hears nothing of it holds by itself: look at both machines"
     )]
     NoAnswer { path: PathBuf },
     #[error("{} runs go on: name one of {}", .runs.len(), .runs.iter().map(|run| run.display().to_string()).collect::<Vec<_>>().join(", "))]

@@ -1,19 +1,22 @@
 //! `regrind resume`: let a held cell go on, or go on with a run whose program ended in the middle of it.
 
 use std::collections::BTreeMap;
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use clap::Args;
-use regrind::cell::{CellPlan, TABLE_VERSION};
+use regrind::cell::{Actor, CellPlan, TABLE_VERSION};
 use regrind::config::CellConfig;
 use regrind::drive::{Interrupted, Request, Task};
 use regrind::formats::{FormatError, Learned};
-use regrind::journal::{Artefact, Journal, JournalError, Kind, Reader, RunLock, may_be_lost, newest_cycle, verify};
+use regrind::journal::{
+    Artefact, DATABASE, Entry, Journal, JournalError, Kind, LOCK, Reader, RunLock, may_be_lost, newest_cycle, verify,
+};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde::Deserialize;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use super::failure::Failure;
 use super::live::{Live, Work, outcome};
@@ -90,13 +93,26 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     }
     super::runtime()?.block_on(async {
         let (part, actor) = (&begun.part_in_files, operator(arguments.operator.as_deref()));
+        let actor_of_this = actor.clone();
         let (recipe, cell, json) = (&recipe, &cell, arguments.json);
         let live = Live { recipe, cell, part, folder, job: begun.job, actor, json };
         let machines = live.open(epoch(SystemTime::now()))?;
-        let journal = Journal::open_locked(lock, key).map_err(Failure::Journal)?;
+        let mut journal = Journal::open_locked(lock, key).map_err(Failure::Journal)?;
+        if let (Some(what), cycle) = (&begun.lost, begun.cycle) {
+            let remark = format!("gone on with by --despite-loss, though the end of the record may be lost: {what}");
+            let Actor { name: actor, station } = actor_of_this.clone();
+            let entry = Entry { actor, station, ..Entry::new(Kind::Note, 0, cycle, json!({ "remark": remark })) };
+            journal.append(entry).map_err(Failure::Journal)?;
+        }
         let (loaded, interrupted) = (cell.simulated, Some(interrupted));
         outcome(&live.carry_out(machines, Work { task, plan, journal, loaded, interrupted }).await?)
     })
+}
+
+/// Whether a folder holds nothing but an empty database with its lock.
+fn is_bare(run: &Path) -> bool {
+    let names = fs::read_dir(run).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.file_name());
+    names.into_iter().all(|name| name.to_str().is_some_and(|name| name.starts_with(DATABASE) || name == LOCK))
 }
 
 /// What the first record of a run tells of how to go on with it.
@@ -115,6 +131,12 @@ struct Begun {
     table_version: u32,
     #[serde(default)]
     rehearsal: bool,
+    /// What may be lost of the record, where a person goes on all the same.
+    #[serde(skip)]
+    lost: Option<String>,
+    /// The last cycle of the record.
+    #[serde(skip)]
+    cycle: u32,
     /// The files that are on record, by their names: nothing else of the folder is read.
     #[serde(skip)]
     files: BTreeMap<String, Artefact>,
@@ -129,7 +151,9 @@ impl Begun {
         let refused = |what: String| Failure::MayBeLost { run: run.to_owned(), what };
         let first = reader.records(0).next();
         if first.is_none() {
-            return Err(lost()?.map_or_else(|| Failure::NotBegun { run: run.to_owned() }, refused));
+            // A program that was ended as it made the folder has written nothing else yet.
+            let what = if is_bare(run) { None } else { lost()? };
+            return Err(what.map_or_else(|| Failure::NotBegun { run: run.to_owned() }, refused));
         }
         let verified = verify(run).map_err(|error| match error {
             JournalError::Broken { .. } => Failure::Broken(error),
@@ -138,14 +162,15 @@ impl Begun {
         if verified.closed {
             return Err(Failure::Over { run: run.to_owned() });
         }
-        let last = reader.last().map_err(Failure::Journal)?.map_or(0, |record| record.cycle);
+        let records = || reader.records(0).filter_map(Result::ok);
+        let last = records().map(|record| record.cycle).max().unwrap_or(0);
         let newest = newest_cycle(run);
-        let of_files = (newest > last + 1)
+        let of_files = (newest > last.saturating_add(1))
             .then(|| format!("there are files of cycle {newest}, and the record ends in cycle {last}"));
-        if let Some(what) = lost()?.or(of_files).filter(|_| !despite_loss) {
+        let lost = lost()?.or(of_files);
+        if let Some(what) = lost.clone().filter(|_| !despite_loss) {
             return Err(refused(what));
         }
-        let records = || reader.records(0).filter_map(Result::ok);
         if !records().any(|record| record.kind == Kind::Event) {
             return Err(Failure::NotBegun { run: run.to_owned() });
         }
@@ -170,6 +195,7 @@ impl Begun {
             })?;
             begun.files.insert(file.name.clone(), file);
         }
+        (begun.lost, begun.cycle) = (lost, last);
         Ok(begun)
     }
 

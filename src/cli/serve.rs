@@ -91,7 +91,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             std::path::absolute(runs).unwrap_or_else(|_| runs.clone()),
             entrance,
             Box::new(move |run| planned.of(run)),
-            Box::new(|what| eprintln!("page: refused {what}")),
+            Box::new(|what| eprintln!("page: {what}")),
         );
         let page = page.map_err(taken)?;
         super::print(&format!("page     {}\n", page.url()))?;

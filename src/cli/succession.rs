@@ -1,8 +1,12 @@
 //! The runs of a folder in the order in which they were begun. Each has a number and names the record of the one before, so that a run that is
 //! taken away, or renamed, is missed.
 
-use std::fs::{self, File};
+use std::cmp::Reverse;
+use std::collections::BTreeSet;
+use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use regrind::formats::ResultFolder;
 use regrind::journal::{Against, Anchor, JournalError, PublicKey, Reader, anchor_of, verify_against};
@@ -10,11 +14,15 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::Outcome;
+use super::audit::is_whole;
 use super::control::folders;
 use super::failure::Failure;
 
-/// Runs whose folders changed last, of which the numbers are read when the next one begins.
+/// Runs of each kind of newest, of which the numbers are read when the next one begins.
 const NEWEST: usize = 200;
+/// How long a run waits for others that begin in the same folder, and how often it asks.
+const TURN_COMES_WITHIN: Duration = Duration::from_secs(5);
+const ASKED_EVERY: Duration = Duration::from_millis(20);
 
 /// The place of a run among those of its folder.
 #[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -48,13 +56,15 @@ impl Place {
     /// Takes the next place in a folder of runs, to be kept until the run has its first record.
     pub(super) fn next(runs: &Path) -> Result<(Self, Turn), Failure> {
         ResultFolder::prepare(runs).map(ResultFolder::keep).map_err(Failure::File)?;
-        let folder = File::open(runs).ok().filter(|folder| folder.lock().is_ok());
-        let last = numbered_newest_first(runs).take(NEWEST).max_by_key(|(number, _)| *number);
+        // Any user may hold it: that keeps nobody from a run, who then may have the number of another.
+        let folder = File::open(runs).ok().filter(is_ours_in_time);
+        let last = newest_with_numbers(runs).into_iter().max_by_key(|(number, _)| *number);
         let before = last.as_ref().and_then(|(_, folder)| {
             let Anchor { records, head, .. } = anchor_of(folder).ok()??;
             Some(Before { run: name_of(folder), records, head })
         });
-        Ok((Self { number: 1 + last.map_or(0, |(number, _)| number), before }, Turn(folder)))
+        let number = last.map_or(0, |(number, _)| number).saturating_add(1);
+        Ok((Self { number, before }, Turn(folder)))
     }
 
     /// As the first record of a run keeps it.
@@ -70,16 +80,55 @@ impl Place {
     }
 }
 
+/// The hash of a record of a run that was found sound.
+fn hash_of(folder: &Path, seq: u64) -> Option<String> {
+    let record = Reader::open(folder).ok()?.records(seq).next()?.ok()?;
+    (record.seq == seq).then_some(record.hash)
+}
+
 fn name_of(folder: &Path) -> String {
     folder.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// The runs of a folder that have a number, those whose folders changed last first; no record of the others is read before it is asked for.
-fn numbered_newest_first(runs: &Path) -> impl Iterator<Item = (u64, PathBuf)> {
+/// Takes a lock, in some seconds or not at all.
+fn is_ours_in_time(folder: &File) -> bool {
+    let began = Instant::now();
+    loop {
+        match folder.try_lock() {
+            Ok(()) => return true,
+            Err(TryLockError::WouldBlock) if began.elapsed() < TURN_COMES_WITHIN => thread::sleep(ASKED_EVERY),
+            Err(_) => return false,
+        }
+    }
+}
+
+/// The newest runs of a folder that have a number: those that began last by the time in their names, and those whose folders changed last, since
+/// a copy of the folder has changed all of them, and a run may have any name.
+fn newest_with_numbers(runs: &Path) -> Vec<(u64, PathBuf)> {
     let changed = |folder: &PathBuf| fs::metadata(folder).and_then(|found| found.modified()).ok();
-    let mut all: Vec<_> = folders(runs).collect();
-    all.sort_by_cached_key(|folder| std::cmp::Reverse(changed(folder)));
-    all.into_iter().filter_map(|folder| Some((Place::of(&folder)?.number, folder)))
+    let mut all: Vec<PathBuf> = folders(runs).collect();
+    all.sort_by_cached_key(|folder| Reverse(changed(folder)));
+    let mut newest: BTreeSet<PathBuf> = all.iter().take(NEWEST).cloned().collect();
+    all.sort_by_cached_key(|folder| Reverse(time_in(&name_of(folder)).map(str::to_owned)));
+    newest.extend(all.into_iter().take(NEWEST));
+    newest.into_iter().filter_map(|folder| Some((Place::of(&folder)?.number, folder))).collect()
+}
+
+/// The time in the name of a run, as 20260704T120000Z; none where it has none.
+fn time_in(name: &str) -> Option<&str> {
+    let is_time = |text: &str| {
+        let of = |at: usize, byte: u8| {
+            if at == 8 {
+                byte == b'T'
+            } else if at == 15 {
+                byte == b'Z'
+            } else {
+                byte.is_ascii_digit()
+            }
+        };
+        text.bytes().enumerate().all(|(at, byte)| of(at, byte))
+    };
+    (0..name.len()).rev().filter_map(|at| name.get(at..at + 16)).find(|text| is_time(text))
 }
 
 /// What is wrong among the runs of a folder, and how each of them stands.
@@ -99,7 +148,7 @@ pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outco
     for (place, folder) in &all {
         proof.take(place.as_ref(), folder, keys);
         let Some(Place { number, before }) = place else { continue };
-        proof.follows((*number, folder), before.as_ref(), last, runs);
+        proof.follows((*number, folder), before.as_ref(), last);
         last = Some((*number, folder));
     }
     let Proof { told, flaws, are_under_way } = &proof;
@@ -128,15 +177,13 @@ impl Proof {
                 self.flaws.push(error.to_string());
                 "not sound".to_owned()
             }
-            Ok(found) if found.under_way => {
+            Ok(found) if let Err(lacks) = is_whole(&found, keys) => {
+                self.flaws.push(format!("{name}: {lacks}"));
+                "not whole".to_owned()
+            }
+            Ok(found) if is_whole(&found, keys) == Ok(false) => {
                 self.are_under_way = true;
                 "sound so far, under way".to_owned()
-            }
-            Ok(found) if !found.closed || found.anchored == 0 || found.lacks_last_seal() => {
-                self.flaws.push(format!(
-                    "{name}: its record is not whole; `regrind audit verify` of this run alone says what it lacks"
-                ));
-                "not whole".to_owned()
             }
             Ok(found) => {
                 format!("sound, {} records{}", found.records, if found.keys.is_empty() { ", not signed" } else { "" })
@@ -154,15 +201,9 @@ impl Proof {
     }
 
     /// Sees that a run follows the one before it, and that this one is what it was then.
-    fn follows(
-        &mut self,
-        (number, folder): (u64, &Path),
-        before: Option<&Before>,
-        last: Option<(u64, &Path)>,
-        runs: &Path,
-    ) {
+    fn follows(&mut self, (number, folder): (u64, &Path), before: Option<&Before>, last: Option<(u64, &Path)>) {
         let name = name_of(folder);
-        let due = last.map_or(1, |(last, _)| last + 1);
+        let due = last.map_or(1, |(last, _)| last.saturating_add(1));
         if number > due {
             let named = before.map_or(String::new(), |before| {
                 format!("; the last of them was {} with {} records or more", before.run, before.records)
@@ -177,13 +218,12 @@ impl Proof {
             self.flaws.push(format!("{name}: another run has its number {number} too"));
         }
         let Some(Before { run, records, head }) = before else { return };
-        let there = runs.join(run);
-        let anchor = Some(Anchor::new(*records, head.clone()));
-        let is_there = matches!(last, Some((_, last)) if last == there);
-        if is_there
-            && let Err(JournalError::Broken { what, .. }) =
-                verify_against(&there, &Against { anchor, keys: Vec::new() })
-        {
+        let Some((_, last)) = last.filter(|_| number == due) else { return };
+        let last_name = name_of(last);
+        if last_name != *run {
+            self.flaws.push(format!("{last_name}: it stands before {name}, which followed {run}"));
+        } else if hash_of(last, *records).as_deref() != Some(head) {
+            let what = format!("its record {records} has another hash than when {name} began");
             self.flaws.push(format!("{run}: it is not the run that {name} followed: {what}"));
         }
     }

@@ -162,7 +162,13 @@ async fn keep_in_place(mut mark: door::Mark, tell: mpsc::UnboundedSender<DoorCha
         });
         let Ok((same, made)) = looked.await else { return };
         mark = same;
-        let Some(made) = made else { continue };
+        let Some(made) = made else {
+            // It was moved away, and back.
+            if std::mem::take(&mut is_lost) {
+                let _ = tell.send(DoorChange::MadeAgain);
+            }
+            continue;
+        };
         if !std::mem::replace(&mut is_lost, true) {
             let why = made.as_ref().map_or_else(io::Error::to_string, |_| String::new());
             let _ = tell.send(DoorChange::Lost(why));

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use super::{DeviceError, Measurement, PassRecord, PointStatus};
+use super::{DeviceError, Measurement, PassRecord, PointStatus, SignalValue};
 
 /// The least and the most that a figure can be.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -58,15 +58,23 @@ impl Range {
     }
 }
 
-/// Refuses a temperature, a progress in steps of a total, or a scale of counts that cannot be.
+/// Returns a temperature, and a progress in steps of a total, where they can be, and what is wrong with one that cannot: a status that has one
+/// is still told, since what the machine is at and what it has acknowledged is in it too.
 pub(super) fn of_status(
-    machine: &Arc<str>,
     temperature_c: Option<f64>,
     progress: (u32, u32),
-) -> Result<(), DeviceError> {
-    temperature_c.map_or(Ok(()), |told| TEMPERATURE.refuse(machine, told))?;
+) -> (Option<f64>, Option<(u32, u32)>, Vec<SignalValue>) {
     let (done, total) = progress;
-    range("its progress", 0.0, f64::from(total), "of its job").refuse(machine, f64::from(done))
+    let of_progress = range("its progress", 0.0, f64::from(total), "of its job");
+    let signal = |of: Range, value: f64| {
+        let Range { figure, least, most, unit } = of;
+        let (name, unit) = (figure.to_owned(), unit.to_owned());
+        SignalValue { name, value: Some(value), unit, range: [least, most], cause: None }
+    };
+    let temperature = temperature_c.filter(|told| !TEMPERATURE.has(*told)).map(|told| signal(TEMPERATURE, told));
+    let steps = Some(f64::from(done)).filter(|done| !of_progress.has(*done)).map(|done| signal(of_progress, done));
+    let told = (temperature_c.filter(|_| temperature.is_none()), Some(progress).filter(|_| steps.is_none()));
+    (told.0, told.1, temperature.into_iter().chain(steps).collect())
 }
 
 /// Refuses a scale of counts that cannot be.
@@ -153,11 +161,22 @@ mod tests {
     }
 
     #[test]
-    fn a_status_that_cannot_be_is_refused() {
+    fn a_figure_of_a_status_that_cannot_be_is_told_and_the_others_are_kept() {
         let machine: Arc<str> = "a machine".into();
-        let of = |temperature_c, progress| of_status(&machine, temperature_c, progress).is_ok();
-        assert!(of(Some(20.0), (0, 0)) && of(None, (7, 7)) && of(Some(-40.0), (0, 1000)));
-        assert!(!of(Some(-327.68), (0, 0)) && !of(Some(20.0), (549, 1)) && !of(Some(20.0), (1, 0)));
+        for (temperature_c, progress) in [(Some(20.0), (0, 0)), (None, (7, 7)), (Some(-40.0), (0, 1000))] {
+            assert_eq!(of_status(temperature_c, progress), (temperature_c, Some(progress), Vec::new()));
+        }
+        let flaws = |temperature_c, progress| {
+            let (kept_c, kept, signals) = of_status(temperature_c, progress);
+            (kept_c, kept, signals.iter().filter_map(SignalValue::flaw).collect::<Vec<_>>().join("; "))
+        };
+        let (kept_c, kept, flaw) = flaws(Some(327.67), (3, 7));
+        assert_eq!((kept_c, kept), (None, Some((3, 7))));
+        assert_eq!(flaw, "the temperature is 327.67 degrees Celsius, and -40 to 120 degrees Celsius are wanted");
+        let (kept_c, kept, flaw) = flaws(Some(20.0), (549, 1));
+        assert_eq!((kept_c, kept), (Some(20.0), None));
+        assert_eq!(flaw, "its progress is 549 of its job, and 0 to 1 of its job are wanted");
+        assert_eq!(flaws(Some(f64::NAN), (1, 0)).2.matches("are wanted").count(), 2);
         assert!(
             of_counts(&machine, 1e-6).is_ok()
                 && of_counts(&machine, 0.0).is_err()

@@ -67,6 +67,11 @@ macro_rules! drivers {
                 match self { $(Self::$wire(_) => <$table>::BY_PERSON),+ }
             }
 
+            /// Whether its results may state their temperature.
+            pub fn tells_temperature(&self) -> bool {
+                match self { $(Self::$wire(_) => <$table>::TELLS_TEMPERATURE),+ }
+            }
+
             /// Whether the tables `registers` and `signals` say something of it.
             pub fn has_registers(&self) -> bool {
                 match self { $(Self::$wire(_) => <$table>::HAS_REGISTERS),+ }

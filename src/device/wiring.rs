@@ -75,6 +75,8 @@ pub trait Wired {
 
     /// Whether a person serves the machine: then it takes as long as people take, and nothing simulates it.
     const BY_PERSON: bool = false;
+    /// Whether its results may state their temperature.
+    const TELLS_TEMPERATURE: bool = true;
     /// Whether the tables `registers` and `signals` say something of it.
     const HAS_REGISTERS: bool = false;
     /// Whether the grinder works by the program and the map that lie in the folder of the run, the first of a run too.

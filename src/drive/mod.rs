@@ -468,6 +468,9 @@ impl Drive {
 
     /// Tells the cell that a command for whose answer it waits was not given, since it did not come on record.
     async fn not_on_record(&mut self, command: Command) {
+        if !self.cell.wants(&command) && !matches!(command, Command::StartMachine { .. }) {
+            return;
+        }
         match command {
             Command::StartMachine { .. } => self.not_carried_out(command).await,
             command if outcome::is_answered(&command) => {
@@ -722,7 +725,8 @@ impl Drive {
         let (map, pass) = self.task.payloads(&cycle.correction);
         let job = Job { job: self.job, cycle: number as u16, digest: 0 };
         let largest_depth_mm = self.task.limits.largest_depth_mm;
-        let told = pass_record::Told { job, pass: &pass, map_identity: map.identity(), largest_depth_mm };
+        let outline = self.task.nominal.outline();
+        let told = pass_record::Told { job, pass: &pass, map_identity: map.identity(), largest_depth_mm, outline };
         pass_record::flaw(&told, record)
     }
 

@@ -50,6 +50,7 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
         (C::Compensate { cycle }, E::Compensated { cycle: c, .. } | E::CompensationRefused { cycle: c, .. }) => {
             cycle == c
         }
+        (C::Acknowledge { device }, E::Refused { device: d, what: Asked::Discard, .. }) => device == d,
         (command, E::NotOnRecord { command: name }) => command.name() == *name,
         (command, E::Refused { device, what, .. }) => asked(command) == Some((*device, *what)),
         _ => false,

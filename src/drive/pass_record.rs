@@ -3,11 +3,13 @@
 use serde_json::{Value, json};
 
 use crate::device::{Job, Outcome, Pass, PassRecord};
+use crate::geometry::Aperture;
 
 /// Share of its stated radius by which a wheel may differ from the recipe's: wear and dressing, not another wheel.
 const WHEEL_SHARE: f64 = 0.01;
-/// Least share of the tracks over the whole rectangle that a pass travels: an aperture leaves corners and holes out.
+/// Least share of the tracks over the part that a pass travels; over its rectangle, where it has no outline: corners and holes may be left out.
 const LEAST_PATH_SHARE: f64 = 0.5;
+const LEAST_SHARE_OF_RECTANGLE: f64 = 0.25;
 /// Most of them that it travels each time it goes over the part: with its ways through the air, and over the edges.
 const MOST_PATH_SHARE: f64 = 20.0;
 /// How much larger than the rectangle a surface is that the wheel can follow.
@@ -23,11 +25,13 @@ pub(super) struct Told<'t> {
     pub(super) map_identity: [u8; 32],
     /// The most that may be taken off in one pass anywhere.
     pub(super) largest_depth_mm: f64,
+    /// The outline of the part, where one was stated.
+    pub(super) outline: Option<&'t Aperture>,
 }
 
 /// Names the first figure of a record that cannot be, with its limit; what was not told is not judged.
 pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
-    let Told { job, pass, map_identity, largest_depth_mm } = told;
+    let Told { job, pass, map_identity, largest_depth_mm, outline } = told;
     if (record.job, record.cycle) != (job.job, job.cycle) {
         let (is_job, is_cycle) = (record.job, record.cycle);
         return Some(format!("it is of job {is_job}, cycle {is_cycle}; {}, {} was ground", job.job, job.cycle));
@@ -54,7 +58,10 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
     };
     let [width, height] = [pass.x_mm, pass.y_mm].map(|[low, high]| high - low);
     let tracks_mm = width * height / pass.track_spacing_mm;
-    let least_path_mm = LEAST_PATH_SHARE * tracks_mm;
+    let least_path_mm = match outline {
+        Some(outline) => LEAST_PATH_SHARE * outline.area_mm2().min(width * height) / pass.track_spacing_mm,
+        None => LEAST_SHARE_OF_RECTANGLE * tracks_mm,
+    };
     // It goes over the part once for each cut of what it may take off, once to finish, and then to spark out.
     let times = (largest_depth_mm / pass.depth_of_cut_mm).ceil() + 1.0 + f64::from(pass.spark_out_passes);
     let most_path_mm = MOST_PATH_SHARE * tracks_mm * times;
@@ -138,8 +145,23 @@ mod tests {
     }
 
     fn judged(record: &PassRecord) -> Option<String> {
+        judged_of(Some(&Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 102.0, height_mm: 62.0 }), record)
+    }
+
+    fn judged_of(outline: Option<&Aperture>, record: &PassRecord) -> Option<String> {
         let job = Job { job: 41, cycle: 2, digest: 0 };
-        flaw(&Told { job, pass: &pass(), map_identity: [3; 32], largest_depth_mm: 0.5 }, record)
+        flaw(&Told { job, pass: &pass(), map_identity: [3; 32], largest_depth_mm: 0.5, outline }, record)
+    }
+
+    #[test]
+    fn a_ring_needs_half_of_its_own_tracks_and_a_part_without_an_outline_a_quarter_of_its_rectangles() {
+        let ring = Aperture::Annulus { centre_mm: [0.0; 2], inner_radius_mm: 27.0, outer_radius_mm: 31.0 };
+        let of_path = |path_mm| PassRecord { path_mm: Some(path_mm), duration_s: None, ..record() };
+        // 728.8 mm2 in tracks of 0.5 mm.
+        assert_eq!(judged_of(Some(&ring), &of_path(740.0)), None);
+        assert!(judged_of(Some(&ring), &of_path(700.0)).is_some_and(|flaw| flaw.contains("at least 728.849 mm")));
+        assert_eq!(judged_of(None, &of_path(3200.0)), None);
+        assert!(judged_of(None, &of_path(3100.0)).is_some_and(|flaw| flaw.contains("at least 3162.000 mm")));
     }
 
     #[test]

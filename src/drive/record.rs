@@ -23,6 +23,8 @@ pub(super) type Ticket = oneshot::Receiver<Result<(), RecordFailure>>;
 const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
 /// Between two tries to write what could not be written.
 const BETWEEN_TRIES: Duration = Duration::from_millis(100);
+/// Every so many tries it is told that they fail.
+const TOLD_EVERY: u32 = 10;
 /// How long the end of a run waits for its record.
 pub(super) const PATIENCE: Duration = Duration::from_secs(5);
 
@@ -206,9 +208,10 @@ impl Scribe {
         }
     }
 
-    /// Writes a job, however often that has to be tried. The loop is told once that it does not go on.
+    /// Writes a job, however often that has to be tried. The loop is told that it does not go on, and again as long as that is so: what it
+    /// hears in between may be of an earlier job.
     async fn until_written(&mut self, job: &Job) -> Result<(), JournalError> {
-        let mut told = false;
+        let mut tries = 0_u32;
         loop {
             self.beside.take_its_time(Blocking::Record).await;
             let error = match self.write(job) {
@@ -225,9 +228,10 @@ impl Scribe {
                 }
                 Err(error) => error,
             };
-            if !std::mem::replace(&mut told, true) {
+            if tries.is_multiple_of(TOLD_EVERY) {
                 let _ = self.failed.send(failure(error));
             }
+            tries = tries.wrapping_add(1);
             tokio::time::sleep(BETWEEN_TRIES).await;
         }
     }

@@ -677,7 +677,7 @@ impl<B: StationDriver> MachineTask<B> {
             Ok(status) if status.state.moves() || status.state == State::Held => {
                 let (device, why) =
                     (B::DEVICE, format!("{} is still {}", self.driver.machine().name(), at_work(&status)));
-                self.tell(Event::Refused { device, what: Asked::Acknowledge, why }).await;
+                self.tell(Event::Refused { device, what: Asked::Discard, why }).await;
             }
             Ok(status) => {
                 self.seen.state = Some(status.state);
@@ -849,7 +849,7 @@ impl<B: StationDriver> MachineTask<B> {
             Some((done, total)) => {
                 let (last, _) = self.seen.progress.replace((done, total)).unwrap_or((done, total));
                 self.seen.rises += u32::from(done > last);
-                if done > last && self.seen.rises == RISES_AFTER {
+                if done > last && self.seen.running && self.seen.rises.is_multiple_of(RISES_AFTER) {
                     let why = format!("it says HELD, and its progress has risen to {done} of {total} meanwhile");
                     self.tell(Event::Refused { device, what: Asked::Hold, why }).await;
                 }

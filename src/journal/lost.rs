@@ -11,6 +11,10 @@ use super::{ANCHOR, DATABASE};
 /// Bytes of the header of a log, and of that of a frame in it (sqlite.org/fileformat.html, "The Write-Ahead Log").
 const LOG_HEADER: usize = 32;
 const FRAME_HEADER: usize = 24;
+/// How a log begins, with checksums over words of either order; its version, and the pages that a database can have.
+const MAGIC: [u32; 2] = [0x377f_0682, 0x377f_0683];
+const LOG_VERSION: u32 = 3_007_000;
+const PAGES: std::ops::RangeInclusive<usize> = 512..=65_536;
 /// Most bytes of a log that are looked at.
 const MOST_OF_LOG: u64 = 256 << 20;
 
@@ -33,11 +37,7 @@ pub fn may_be_lost(folder: &Path) -> Result<Option<String>, JournalError> {
     let mut bytes = Vec::new();
     let read = File::open(&log).and_then(|file| file.take(MOST_OF_LOG).read_to_end(&mut bytes));
     read.map_err(JournalError::file(&log, "reading it"))?;
-    Ok(damage(&bytes).map(|behind| {
-        format!(
-            "{DATABASE}-wal is damaged: {behind} changes that were on the disk stand behind a place that does not hold"
-        )
-    }))
+    Ok(damage(&bytes).map(|what| format!("{DATABASE}-wal is damaged: {what}")))
 }
 
 /// Returns the highest number of a cycle of which there are files in the folder of a run; 0 where there is none.
@@ -47,20 +47,20 @@ pub fn newest_cycle(folder: &Path) -> u32 {
     names.filter_map(number).max().unwrap_or(0)
 }
 
-/// Returns how many changes were committed in a log behind its first frame that does not hold; none where all hold, or what does not is the
-/// end that a cut of the power left.
-fn damage(log: &[u8]) -> Option<usize> {
-    if log.len() < LOG_HEADER {
+/// Says that changes which were on the disk stand in a log behind a place that does not hold; none where all hold, or what does not is the end
+/// that a cut of the power left: a transaction is on the disk before the first frame of the next one is written.
+fn damage(log: &[u8]) -> Option<String> {
+    if log.len() <= LOG_HEADER {
         return None;
     }
     let word = |at: usize| u32::from_be_bytes(log[at..at + 4].try_into().expect("four bytes"));
-    let is_big_endian = word(0) & 1 != 0;
-    let page = word(8) as usize;
+    let (magic, version, page) = (word(0), word(4), word(8) as usize);
+    let is_header = MAGIC.contains(&magic) && version == LOG_VERSION && page.is_power_of_two() && PAGES.contains(&page);
     let sum = |[mut a, mut b]: [u32; 2], bytes: &[u8]| {
         for pair in bytes.as_chunks::<8>().0 {
             let [x, y] = [0, 4].map(|at| {
                 let four = pair[at..at + 4].try_into().expect("four bytes");
-                if is_big_endian { u32::from_be_bytes(four) } else { u32::from_le_bytes(four) }
+                if magic == MAGIC[1] { u32::from_be_bytes(four) } else { u32::from_le_bytes(four) }
             });
             a = a.wrapping_add(x).wrapping_add(b);
             b = b.wrapping_add(y).wrapping_add(a);
@@ -68,23 +68,29 @@ fn damage(log: &[u8]) -> Option<usize> {
         [a, b]
     };
     let mut so_far = sum([0, 0], &log[..24]);
-    // Frames of an earlier filling of the log stand behind its end, under other numbers.
-    let frames = log[LOG_HEADER..].chunks_exact(FRAME_HEADER + page.max(1));
-    let is_of_this = |frame: &[u8]| frame[8..16] == log[16..24];
-    let commits = |frame: &[u8]| frame[4..8] != [0; 4];
-    let holds_header = so_far == [word(24), word(28)];
-    let mut committed_behind = 0;
-    let mut holds = holds_header;
-    for frame in frames.take_while(|frame| is_of_this(frame)) {
-        if holds {
-            so_far = sum(sum(so_far, &frame[..8]), &frame[FRAME_HEADER..]);
-            let stated = [16, 20].map(|at| u32::from_be_bytes(frame[at..at + 4].try_into().expect("four bytes")));
-            holds = so_far == stated;
-            continue;
-        }
-        committed_behind += usize::from(commits(frame));
+    // It is on the disk before the first frame is written.
+    if !is_header || so_far != [word(24), word(28)] {
+        return Some("its first bytes do not hold, and nothing behind them is read".to_owned());
     }
-    (committed_behind > 0 || !holds_header && log.len() > LOG_HEADER).then_some(committed_behind)
+    let (mut holds, mut committed, mut synced) = (true, 0, 0);
+    for frame in log[LOG_HEADER..].chunks_exact(FRAME_HEADER + page) {
+        // Frames of an earlier filling of the log have other numbers; so has one whose header is damaged, and then those behind it do not hold.
+        let is_of_this = frame[8..16] == log[16..24];
+        if holds {
+            let sum = sum(sum(so_far, &frame[..8]), &frame[FRAME_HEADER..]);
+            let stated = [16, 20].map(|at| u32::from_be_bytes(frame[at..at + 4].try_into().expect("four bytes")));
+            (holds, so_far) = (is_of_this && sum == stated, sum);
+            if holds {
+                continue;
+            }
+        }
+        if is_of_this {
+            synced = committed;
+            committed += usize::from(frame[4..8] != [0; 4]);
+        }
+    }
+    (synced > 0)
+        .then(|| format!("{synced} changes or more that were on the disk stand behind a place that does not hold"))
 }
 
 #[cfg(test)]
@@ -140,6 +146,27 @@ mod tests {
         let mut header = log.clone();
         header[17] ^= 1;
         assert!(told(&header).is_some(), "one flipped bit in the header");
+        // A frame that is not read any more, whatever of it is damaged, and a block of zeros, as a bad sector or a lost extent is read.
+        let frame = FRAME_HEADER + u32::from_be_bytes(log[8..12].try_into().unwrap()) as usize;
+        for at in [LOG_HEADER + 8, LOG_HEADER + frame * 5 + 9, LOG_HEADER + frame * 5 + 20] {
+            let mut damaged = log.clone();
+            damaged[at] ^= 1;
+            assert!(told(&damaged).is_some(), "one flipped bit at {at}");
+        }
+        for zeros in [0..4096, 4096..8192, 0..log.len()] {
+            let mut damaged = log.clone();
+            damaged[zeros.clone()].fill(0);
+            assert!(told(&damaged).is_some(), "{zeros:?} zero");
+        }
+        // The power went while the last transaction was written: its end is there, and something before it is not.
+        let last = log.len() - frame;
+        let mut torn = log.clone();
+        torn[last - frame + FRAME_HEADER + 3] ^= 1;
+        let begins = |from: usize| log[from + 4..from + 8] != [0; 4];
+        assert_eq!(told(&torn).is_some(), begins(last - frame), "the frame before is a transaction of its own, or not");
+        let mut torn = log.clone();
+        torn[last + FRAME_HEADER + 3] ^= 1;
+        assert_eq!(told(&torn), None);
         assert_eq!(told(&log), None);
         fs::remove_file(&path).unwrap();
         assert!(may_be_lost(&folder).unwrap().unwrap().contains("-wal is missing or empty"));

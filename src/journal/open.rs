@@ -5,6 +5,7 @@ use std::io::Read;
 use std::path::Path;
 use std::time::Duration;
 
+use rusqlite::config::DbConfig;
 use rusqlite::{Connection, OpenFlags};
 
 use super::DATABASE;
@@ -51,7 +52,13 @@ pub(super) fn create(folder: &Path) -> Result<Connection, JournalError> {
     let marks = format!("PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = {LAYOUT};");
     connection.execute_batch(&format!("BEGIN IMMEDIATE; {marks} {SCHEMA} COMMIT;")).map_err(&failed)?;
     configure(&connection, &path)?;
+    keep_the_log(&connection, true).map_err(&failed)?;
     Ok(connection)
+}
+
+/// Has the log stay when the database is closed, or has it brought in: that of a run which broke off stays, however its program ended.
+pub(super) fn keep_the_log(connection: &Connection, keeps: bool) -> rusqlite::Result<()> {
+    connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, keeps).map(drop)
 }
 
 /// Opens the database of a run for writing.
@@ -64,6 +71,7 @@ pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
     configure(&connection, &path)?;
     check_schema(&connection, &path)?;
     bring_in_the_log(&connection).map_err(&failed)?;
+    keep_the_log(&connection, true).map_err(&failed)?;
     if layout < LAYOUT {
         // What is written from here on, an earlier version may not know.
         connection.execute_batch(&format!("PRAGMA user_version = {LAYOUT};")).map_err(&failed)?;

@@ -174,7 +174,7 @@ impl Journal {
         journal.is_whole()?;
         let payload =
             json!({ "regrind": env!("CARGO_PKG_VERSION"), "key": journal.key.as_ref().map(AuditKey::public) });
-        journal.append(Entry::new(Kind::Reopen, 0, 0, payload))?;
+        journal.append(Entry::new(Kind::Reopen, 0, journal.tail.cycle, payload))?;
         journal.anchor()?;
         Ok(journal)
     }
@@ -326,7 +326,10 @@ impl Journal {
             let payload = json!({ "ending": ending, "records_before": self.tail.seq, "head_before": self.tail.hash });
             self.append(Entry::new(Kind::End, mono_ns, cycle, payload))?;
         }
-        self.anchor()
+        let anchor = self.anchor()?;
+        // Everything is in the database then.
+        open::keep_the_log(&self.connection, false).map_err(JournalError::database(&self.folder))?;
+        Ok(anchor)
     }
 
     fn register(&mut self, artefact: Artefact, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {

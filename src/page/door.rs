@@ -21,6 +21,7 @@ use tokio::net::TcpListener;
 use tokio::task::AbortHandle;
 
 use super::guard::{self, Entrance, Guard, Peer};
+use super::sign_in::place;
 use super::view::{self, PageOf};
 use super::{assets, sign_in};
 
@@ -75,6 +76,8 @@ pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Rout
         let place = Place { connections: Arc::clone(&connections), number };
         let (of, task) = (peer.ip(), Arc::clone(&connections));
         let is_known: Arc<dyn Fn() + Send + Sync> = Arc::new(move || task.know(number));
+        // What it does to the list waits until it is on it.
+        let mut open = connections.open();
         let serving = tokio::spawn(async move {
             let _place = place;
             // A client that goes away or misbehaves is no concern of anybody else.
@@ -87,12 +90,12 @@ pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Rout
                 }
             }
         });
-        connections.add(number, of, serving.abort_handle());
+        open.add(number, of, serving.abort_handle());
     }
 }
 
-/// The connections of a page. One more than there is room for of those who are not let in ends the oldest of them, of the same address first: whoever
-/// opens many and says nothing keeps out nobody but himself.
+/// The connections of a page. One more than there is room for of those who are not let in ends the oldest of them, of the same address or network, or of
+/// that which has most: whoever opens many and says nothing keeps out nobody elsewhere, and nobody who has come in.
 #[derive(Default)]
 struct Connections(Mutex<Open>);
 
@@ -101,8 +104,6 @@ struct Open {
     /// In the order in which they came, those of strangers.
     strangers: Vec<(u64, IpAddr, AbortHandle)>,
     known: Vec<(u64, AbortHandle)>,
-    /// Those that ended, or were known, before they were added.
-    early: Vec<(u64, bool)>,
 }
 
 impl Connections {
@@ -110,58 +111,39 @@ impl Connections {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn add(&self, number: u64, from: IpAddr, serving: AbortHandle) {
-        let mut open = self.open();
-        let early: Vec<bool> =
-            open.early.extract_if(.., |(of, _)| *of == number).map(|(_, has_ended)| has_ended).collect();
-        if early.contains(&true) {
-            return;
-        }
-        if early.contains(&false) {
-            return open.know(number, serving);
-        }
-        open.strangers.push((number, from, serving));
-        let of_address = open.strangers.iter().filter(|(_, of, _)| *of == from).count();
-        let oldest = match of_address > STRANGERS_OF_ADDRESS {
-            true => open.strangers.iter().position(|(_, of, _)| *of == from),
-            false => (open.strangers.len() > STRANGERS).then_some(0),
-        };
-        if let Some(oldest) = oldest {
-            open.strangers.remove(oldest).2.abort();
-        }
-    }
-
     /// Whoever is at the other end has been let in.
     fn know(&self, number: u64) {
         let mut open = self.open();
-        if open.known.iter().any(|(of, _)| *of == number) {
-            return;
-        }
-        match open.strangers.iter().position(|(of, ..)| *of == number) {
-            Some(at) => {
-                let (_, _, serving) = open.strangers.remove(at);
-                open.know(number, serving);
+        if let Some(at) = open.strangers.iter().position(|(of, ..)| *of == number) {
+            let (_, _, serving) = open.strangers.remove(at);
+            open.known.push((number, serving));
+            if open.known.len() > KNOWN {
+                open.known.remove(0).1.abort();
             }
-            None => open.early.push((number, false)),
         }
     }
 
     fn end(&self, number: u64) {
         let mut open = self.open();
-        let before = open.strangers.len() + open.known.len();
         open.strangers.retain(|(of, ..)| *of != number);
         open.known.retain(|(of, _)| *of != number);
-        if open.strangers.len() + open.known.len() == before {
-            open.early.push((number, true));
-        }
     }
 }
 
 impl Open {
-    fn know(&mut self, number: u64, serving: AbortHandle) {
-        self.known.push((number, serving));
-        if self.known.len() > KNOWN {
-            self.known.remove(0).1.abort();
+    fn add(&mut self, number: u64, from: IpAddr, serving: AbortHandle) {
+        self.strangers.push((number, place(from), serving));
+        let count = |from: IpAddr| self.strangers.iter().filter(|(_, of, _)| *of == from).count();
+        let most = match count(place(from)) > STRANGERS_OF_ADDRESS {
+            true => Some(place(from)),
+            false if self.strangers.len() > STRANGERS => {
+                self.strangers.iter().map(|(_, of, _)| *of).max_by_key(|of| count(*of))
+            }
+            false => None,
+        };
+        let oldest = most.and_then(|from| self.strangers.iter().position(|(_, of, _)| *of == from));
+        if let Some(oldest) = oldest {
+            self.strangers.remove(oldest).2.abort();
         }
     }
 }

@@ -42,6 +42,9 @@ const WRONG_KEYS: u32 = 20;
 const TOLD: u32 = 10;
 const MINUTE: Duration = Duration::from_secs(60);
 
+/// The names of this computer for itself.
+const IS_LOOPBACK: [&str; 3] = ["localhost", "127.0.0.1", "[::1]"];
+
 /// What a page of this program may do in a browser: nothing from elsewhere, nothing within others.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; \
                       form-action 'self'; frame-ancestors 'none'; base-uri 'none'";
@@ -72,7 +75,7 @@ impl Entrance {
             // What browsers leave out.
             _ => (named, Some(if self.tls.is_some() { 443 } else { 80 })),
         };
-        let is_loopback = ["localhost", "127.0.0.1", "[::1]"].iter().any(|name| name.eq_ignore_ascii_case(host));
+        let is_loopback = IS_LOOPBACK.iter().any(|name| name.eq_ignore_ascii_case(host));
         let is_here = match &self.tls {
             Some(tls) => tls.is_for(host),
             None => is_loopback || named == self.address.to_string(),
@@ -242,7 +245,7 @@ impl Guard {
             (self.log)(&format!("{untold} more were refused in that minute"));
         }
         if told <= TOLD {
-            (self.log)(what);
+            (self.log)(&format!("refused {what}"));
         } else if told == TOLD + 1 {
             (self.log)("more was refused within the same minute: it is counted, and not told one by one");
         }
@@ -315,6 +318,9 @@ impl Session {
 pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
     let mut hosts = request.headers().get_all(HOST).iter();
     let host = hosts.next().and_then(|host| host.to_str().ok()).unwrap_or_default();
+    // Such a header holds for all ports of a name: other pages of this computer go without.
+    let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
+    let is_loopback = IS_LOOPBACK.iter().any(|known| known.eq_ignore_ascii_case(name));
     let mut response = if hosts.next().is_none() && guard.entrance.is_host(host) {
         next.run(request).await
     } else {
@@ -329,7 +335,7 @@ pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Re
     headers.insert(REFERRER_POLICY, HeaderValue::from_static("same-origin"));
     // What stands there now is of no use later, and who uses the computer next has no business with it.
     headers.entry(CACHE_CONTROL).or_insert(HeaderValue::from_static("no-store"));
-    if guard.entrance.tls.is_some() {
+    if guard.entrance.tls.is_some() && !is_loopback {
         headers.insert(STRICT_TRANSPORT_SECURITY, HeaderValue::from_static("max-age=31536000"));
     }
     response

@@ -1,5 +1,6 @@
 //! Signing in and out, where there are users: one password at a time, and of a stranger's guesses only the first few.
 
+use std::cmp::Reverse;
 use std::collections::HashMap;
 use std::net::{IpAddr, Ipv6Addr};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -11,7 +12,7 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Form};
 use serde::Deserialize;
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::spawn_blocking;
 
 use super::guard::{Guard, Peer, Rate, Session, foreign, foreign_origin, printable, random_word};
@@ -25,13 +26,14 @@ const LASTS: Duration = Duration::from_secs(12 * 3600);
 const MOST: usize = 256;
 /// Tries within a minute under one name from one place; more are not looked at. Others at that place sign in all the same.
 const TRIES: u32 = 10;
-/// Names and places of which the tries are counted; of one place only so many, the oldest forgotten first.
+/// Names and places of which the tries are counted; of one place only so many, those with the fewest tries forgotten first.
 const COUNTED: usize = 4096;
 const NAMES_OF_PLACE: usize = 64;
 /// Proofs that one place may have waiting: whoever else signs in is not kept behind its guesses.
 const WAITING_OF_PLACE: usize = 2;
 /// Longest time that somebody waits for the guesses of others.
 const WAITS: Duration = Duration::from_secs(5);
+const ASKED_EVERY: Duration = Duration::from_millis(20);
 
 /// Who has signed in, and who tries to.
 pub(crate) struct SignedIn {
@@ -82,13 +84,18 @@ impl SignedIn {
         tries.retain(|_, rate| !rate.is_over());
         let this = (place(from), name.to_owned());
         if !tries.contains_key(&this) {
-            let of_place: Vec<_> = tries.iter().filter(|((place, _), _)| *place == this.0).collect();
-            let oldest = of_place.iter().max_by_key(|(_, rate)| rate.age()).map(|(tried, _)| (*tried).clone());
-            if let Some(oldest) = oldest.filter(|_| of_place.len() >= NAMES_OF_PLACE) {
-                tries.remove(&oldest);
-            }
-            if tries.len() >= COUNTED {
-                return false;
+            // The one that was tried least goes: a name that somebody guesses at stays however many others are tried beside it.
+            let least = |of: &mut dyn Iterator<Item = (&(IpAddr, String), &Rate)>| {
+                of.min_by_key(|(_, rate)| (rate.so_far(), Reverse(rate.age()))).map(|(tried, _)| tried.clone())
+            };
+            let is_here = |(tried, _): &(&(IpAddr, String), &Rate)| tried.0 == this.0;
+            let forgotten = match tries.iter().filter(is_here).count() >= NAMES_OF_PLACE {
+                true => least(&mut tries.iter().filter(is_here)),
+                false if tries.len() >= COUNTED => least(&mut tries.iter()),
+                false => None,
+            };
+            if let Some(forgotten) = forgotten {
+                tries.remove(&forgotten);
             }
         }
         tries.entry(this).or_insert_with(Rate::new).count() <= TRIES
@@ -99,7 +106,18 @@ impl SignedIn {
         self.tries.lock().unwrap_or_else(PoisonError::into_inner).remove(&(place(from), name.to_owned()));
     }
 
-    /// Takes a place in the line of those whose passwords are looked at, until it is dropped; none where that place has its share.
+    /// Takes a place in the line of those whose passwords are looked at, until it is dropped; none where that place has its share for some seconds.
+    async fn wait_a_while(&self, from: IpAddr) -> Option<Waiting<'_>> {
+        let began = Instant::now();
+        loop {
+            match self.wait(from) {
+                None if began.elapsed() < WAITS => tokio::time::sleep(ASKED_EVERY).await,
+                waiting => return waiting,
+            }
+        }
+    }
+
+    /// The same, at once.
     fn wait(&self, from: IpAddr) -> Option<Waiting<'_>> {
         let place = place(from);
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
@@ -131,7 +149,7 @@ impl Drop for Waiting<'_> {
 }
 
 /// The place from which somebody tries: one who has an IPv6 network has all its addresses.
-fn place(from: IpAddr) -> IpAddr {
+pub(crate) fn place(from: IpAddr) -> IpAddr {
     match from.to_canonical() {
         IpAddr::V6(address) => IpAddr::V6(Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX))),
         address => address,
@@ -162,12 +180,20 @@ pub(crate) async fn sign_in(
         return refuse(StatusCode::FORBIDDEN, what, Text::SignInRefused);
     }
     let (who, name) = (printable(&given.name), given.name.trim().to_lowercase());
-    let waiting = guard.signed_in.wait(from);
-    if waiting.is_none() || !guard.signed_in.may_try(from, &name) {
+    if !guard.signed_in.may_try(from, &name) {
         let what = format!("one of too many tries to sign in within a minute, as {who}, from {from}");
         return refuse(StatusCode::TOO_MANY_REQUESTS, what, Text::TooManyTries);
     }
-    let Some(proven) = prove(&guard, given).await else {
+    let waiting = guard.signed_in.wait_a_while(from).await;
+    let turn = match &waiting {
+        Some(_) => turn(&guard).await,
+        None => None,
+    };
+    let Some(turn) = turn else {
+        let what = format!("a try to sign in whose turn did not come in time, as {who}, from {from}");
+        return refuse(StatusCode::SERVICE_UNAVAILABLE, what, Text::TooManyTries);
+    };
+    let Some(proven) = prove(&guard, turn, given).await else {
         let what = format!("a wrong name or password, {who}, from {from}");
         return refuse(StatusCode::UNAUTHORIZED, what, Text::SignInRefused);
     };
@@ -183,10 +209,14 @@ pub(crate) async fn sign_in(
     response
 }
 
-/// Sees whether a name and a password belong together, in its turn.
-async fn prove(guard: &Arc<Guard>, given: Credentials) -> Option<Proven> {
+/// Waits for the turn of a proof; none where it does not come in time.
+async fn turn(guard: &Arc<Guard>) -> Option<OwnedSemaphorePermit> {
     let turn = Arc::clone(&guard.signed_in.proving).acquire_owned();
-    let turn = tokio::time::timeout(WAITS, turn).await.ok()?.ok()?;
+    tokio::time::timeout(WAITS, turn).await.ok()?.ok()
+}
+
+/// Sees whether a name and a password belong together, in its turn.
+async fn prove(guard: &Arc<Guard>, turn: OwnedSemaphorePermit, given: Credentials) -> Option<Proven> {
     let guard = Arc::clone(guard);
     let proven = spawn_blocking(move || {
         let _turn = turn;

@@ -8,7 +8,8 @@ use serde_json::{Value, json};
 
 use crate::http::{Visitor, raw};
 use crate::program::{records_with, run};
-use crate::{Shown, serve};
+use crate::users::{PASSWORD, add};
+use crate::{Shown, serve, serve_with};
 
 fn remarks(shown: &Shown) -> Vec<String> {
     let all = records_with(&shown.folder, "remark");
@@ -128,11 +129,25 @@ fn a_request_for_another_host_is_refused_and_what_is_outside_of_the_runs_is_not_
     let (_page, url) = serve(home.path());
     let visitor = Visitor::with_key(&url);
     let cookies = &visitor.cookies;
-    for host in ["evil.example", "evil.example:80", "127.0.0.1", ""] {
+    let port = visitor.place.rsplit(':').next().unwrap();
+    for host in [
+        "evil.example",
+        "evil.example:80",
+        "127.0.0.1",
+        "",
+        &format!("127.0.0.1:+{port}"),
+        &format!("127.0.0.1:0{port}0"),
+    ] {
         let request = format!("GET /runs HTTP/1.1\r\nHost: {host}\r\nCookie: {cookies}\r\nConnection: close\r\n\r\n");
         assert_eq!(raw(&visitor.place, request.as_bytes()).status, 421, "{host}");
     }
-    let port = visitor.place.rsplit(':').next().unwrap();
+    // One of two hosts is none.
+    let request = format!(
+        "GET /runs HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nHost: 127.0.0.1:{port}\r\nCookie: {cookies}\r\nConnection: close\r\n\r\n"
+    );
+    assert_ne!(raw(&visitor.place, request.as_bytes()).status, 200);
+    let shown = visitor.get("/runs");
+    assert_eq!(shown.header("cache-control"), ["no-store"], "{shown:?}");
     let request =
         format!("GET /runs HTTP/1.1\r\nHost: LocalHost:{port}\r\nCookie: {cookies}\r\nConnection: close\r\n\r\n");
     assert_eq!(raw(&visitor.place, request.as_bytes()).status, 200);
@@ -161,6 +176,33 @@ fn clients_that_never_finish_a_request_do_not_keep_others_waiting() {
         stream.write_all(b"GET /runs HTTP/1.1\r\nHost: ").unwrap();
     }
     assert_eq!(visitor.get("/runs").status, 200);
+    drop(slow);
+}
+
+/// As many as the page once had room for, each with its header whole and its body never.
+#[test]
+fn orders_that_are_never_finished_keep_nobody_out() {
+    let home = tempfile::tempdir().unwrap();
+    std::fs::create_dir(home.path().join("runs")).unwrap();
+    assert_eq!(add(home.path(), "operator", "operator", PASSWORD).0, 0);
+    let (_page, url) = serve_with(home.path(), &["--listen", "127.0.0.1:0", "--users", "users.toml"]);
+    let before = Visitor::signed_in(&url, "operator", PASSWORD).expect("signed in");
+    let unfinished = format!(
+        "POST /sign-in HTTP/1.1\r\nHost: {0}\r\nOrigin: http://{0}\r\nContent-Type: application/x-www-form-urlencoded\r\n\
+         Content-Length: 100\r\n\r\nname=",
+        before.place
+    );
+    let slow: Vec<_> = (0..512)
+        .map(|_| {
+            let mut stream = TcpStream::connect(&before.place).unwrap();
+            // The page may have given it up already.
+            let _ = stream.write_all(unfinished.as_bytes());
+            stream
+        })
+        .collect();
+    assert_eq!(before.get("/runs").status, 200);
+    let after = Visitor::signed_in(&url, "operator", PASSWORD).expect("signed in beside them");
+    assert_eq!(after.get("/runs").status, 200);
     drop(slow);
 }
 

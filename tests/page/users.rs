@@ -160,12 +160,20 @@ fn a_thousand_wrong_passwords_let_nobody_in_are_on_record_and_leave_the_cell_alo
     assert!(tries[..10].iter().all(|status| *status == 401), "{:?}", &tries[..10]);
     assert!(tries[10..].iter().filter(|status| **status == 429).count() > 900, "{tries:?}");
     assert!(tries.iter().all(|status| [401, 429].contains(status)), "{tries:?}");
+    // Others at that place sign in, which is told where the page is served.
+    assert!(Visitor::signed_in(&shown.url, "engineer", PASSWORD).is_some());
     // Who has signed in stays in, and gives orders.
     assert!(signed_in.order(&shown.id, &json!({ "order": "stop", "reason": "" })).1);
     assert_eq!(shown.run.end().0, 1);
     let remarks = records_with(&shown.folder, "remark");
     let wrong = remarks.iter().filter(|record| record["remark"].as_str().unwrap().contains("a wrong name or password"));
     assert!(wrong.count() > 0, "{remarks:?}");
+    shown.page.interrupt();
+    let (_, told) = shown.page.end();
+    let came_in = told.lines().filter(|line| line.starts_with("page: engineer (engineer) signed in at the page, from"));
+    assert_eq!(came_in.count(), 1, "{told}");
+    assert!(told.contains("page: refused a wrong name or password, operator, from"), "{told}");
+    assert!(told.contains("page: more was refused within the same minute"), "{told}");
 }
 
 #[test]
@@ -235,6 +243,7 @@ fn another_computer_comes_in_by_tls_under_the_names_of_the_certificate_alone() {
     assert_eq!(at("127.0.0.1").get("/").status, 401, "the address that the certificate names too");
     let cookie = at("cell-2.example").try_to_sign_in("A. Smith", PASSWORD);
     assert!(cookie.header("set-cookie")[0].contains("; Secure"), "{cookie:?}");
+    assert_eq!(cookie.header("strict-transport-security"), ["max-age=31536000"]);
     // A name that leads here, and is none of the certificate's; another port; no encryption.
     for host in [format!("evil.example:{port}"), "cell-2.example:1".into(), format!("localhost:{port}")] {
         let request = format!("GET / HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n");

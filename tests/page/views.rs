@@ -66,6 +66,35 @@ fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
     assert_eq!(visitor.get(&format!("/runs/{}/cycles/9/map", ids[0])).status, 404);
 }
 
+/// The name of a run in an address, as a browser escapes it.
+fn escaped(id: &str) -> String {
+    id.bytes().map(|byte| format!("%{byte:02X}")).collect()
+}
+
+#[test]
+fn a_run_with_signs_of_addresses_in_its_name_is_shown_and_takes_orders() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = home.path().join("lens #3 100%41? & <half>.toml");
+    std::fs::rename(small_recipe(home.path(), 20.0), &recipe).unwrap();
+    let mut shown = Shown::of(home.path(), &recipe);
+    shown.run.line("grinding", |line| line.contains("grinding"));
+    let visitor = shown.visitor();
+    let list = visitor.get("/runs").text();
+    let written: Vec<&str> = list.split("href=\"").skip(1).map(|rest| rest.split('"').next().unwrap()).collect();
+    let address = written.iter().find(|address| address.starts_with("/runs/lens")).expect(&list);
+    for path in [(*address).to_owned(), format!("/runs/{}", escaped(&shown.id))] {
+        let answer = visitor.get(&path);
+        assert!(answer.status == 200 && answer.text().contains("data-run=\"lens #3"), "{path}: {answer:?}");
+    }
+    assert_eq!(visitor.get("/").header("location"), [*address]);
+    let held =
+        visitor.order(address.trim_start_matches("/runs/"), &serde_json::json!({ "order": "hold", "reason": "" }));
+    assert!(held.1, "{held:?}");
+    let aborted = visitor.order(&escaped(&shown.id), &serde_json::json!({ "order": "abort", "reason": "" }));
+    assert!(aborted.1, "{aborted:?}");
+    assert_eq!(shown.run.end().0, 3);
+}
+
 #[test]
 fn a_page_for_other_computers_and_one_on_a_port_in_use_are_refused() {
     let home = tempfile::tempdir().unwrap();

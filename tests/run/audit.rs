@@ -572,3 +572,73 @@ fn the_picture_names_every_state_once_and_is_well_formed() {
     let empty = state_picture(&[]);
     assert_eq!(empty.matches("<path").count(), 6);
 }
+
+/// A folder of signed runs, as many as there are parts, in the order of their numbers.
+fn runs_of(home: &Path, key: &Path, parts: &[&str]) -> Vec<PathBuf> {
+    let recipe = small_recipe(home, 1e5).display().to_string();
+    for part in parts {
+        let (code, said, errors) = with_key(home, key, &["run", &recipe, "--cell", "sim", "--part", part]);
+        assert_eq!(code, 0, "{said}{errors}");
+    }
+    let number = |run: &PathBuf| {
+        let first = Reader::open(run).unwrap().records(0).next().unwrap().unwrap().value();
+        first["content"]["number"].as_u64().unwrap()
+    };
+    let mut runs: Vec<PathBuf> = fs::read_dir(home.join("runs")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    runs.sort_by_key(number);
+    assert_eq!(runs.iter().map(number).collect::<Vec<_>>(), (1..=parts.len() as u64).collect::<Vec<_>>());
+    runs
+}
+
+#[test]
+fn a_run_that_is_removed_renamed_or_exchanged_is_missed_in_its_folder() {
+    let [home, elsewhere] = [(), ()].map(|()| tempfile::tempdir().unwrap());
+    let (home, elsewhere) = (home.path(), elsewhere.path());
+    let key = home.join("audit.key");
+    assert_eq!(with_key(home, &key, &["audit", "key"]).0, 0);
+    let runs = runs_of(home, &key, &["SN-1", "SN-2", "SN-3"]);
+    let flaws = || -> Vec<String> {
+        let (code, told, errors) = run(&["audit", "verify", "runs", "--json"], home);
+        let told: Value = serde_json::from_str(&told).unwrap_or_else(|error| panic!("{error}: {told}{errors}"));
+        let flaws: Vec<String> = serde_json::from_value(told["flaws"].clone()).unwrap();
+        assert_eq!(code, i32::from(!flaws.is_empty()), "{told}{errors}");
+        flaws
+    };
+    assert_eq!(flaws(), Vec::<String>::new(), "each names the signed one before");
+    let aside = home.join("aside");
+    // Removed.
+    fs::rename(&runs[1], &aside).unwrap();
+    assert!(flaws().iter().any(|flaw| flaw.contains("number 2 is missing")), "{:?}", flaws());
+    // Another sound one of its number in its place, signed with the same key.
+    let others = runs_of(elsewhere, &key, &["SN-1", "SN-2"]);
+    let in_its_place = home.join("runs").join("another");
+    for (from, to) in [(&others[1], home.join("runs").join(others[1].file_name().unwrap())), (&others[1], in_its_place)]
+    {
+        fs::rename(from, &to).unwrap();
+        let found = flaws();
+        assert!(
+            found.iter().any(|flaw| flaw.contains("it stands before") || flaw.contains("it is not the run")),
+            "{found:?}"
+        );
+        fs::rename(&to, from).unwrap();
+    }
+    // Renamed.
+    fs::rename(&aside, home.join("runs").join("renamed")).unwrap();
+    assert!(flaws().iter().any(|flaw| flaw.contains("its folder was renamed")), "{:?}", flaws());
+    fs::rename(home.join("runs").join("renamed"), &runs[1]).unwrap();
+    assert_eq!(flaws(), Vec::<String>::new());
+    // An anchor is of one run.
+    assert_eq!(run(&["audit", "verify", "runs", "--anchor", "runs"], home).0, 2);
+    // Held by anybody, the folder keeps nobody from a run.
+    let held = fs::File::open(home.join("runs")).unwrap();
+    held.lock().unwrap();
+    let recipe = small_recipe(home, 1e5).display().to_string();
+    assert_eq!(with_key(home, &key, &["run", &recipe, "--cell", "sim", "--part", "SN-4"]).0, 0);
+    held.unlock().unwrap();
+    // A missing anchor is a flaw, whoever holds the lock of the run.
+    let lock = fs::File::options().read(true).write(true).open(runs[0].join(".lock")).unwrap();
+    lock.lock().unwrap();
+    fs::rename(runs[0].join("journal.anchor"), &aside).unwrap();
+    assert!(flaws().iter().any(|flaw| flaw.contains("journal.anchor is missing")), "{:?}", flaws());
+    lock.unlock().unwrap();
+}

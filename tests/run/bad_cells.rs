@@ -48,6 +48,23 @@ fn a_file_stands_where_the_runs_should_be() {
 }
 
 #[test]
+fn a_recipe_that_needs_the_temperature_is_refused_over_a_wire_that_tells_none() {
+    let home = tempfile::tempdir().unwrap();
+    let cell = root().join("config/ippdme.toml").display().to_string();
+    let part = ("[part]", "[part]\nexpansion_um_m_k = 7.1");
+    let measure = ("[measure]", "[measure]\ntemperature_c = [19.0, 21.0]");
+    for (key, change) in [("part.expansion_um_m_k", part), ("measure.temperature_c", measure)] {
+        let recipe = home.path().join("warm.toml");
+        fs::write(&recipe, changed("recipes/freeform-mirror.toml", &[change])).unwrap();
+        let (code, _, errors) = in_time(&["check", recipe.to_str().unwrap(), &cell], home.path());
+        let (run_code, _, run_errors) = in_time(&["run", recipe.to_str().unwrap(), "--cell", &cell], home.path());
+        assert_eq!(run_code, 2, "{run_errors}");
+        assert!(run_errors.contains(key) && run_errors.contains("tells none"), "{run_errors}");
+        println!("check alone: {code} {errors}");
+    }
+}
+
+#[test]
 fn runs_that_begin_in_one_second_have_folders_of_their_own() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 1e4);

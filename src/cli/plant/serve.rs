@@ -47,7 +47,7 @@ pub(super) fn serve(arguments: &Arguments) -> Result<Outcome, Failure> {
             Err(error) => return Err(error),
         }
         let (listener, entrance) = door.open(*listen).await?;
-        let log = Box::new(|what: &str| eprintln!("page: refused {what}"));
+        let log = Box::new(|what: &str| eprintln!("page: {what}"));
         let door =
             PageDoor::new(entrance, PageOf::Plant, log).map_err(|source| Failure::Page { address: *listen, source })?;
         super::super::print(&format!("page     {}\n", door.url()))?;

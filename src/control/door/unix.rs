@@ -78,7 +78,11 @@ impl Door {
 impl Mark {
     /// Whether the socket still lies where it was made.
     pub(crate) fn is_in_place(&self) -> bool {
-        identity(&self.path).is_ok_and(|identity| identity == self.identity)
+        match identity(&self.path) {
+            Ok(identity) => identity == self.identity,
+            // A folder that cannot be looked into just now is no folder that is gone.
+            Err(error) => error.kind() != io::ErrorKind::NotFound,
+        }
     }
 
     /// Makes the socket again, and the folder around it.
@@ -150,17 +154,18 @@ fn path_in(folder: &Path) -> PathBuf {
 
 /// Whether somebody listens behind the door of a run folder.
 pub(crate) fn is_open(folder: &Path) -> bool {
-    std::os::unix::net::UnixStream::connect(path_in(folder)).is_ok()
+    // One that has no room for another caller is there all the same.
+    connected(&path_in(folder)).map_or_else(|error| error.kind() == io::ErrorKind::TimedOut, |_| true)
 }
 
 /// Whether somebody whom one may believe listens behind a door that lies in no run folder.
 pub(crate) fn is_open_at(place: &Path) -> bool {
-    connected_at(place).is_ok()
+    connected_at(place).map_or_else(|error| error.kind() == io::ErrorKind::TimedOut, |_| true)
 }
 
 /// Says a line to the cell of a run folder, and waits for the line that it answers.
 pub(crate) fn ask(folder: &Path, line: &[u8], patience: Duration) -> io::Result<String> {
-    exchanged(std::os::unix::net::UnixStream::connect(path_in(folder))?, line, patience)
+    exchanged(connected(&path_in(folder))?, line, patience)
 }
 
 /// Says a line to the cell behind a door that lies in no run folder, and waits for the line that it answers.
@@ -173,7 +178,21 @@ fn connected_at(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     if !is_trusted(std::fs::symlink_metadata(place)?.uid()) {
         return Err(io::Error::new(io::ErrorKind::PermissionDenied, "the socket belongs to another user"));
     }
-    std::os::unix::net::UnixStream::connect(place)
+    connected(place)
+}
+
+/// Connects without waiting: where as many wait at the door as may, whoever is behind it does not answer.
+fn connected(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
+    use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
+    match connect(&socket, &SocketAddrUnix::new(place)?) {
+        Err(rustix::io::Errno::AGAIN) => return Err(io::ErrorKind::TimedOut.into()),
+        connected => connected?,
+    }
+    let stream = std::os::unix::net::UnixStream::from(socket);
+    stream.set_nonblocking(false)?;
+    Ok(stream)
 }
 
 fn exchanged(mut stream: std::os::unix::net::UnixStream, line: &[u8], patience: Duration) -> io::Result<String> {

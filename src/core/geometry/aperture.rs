@@ -3,6 +3,8 @@
 //! An aperture is a closed set in the (x, y) plane of the surface's own frame: its boundary belongs to it. Lengths are
 //! millimetres. What is read from outside is checked once by [`Aperture::validate`]; the other functions rely on it.
 
+use std::f64::consts::PI;
+
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -199,6 +201,25 @@ impl Aperture {
         }
     }
 
+    /// Returns the area of the aperture.
+    ///
+    /// Units: square millimetres.
+    pub fn area_mm2(&self) -> f64 {
+        match self {
+            Self::Rectangle { width_mm, height_mm, .. } => width_mm * height_mm,
+            Self::Circle { radius_mm, .. } => PI * radius_mm * radius_mm,
+            Self::Ellipse { semi_axes_mm: [a, b], .. } => PI * a * b,
+            Self::Annulus { inner_radius_mm: inner, outer_radius_mm: outer, .. } => {
+                PI * (outer - inner) * (outer + inner)
+            }
+            // From one corner, so that a place far from the origin costs no digits.
+            Self::Polygon { corners_mm } => {
+                let of_edge = |[p, q]: [[f64; 2]; 2]| 0.5 * orient2d(corners_mm[0], p, q);
+                edges(corners_mm).map(of_edge).sum::<f64>().abs()
+            }
+        }
+    }
+
     /// Returns places along the whole boundary, at least `count` in all; corners are among them.
     ///
     /// Units: millimetres. On a round boundary a place may lie outside by rounding.
@@ -385,6 +406,17 @@ mod tests {
             Aperture::Annulus { centre_mm: [0.0, 1.0], inner_radius_mm: 1.0, outer_radius_mm: 2.5 },
             l_shape(),
         ]
+    }
+
+    #[test]
+    fn areas_by_hand() {
+        let areas: Vec<f64> = all_kinds().iter().map(Aperture::area_mm2).collect();
+        let expected = [3.0, 4.0 * PI, 2.0 * PI, 5.25 * PI, 12.0];
+        assert!(areas.iter().zip(expected).all(|(area, expected)| (area - expected).abs() < 1e-12), "{areas:?}");
+        // The other way around, and a kilometre away.
+        let Aperture::Polygon { corners_mm } = l_shape() else { panic!() };
+        let corners_mm = corners_mm.into_iter().rev().map(|[x, y]| [x + 1e6, y - 1e6]).collect();
+        assert_eq!(Aperture::Polygon { corners_mm }.area_mm2(), 12.0);
     }
 
     #[test]

@@ -159,6 +159,13 @@ struct Accepted {
 /// What a judgement of the folder comes to: an answer, or only words.
 type Judgement = Result<Option<Accepted>, ExchangeError>;
 
+/// A judgement, with words and the files as they were.
+struct Judged {
+    judgement: Judgement,
+    notes: Vec<String>,
+    of: Vec<WatchedFile>,
+}
+
 /// The files of a station: its points, and the reference points as it sees them.
 type Pair<'f> = (&'f WatchedFile, &'f WatchedFile);
 
@@ -198,8 +205,8 @@ impl CmmFolders {
         Ok(expected)
     }
 
-    /// Returns what some files come to, where that is known by now; begins to read them, unless others are still being read.
-    fn judged_by_now(&mut self, expected: &Expected, found: &[WatchedFile]) -> Option<(Judgement, Vec<String>)> {
+    /// Returns what some files come to, and as they were then, where that is known by now; begins to read them, unless others are still being read.
+    fn judged_by_now(&mut self, expected: &Expected, found: &[WatchedFile]) -> Option<Judged> {
         let job = expected.stored.ticket.job();
         if self.judging.is_none() {
             let (judge, expected, files) = (Arc::clone(&self.judge), expected.clone(), found.to_owned());
@@ -212,16 +219,20 @@ impl CmmFolders {
             });
             self.judging = Some(Judging { job, found: found.to_owned(), judged });
         }
-        let Judging { job: asked, found: of, judged } = self.judging.as_ref()?;
-        let is_of_these = *asked == job && *of == found;
-        let judged = judged.recv_timeout(READ_WITHIN);
+        let judged = self.judging.as_ref()?.judged.recv_timeout(READ_WITHIN);
         if matches!(judged, Err(mpsc::RecvTimeoutError::Timeout)) {
             return None;
         }
-        self.judging = None;
+        let Judging { job: asked, found: of, .. } = self.judging.take()?;
         let broken = || (Err(ExchangeError::NotRead { folder: self.judge.settings.inbox.clone() }), Vec::new());
-        // The files have changed meanwhile: the next look reads them anew.
-        is_of_these.then(|| judged.unwrap_or_else(|_| broken()))
+        let (judgement, notes) = judged.unwrap_or_else(|_| broken());
+        // Other files may have come or changed meanwhile, as a log does again and again; those of an answer have not.
+        let stands = |name: &str| of.iter().find(|file| file.name == name).is_some_and(|file| found.contains(file));
+        let holds = match &judgement {
+            Ok(Some(accepted)) => accepted.files.iter().all(|(name, _)| stands(name)),
+            _ => true,
+        };
+        (asked == job && holds).then_some(Judged { judgement, notes, of })
     }
 }
 
@@ -549,9 +560,10 @@ impl Exchange for CmmFolders {
         if let Some((_, look)) = self.judged.as_ref().filter(|(before, _)| *before == found) {
             return Ok(look.clone());
         }
-        let Some((judgement, mut notes)) = self.judged_by_now(&expected, &found) else {
-            let names = found.iter().map(|file| file.name.as_str()).collect::<Vec<_>>().join(", ");
-            return Ok(Look { begun: false, answer: None, notes: vec![format!("reading {names}")] });
+        let Some(Judged { judgement, mut notes, of }) = self.judged_by_now(&expected, &found) else {
+            let names = || found.iter().map(|file| file.name.as_str()).collect::<Vec<_>>().join(", ");
+            let reading = || Look { begun: false, answer: None, notes: vec![format!("reading {}", names())] };
+            return Ok(self.judged.as_ref().map_or_else(reading, |(_, before)| before.clone()));
         };
         let answer = match judgement {
             Ok(None) => None,
@@ -568,7 +580,7 @@ impl Exchange for CmmFolders {
             }
         };
         let look = Look { begun: answer.is_some(), answer, notes };
-        self.judged = Some((found, look.clone()));
+        self.judged = Some((of, look.clone()));
         Ok(look)
     }
 }

@@ -227,6 +227,7 @@ impl Wired for HitLinesWire {
     type Cmm = HitLinesCmm;
     type Grinder = NoMachine;
     const BY_PERSON: bool = true;
+    const TELLS_TEMPERATURE: bool = false;
 
     fn check(&self, place: &Place<'_>, document: &mut Document) {
         if place.table == "grinder" {

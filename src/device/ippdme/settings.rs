@@ -133,6 +133,7 @@ impl IppdmeSettings {
 impl Wired for IppdmeWire {
     type Cmm = IppdmeCmm;
     type Grinder = NoMachine;
+    const TELLS_TEMPERATURE: bool = false;
 
     fn check(&self, place: &Place<'_>, document: &mut Document) {
         if place.table == "grinder" {

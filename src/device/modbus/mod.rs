@@ -32,6 +32,7 @@ use ahead::{Ahead, Misses};
 #[cfg(fuzzing)]
 pub use any_registers::any_registers;
 use codec::{CommandFrame, Payload, RecordFlaw, crc32};
+use link::Ask;
 pub(crate) use link::OfThisComputer;
 pub use link::{Dial, Dialled, LineStream, Link, LinkFigures};
 pub use settings::{
@@ -228,7 +229,6 @@ impl ModbusMachine {
             boot_id: block.u32(34),
         };
         self.check_alive(&block)?;
-        range::of_status(&machine, block.temperature_c, block.progress)?;
         Ok(block)
     }
 
@@ -260,6 +260,8 @@ impl ModbusMachine {
         for k in 0..self.signals.len() {
             let reading = self.signal(k).await?;
             status.signals.push(reading);
+            // What is slow to tell does not make the machine believe that its client is gone.
+            self.beat().await?;
         }
         Ok(status)
     }
@@ -276,7 +278,8 @@ impl ModbusMachine {
     /// Reads a signal; one that the machine does not have, or that reads as no number, has no value and says why.
     async fn signal(&mut self, k: usize) -> Result<SignalValue, DeviceError> {
         let signal = self.signals[k].clone();
-        let (value, cause) = match self.unit.read("signal", signal.address, signal.kind.registers()).await {
+        let ask = Ask::Read { address: signal.address, count: signal.kind.registers() };
+        let (value, cause) = match self.unit.few_tries("signal", signal.address, ask).await {
             Err(error @ DeviceError::Exception { .. }) => (None, Some(error.to_string())),
             words => {
                 let mut words = words?;
@@ -466,7 +469,7 @@ impl ModbusMachine {
     async fn abort(&mut self) -> Result<Block, DeviceError> {
         self.unit.link.hurry();
         if self.unit.identity().is_none() {
-            self.unit.meet().await?;
+            self.unit.meet_within(Duration::ZERO).await?;
         }
         match self.simply(Command::Abort).await {
             // Somebody else has counted further: what counts is where it led, and else an abort is worth going past them.
@@ -855,6 +858,7 @@ struct Block {
 impl From<&Block> for Status {
     fn from(block: &Block) -> Self {
         let good = |bit: u16| Some(block.interlocks & (1 << bit) != 0);
+        let (temperature_c, progress, signals) = range::of_status(block.temperature_c, block.progress);
         Self {
             state: block.state,
             job: block.job,
@@ -864,10 +868,10 @@ impl From<&Block> for Status {
             supplies: good(3),
             automatic: Some(block.automatic),
             fault: Some(block.fault),
-            progress: Some(block.progress),
-            temperature_c: block.temperature_c,
+            progress,
+            temperature_c,
             boot_id: Some(block.boot_id),
-            signals: Vec::new(),
+            signals,
         }
     }
 }

@@ -25,8 +25,8 @@ const SIMULATION: u16 = 1;
 const GIVES_AHEAD: u16 = 2;
 /// A machine that says it is busy is asked again after this.
 const BUSY_PAUSE: Duration = Duration::from_millis(50);
-/// A machine that is busy for so long when it is met is given up.
-const BUSY_WHEN_MET: Duration = Duration::from_secs(20);
+/// A machine that is busy for so long when it is met is given up: before the cell gives up waiting for it, so that what it said is told.
+const BUSY_WHEN_MET: Duration = Duration::from_secs(15);
 /// The sentinels that prove the order of words.
 const SENTINEL_WHOLE: u32 = 0x1234_5678;
 const SENTINEL_REAL: f64 = -2.5e-7;
@@ -88,6 +88,11 @@ impl Unit {
 
     /// Forgets who was there and proves who is there now.
     pub(super) async fn meet(&mut self) -> Result<Identity, DeviceError> {
+        self.meet_within(BUSY_WHEN_MET).await
+    }
+
+    /// As [`Self::meet`], and a machine whose program is still starting has so long.
+    pub(super) async fn meet_within(&mut self, busy: Duration) -> Result<Identity, DeviceError> {
         self.identity = None;
         self.trusted = None;
         let began = Instant::now();
@@ -95,7 +100,7 @@ impl Unit {
             match self.prove().await {
                 Ok(_) => break,
                 // Its program may still be starting: it is there, and says so.
-                Err(error) if is_starting(&error) && began.elapsed() < BUSY_WHEN_MET => self.ask_again(&error).await,
+                Err(error) if is_starting(&error) && began.elapsed() < busy => self.ask_again(&error).await,
                 Err(error) if self.gives_up(&error, tries, began) => return Err(error),
                 Err(error) => self.ask_again(&error).await,
             }
@@ -161,12 +166,26 @@ impl Unit {
         if self.identity.is_none() {
             return Err(DeviceError::NotConnected { machine: self.name.clone(), what });
         }
+        self.tried(what, address, ask, false).await
+    }
+
+    /// Asks a few times, also of a machine that says that it is busy: for what is asked between two looks.
+    pub(super) async fn few_tries(
+        &mut self,
+        what: &'static str,
+        address: u16,
+        ask: Ask,
+    ) -> Result<Vec<u16>, DeviceError> {
+        self.tried(what, address, ask, true).await
+    }
+
+    async fn tried(&mut self, what: &'static str, address: u16, ask: Ask, few: bool) -> Result<Vec<u16>, DeviceError> {
         let began = Instant::now();
         let mut tries = 0;
         loop {
             match self.attempt(what, address, &ask).await {
                 Ok(words) => return Ok(words),
-                Err(error) if self.gives_up(&error, tries, began) => return Err(error),
+                Err(error) if self.gives_up(&error, tries, began) || few && tries >= self.retries => return Err(error),
                 Err(error) => self.ask_again(&error).await,
             }
             tries += 1;

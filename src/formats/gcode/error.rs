@@ -25,7 +25,7 @@ pub enum GcodeError {
     )]
     Large { axis: char, value_mm: f64, number: u64, largest_mm: f64 },
     #[error(
-        "of the feed of {feed_mm_min} mm/min of move {number} nothing is left with {decimals} decimals (numbers.feed_decimals); raise          grinding.feed_mm_min"
+        "of the feed of {feed_mm_min} mm/min of move {number} nothing is left with {decimals} decimals (numbers.feed_decimals); raise grinding.feed_mm_min"
     )]
     Slow { feed_mm_min: f64, decimals: u8, number: u64 },
     #[error("{found} moves came where {expected} were announced; please report it with the files that led to it")]
