@@ -49,6 +49,10 @@ impl Cell {
 
     /// Tells why an event cannot belong to what the cell is doing, whatever its state.
     fn foreign(&self, event: &Event) -> Option<String> {
+        // A STOP waits for no record, and comes to a machine before the preparation of this cycle: it stands, with the job of the one before.
+        if matches!((self.state, event), (Stopping, Event::Ended { device, .. }) if self.stopping == Some(*device)) {
+            return None;
+        }
         let cycle = event.cycle().filter(|cycle| *cycle != self.cycle);
         cycle.map(|cycle| format!("it belongs to cycle {cycle}, and this is cycle {}", self.cycle))
     }

@@ -46,6 +46,7 @@ const SAMPLE_BY_OTHER_WIRES: u64 = 10;
 
 const SAMPLE_OF_FORGETFUL: u64 = 24;
 const SAMPLE_OF_FULL_DISKS: u64 = 24;
+const KEPT_OF_FULL_DISKS: &[u64] = &[3_000_338];
 /// One for each register of the two blocks.
 const SAMPLE_OF_LIARS: u64 = 104;
 
@@ -125,7 +126,9 @@ fn nor_one_in_which_a_machine_forgets_its_job() {
 /// A disk that is full for a while: the cell is held meanwhile, waits for no answer to what it has not asked, and goes on after.
 #[test]
 fn nor_one_in_which_the_disk_is_full_for_a_while() {
-    let seeds = (0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_FULL_DISKS)).map(|k| FULL_DISK + k);
+    // A stop that overtook the preparation of a cycle was not seen to be done.
+    let seeds = KEPT_OF_FULL_DISKS.iter().copied();
+    let seeds = seeds.chain((0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_FULL_DISKS)).map(|k| FULL_DISK + k));
     let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
     let began = std::time::Instant::now();
     let tally = run_all(&schedules);

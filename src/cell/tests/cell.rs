@@ -1163,6 +1163,25 @@ fn a_machine_that_moves_over_a_line_that_fails_again_and_again_is_held_or_aborte
 }
 
 #[test]
+fn a_stop_that_overtakes_the_preparation_of_a_cycle_ends_with_the_job_of_the_one_before() {
+    let device = Device::Grinder;
+    let mut run = Run::new(plan(), |_| figures(30.0, 6.0));
+    run.start().until(State::Execute(Phase::Measure(JobStep::Run)));
+    run.until(State::Execute(Phase::Grind(JobStep::Prepare))).waiting.clear();
+    let cycle = run.cell.cycle();
+    assert!(cycle > 1);
+    assert_eq!(run.send(stop()).last(), Some(&Command::StopMachine { device }));
+    let ended = |device| Event::Ended { device, cycle: cycle - 1, result: JobResult::Stopped };
+    assert!(
+        matches!(run.send(ended(Device::Cmm))[..], [Command::Refuse { .. }]),
+        "the other machine says nothing of it"
+    );
+    assert_eq!(run.send(ended(device)).last(), Some(&Command::Acknowledge { device }));
+    run.send(Event::Acknowledged { device });
+    assert_eq!(run.cell.state(), State::Stopped);
+}
+
+#[test]
 fn a_command_that_was_withdrawn_before_the_stop_does_not_end_it() {
     let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
     run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
