@@ -49,7 +49,7 @@ impl Cell {
         }
     }
 
-    /// Notes how far the cell has come: what failed before that is over.
+    /// Notes how far the cell has come; failures before that are forgotten.
     pub(super) fn note_place(&mut self) {
         let Some(phase) = self.state.phase() else { return };
         let place = (self.cycle, phase.place());
@@ -61,7 +61,7 @@ impl Cell {
         }
     }
 
-    /// What failed of a machine before is over.
+    /// Forgets the failures of a machine: it has got further.
     fn succeeds(&mut self, device: Device) {
         let was_told = std::mem::take(&mut self.vain[device as usize]).told;
         if was_told && !self.vain.iter().any(|vain| vain.told) {
@@ -364,7 +364,7 @@ impl Cell {
         }
         self.raise(AlarmId::MachineRefused, &format!("{device}, {what}: {why}"));
         self.keeps[device as usize] = what == Asked::Acknowledge;
-        // What a person called over is not: it is asked once more what became of it.
+        // The machine still has the job that a person called over: it is asked once more.
         let still_there = what == Asked::Discard && phase == Phase::of(device, JobStep::Discard);
         self.go(Held(if still_there { Phase::of(device, JobStep::Reconcile) } else { restart_of(phase) }));
     }
@@ -680,7 +680,7 @@ impl Cell {
     pub(super) fn not_on_record(&mut self, phase: Phase) {
         let runs = matches!(phase.job(), Some((_, JobStep::Run)));
         match self.state {
-            // What holds is given whether it is on record or not.
+            // A HOLD is given whether it is on record or not.
             Execute(_) | Holding(_) | Suspending(_) if runs => {}
             // That a START was not given is told as a refusal; without one it may have moved the machine.
             _ if matches!(phase.job(), Some((_, JobStep::Start))) => {}
@@ -811,7 +811,7 @@ impl Cell {
         let fails_again = self.fails_again(device);
         // The cell does without a machine that it does not need.
         let is_vain = fails_again && needed;
-        // What is known to fail again and again is not told each time anew.
+        // A failure that was told as one that comes again and again is not told each time.
         let was_told = self.vain[device as usize].told && (!needed || self.raised.contains_key(&AlarmId::FailsAgain));
         if !(fails_again && was_told) {
             self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));

@@ -40,7 +40,7 @@ pub(super) struct Known {
     pub(super) astray: bool,
 }
 
-/// What has been tried in vain.
+/// The failures of a machine in a row, without getting any further.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Vain {
     pub(super) failures: u32,
@@ -94,7 +94,7 @@ pub struct Cell {
     pub(super) still: bool,
     /// How far the cell has come: the cycle, and the place in it.
     pub(super) furthest: (u32, u8),
-    /// What failed of each machine in a row, without getting any further.
+    /// The failures of each machine.
     pub(super) vain: [Vain; 2],
     pub(super) commands: Vec<Command>,
 }

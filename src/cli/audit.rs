@@ -215,7 +215,7 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
 /// Returns whether a sound run is whole or still under way, or what it lacks.
 pub(super) fn is_whole(verified: &Verified, keys: &[PublicKey]) -> Result<bool, &'static str> {
     match verified {
-        // Whoever holds the lock: with a key at hand, what is not signed by it is not believed.
+        // With a key at hand an end that it has not signed is not believed, whoever holds the lock.
         verified if verified.lacks_last_seal() && (!verified.under_way || !keys.is_empty()) => Err(
             "its end is not signed, and the run names a key: who has no key may have written what follows the last seal",
         ),

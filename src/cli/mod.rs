@@ -117,7 +117,7 @@ const EXIT_CODES: &str = "Exit codes: 0 accepted; 1 finished, not in tolerance; 
 enum Outcome {
     Accepted,
     NotInTolerance,
-    /// What was looked at goes on, and its end is still to come.
+    /// The run that was looked at goes on, and its end is still to come.
     UnderWay,
 }
 

@@ -93,15 +93,15 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     }
     super::runtime()?.block_on(async {
         let (part, actor) = (&begun.part_in_files, operator(arguments.operator.as_deref()));
-        let actor_of_this = actor.clone();
         let (recipe, cell, json) = (&recipe, &cell, arguments.json);
         let live = Live { recipe, cell, part, folder, job: begun.job, actor, json };
         let machines = live.open(epoch(SystemTime::now()))?;
         let mut journal = Journal::open_locked(lock, key).map_err(Failure::Journal)?;
-        if let (Some(what), cycle) = (&begun.lost, begun.cycle) {
+        if let Some(what) = &begun.lost {
             let remark = format!("gone on with by --despite-loss, though the end of the record may be lost: {what}");
-            let Actor { name: actor, station } = actor_of_this.clone();
-            let entry = Entry { actor, station, ..Entry::new(Kind::Note, 0, cycle, json!({ "remark": remark })) };
+            let Actor { name: actor, station } = live.actor.clone();
+            let note = Entry::new(Kind::Note, 0, begun.cycle, json!({ "remark": remark }));
+            let entry = Entry { actor, station, ..note };
             journal.append(entry).map_err(Failure::Journal)?;
         }
         let (loaded, interrupted) = (cell.simulated, Some(interrupted));
@@ -111,8 +111,8 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
 
 /// Whether a folder holds nothing but an empty database with its lock.
 fn is_bare(run: &Path) -> bool {
-    let names = fs::read_dir(run).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.file_name());
-    names.into_iter().all(|name| name.to_str().is_some_and(|name| name.starts_with(DATABASE) || name == LOCK))
+    let mut names = fs::read_dir(run).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.file_name());
+    names.all(|name| name.to_str().is_some_and(|name| name.starts_with(DATABASE) || name == LOCK))
 }
 
 /// What the first record of a run tells of how to go on with it.

@@ -18,6 +18,7 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpListener;
+use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
 
 use super::guard::{self, Entrance, Guard, Peer};
@@ -77,10 +78,13 @@ pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Rout
         let place = Place { connections: Arc::clone(&connections), number };
         let (of, task) = (peer.ip(), Arc::clone(&connections));
         let is_known: Arc<dyn Fn() + Send + Sync> = Arc::new(move || task.know(number));
-        // What it does to the list waits until it is on it.
-        let mut open = connections.open();
+        let (is_listed, listed) = oneshot::channel::<()>();
         let serving = tokio::spawn(async move {
             let _place = place;
+            // A connection that ends, or is let in, is on the list by then.
+            if listed.await.is_err() {
+                return;
+            }
             // A client that goes away or misbehaves is no concern of anybody else.
             match tls {
                 None => answer(stream, Peer(peer.ip(), is_known), service).await,
@@ -91,7 +95,9 @@ pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Rout
                 }
             }
         });
-        open.add(number, of, serving.abort_handle());
+        connections.open().add(number, of, serving.abort_handle());
+        // It may have ended with the program.
+        let _ = is_listed.send(());
     }
 }
 
@@ -194,7 +200,7 @@ fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
 
 /// Gives up an order whose answer does not begin in time, be it that its body does not come.
 async fn in_time(request: Request, next: Next) -> Response {
-    // What is only looked at has no body that could stay away, and a proof of a large record takes its time.
+    // A request that only looks has no body that could stay away, and a proof of a large record takes its time.
     if request.method().is_safe() {
         return next.run(request).await;
     }

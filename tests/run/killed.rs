@@ -185,6 +185,13 @@ async fn a_record_whose_last_lines_are_lost_is_not_gone_on_with_unasked() {
         let mut running = Running::new(regrind(&["resume", &path, "--despite-loss", "--json"], &home));
         let found = || Some(folder.clone());
         assert_eq!(follow(&mut running, &found, usize::MAX), Some(0), "{}", running.told);
+        let remarks = records_with(&folder, "remark");
+        let said = remarks.iter().filter_map(|record| record["remark"].as_str());
+        assert_eq!(
+            said.filter(|said| said.contains("--despite-loss") && said.contains("cycle 7")).count(),
+            1,
+            "{remarks:?}"
+        );
     })
     .await
     .unwrap();

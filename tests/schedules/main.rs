@@ -94,33 +94,32 @@ fn number(name: &str) -> Option<u64> {
     std::env::var(name).ok().map(|text| text.parse().unwrap_or_else(|_| panic!("{name} is no number")))
 }
 
-#[test]
-fn no_schedule_breaks_a_promise() {
-    let seeds = KEPT.iter().copied().chain(0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE));
+/// Plays the schedules of some seeds, and fails by the first that breaks a promise.
+fn hold_their_promises(seeds: impl Iterator<Item = u64>) {
     let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
     let began = std::time::Instant::now();
     let tally = run_all(&schedules);
     println!("{} schedules in {:.1} s: {tally}", schedules.len(), began.elapsed().as_secs_f64());
+}
+
+#[test]
+fn no_schedule_breaks_a_promise() {
+    let seeds = KEPT.iter().copied().chain(0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE));
+    hold_their_promises(seeds);
 }
 
 #[test]
 fn nor_one_by_other_wires() {
     let seeds = KEPT_BY_OTHER_WIRES.iter().copied();
     let seeds = seeds.chain((0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_BY_OTHER_WIRES)).map(|k| OTHER_WIRES + k));
-    let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
-    let began = std::time::Instant::now();
-    let tally = run_all(&schedules);
-    println!("{} schedules in {:.1} s: {tally}", schedules.len(), began.elapsed().as_secs_f64());
+    hold_their_promises(seeds);
 }
 
 /// Machines that start anew with their old boot id and say that their job never began.
 #[test]
 fn nor_one_in_which_a_machine_forgets_its_job() {
     let seeds = (0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_FORGETFUL)).map(|k| FORGETFUL + k);
-    let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
-    let began = std::time::Instant::now();
-    let tally = run_all(&schedules);
-    println!("{} schedules in {:.1} s: {tally}", schedules.len(), began.elapsed().as_secs_f64());
+    hold_their_promises(seeds);
 }
 
 /// A disk that is full for a while: the cell is held meanwhile, waits for no answer to what it has not asked, and goes on after.
@@ -129,10 +128,7 @@ fn nor_one_in_which_the_disk_is_full_for_a_while() {
     // A stop that overtook the preparation of a cycle was not seen to be done.
     let seeds = KEPT_OF_FULL_DISKS.iter().copied();
     let seeds = seeds.chain((0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_FULL_DISKS)).map(|k| FULL_DISK + k));
-    let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
-    let began = std::time::Instant::now();
-    let tally = run_all(&schedules);
-    println!("{} schedules in {:.1} s: {tally}", schedules.len(), began.elapsed().as_secs_f64());
+    hold_their_promises(seeds);
 }
 
 /// Machines of which each register of the status and of the header of a result says in its turn what is not so: nothing that was seen to begin is
@@ -140,10 +136,7 @@ fn nor_one_in_which_the_disk_is_full_for_a_while() {
 #[test]
 fn nor_one_in_which_a_machine_says_what_is_not_so() {
     let seeds = (0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_LIARS)).map(|k| LIARS + k);
-    let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
-    let began = std::time::Instant::now();
-    let tally = run_all(&schedules);
-    println!("{} schedules in {:.1} s: {tally}", schedules.len(), began.elapsed().as_secs_f64());
+    hold_their_promises(seeds);
 }
 
 /// The program dies before every single one of its effects on the world, once each, and before some pairs of them.
