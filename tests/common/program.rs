@@ -193,6 +193,23 @@ pub fn run(arguments: &[&str], folder: &Path) -> (i32, String, String) {
     (status.code().unwrap_or(-1), text(stdout), text(stderr))
 }
 
+/// The run folders of a runs folder, in order of their names; none where there is no runs folder. Files whose name begins with a dot are no
+/// runs: a program that begins writes one for a moment to see whether it can.
+pub fn run_folders(runs: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(runs).into_iter().flatten().map(|entry| entry.unwrap().path());
+    let mut folders: Vec<PathBuf> =
+        entries.filter(|path| !path.file_name().unwrap().as_encoded_bytes().starts_with(b".")).collect();
+    folders.sort();
+    folders
+}
+
+/// The only run folder of a runs folder.
+pub fn only_run(runs: &Path) -> PathBuf {
+    let mut folders = run_folders(runs);
+    assert_eq!(folders.len(), 1, "{folders:?}");
+    folders.remove(0)
+}
+
 /// The content of the journal's records of a kind that have a key.
 pub fn records_with(folder: &Path, key: &str) -> Vec<Value> {
     let reader = regrind::journal::Reader::open(folder).unwrap();

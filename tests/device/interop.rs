@@ -244,7 +244,7 @@ fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
     let (code, said, errors) = crate::program::run(&arguments, home.path());
     assert_eq!(code, 0, "{said}\n{errors}");
     assert!(said.contains("SIMULATION  ACCEPTED") && errors.is_empty(), "{said}\n{errors}");
-    let folder = std::fs::read_dir(home.path().join("runs")).unwrap().next().unwrap().unwrap().path();
+    let folder = crate::program::only_run(&home.path().join("runs"));
     let verified = verify(&folder).unwrap();
     assert!(verified.closed && verified.open_intents.is_empty(), "{verified:?}");
     let result: Value = serde_json::from_slice(&std::fs::read(folder.join("result.json")).unwrap()).unwrap();

@@ -3,7 +3,7 @@
 use serde_json::json;
 
 use crate::browser::{Browser, Tab};
-use crate::program::{Running, changed, regrind, root, small_recipe};
+use crate::program::{Running, changed, only_run, regrind, root, small_recipe};
 use crate::{SPEED, Shown, serve_with, users};
 
 const SCREEN: [u32; 2] = [1024, 768];
@@ -277,7 +277,7 @@ fn pictures_are_made() {
     tab.click(&mut browser, "[data-view=relief]");
     picture(&tab, &mut browser, "page-relief.png");
     assert_eq!(shown.run.end().0, 0);
-    let run = std::fs::read_dir(home.path().join("runs")).unwrap().next().unwrap().unwrap().path();
+    let run = only_run(&home.path().join("runs"));
     let report = browser.open(&format!("file://{}", run.join("report.html").display()), [1000, 1000]);
     report.until(&mut browser, "document.querySelector('#judged') !== null");
     picture(&report, &mut browser, "report.png");

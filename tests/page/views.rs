@@ -1,7 +1,7 @@
 //! What the pages hold, without a browser.
 
 use crate::http::Visitor;
-use crate::program::{replaced, run, small_recipe};
+use crate::program::{replaced, run, run_folders, small_recipe};
 use crate::{Shown, serve};
 
 #[test]
@@ -12,11 +12,8 @@ fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
         let (code, said, errors) = run(&["run", &recipe, "--cell", "sim", "--part", part], home.path());
         assert_eq!(code, 0, "{said}{errors}");
     }
-    let mut ids: Vec<String> = std::fs::read_dir(home.path().join("runs"))
-        .unwrap()
-        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
-        .collect();
-    ids.sort();
+    let folders = run_folders(&home.path().join("runs"));
+    let ids: Vec<&str> = folders.iter().map(|folder| folder.file_name().unwrap().to_str().unwrap()).collect();
     let (_page, url) = serve(home.path());
     let mut visitor = Visitor::with_key(&url);
 
@@ -24,8 +21,8 @@ fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
     assert!(ids.iter().all(|id| list.contains(&format!("/runs/{id}\""))), "{list}");
     assert!(list.contains("SN-&lt;1&gt;") && !list.contains("SN-<1>"), "{list}");
     let narrowed = visitor.get("/runs?part=0002&result=Accepted").text();
-    assert!(!narrowed.contains(&ids[0]) && narrowed.contains(&ids[1]), "{narrowed}");
-    assert!(!visitor.get("/runs?result=Aborted").text().contains(&ids[1]));
+    assert!(!narrowed.contains(ids[0]) && narrowed.contains(ids[1]), "{narrowed}");
+    assert!(!visitor.get("/runs?result=Aborted").text().contains(ids[1]));
     let lists = |visitor: &mut Visitor, wanted: &str| {
         let text = visitor.get(&format!("/runs?{wanted}")).text();
         ids.iter().filter(|id| text.contains(&format!("/runs/{id}\""))).count()
@@ -36,7 +33,7 @@ fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
 
     let shown = visitor.get(&format!("/runs/{}", ids[0])).text();
     let result: serde_json::Value =
-        serde_json::from_slice(&std::fs::read(home.path().join("runs").join(&ids[0]).join("result.json")).unwrap())
+        serde_json::from_slice(&std::fs::read(home.path().join("runs").join(ids[0]).join("result.json")).unwrap())
             .unwrap();
     let last = result["cycles"].as_array().unwrap().last().unwrap();
     assert!(shown.contains(&format!("<strong>{:.3}</strong>", last["judged_rms_um"].as_f64().unwrap())), "{shown}");
@@ -53,7 +50,7 @@ fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
     );
     assert_eq!(visitor.get(&format!("/compare?run={}", ids[0])).header("location"), ["/runs"]);
     let report = visitor.get(&format!("/runs/{}/report", ids[0]));
-    assert_eq!(report.body, std::fs::read(home.path().join("runs").join(&ids[0]).join("report.html")).unwrap());
+    assert_eq!(report.body, std::fs::read(home.path().join("runs").join(ids[0]).join("report.html")).unwrap());
     assert!(report.header("content-security-policy")[0].contains("default-src 'none'"));
 
     let map = visitor.get(&format!("/runs/{}/cycles/1/map", ids[0]));

@@ -121,9 +121,7 @@ impl Plant {
 
 /// The only run below a folder.
 fn only_run(runs: &Path) -> (PathBuf, String) {
-    let mut runs = fs::read_dir(runs).unwrap().map(|entry| entry.unwrap().path());
-    let run = runs.next().expect("a run");
-    assert!(runs.next().is_none(), "one run");
+    let run = program::only_run(runs);
     let name = run.file_name().unwrap().to_string_lossy().into_owned();
     (run, name)
 }

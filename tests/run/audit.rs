@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::program::{regrind, root, run, small_recipe};
+use crate::program::{only_run, regrind, root, run, run_folders, small_recipe};
 use regrind::cell::{
     Actor, Alarm, AlarmId, Command as Order, Device, Ending, Event, Figures, Judgement, Occupation, Role, Verdict,
     table,
@@ -392,7 +392,7 @@ fn a_run_signs_its_record_and_quality_proves_it_with_the_key_that_it_kept() {
 
 /// The report of the one run of a folder.
 fn report_in(home: &Path) -> PathBuf {
-    let run = fs::read_dir(home.join("runs")).unwrap().next().unwrap().unwrap().path();
+    let run = only_run(&home.join("runs"));
     run.join("report.html")
 }
 
@@ -584,7 +584,7 @@ fn runs_of(home: &Path, key: &Path, parts: &[&str]) -> Vec<PathBuf> {
         let first = Reader::open(run).unwrap().records(0).next().unwrap().unwrap().value();
         first["content"]["number"].as_u64().unwrap()
     };
-    let mut runs: Vec<PathBuf> = fs::read_dir(home.join("runs")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    let mut runs = run_folders(&home.join("runs"));
     runs.sort_by_key(number);
     assert_eq!(runs.iter().map(number).collect::<Vec<_>>(), (1..=parts.len() as u64).collect::<Vec<_>>());
     runs

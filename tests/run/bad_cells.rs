@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use crate::program::{Running, changed, records_with, regrind, root, run, small_recipe};
+use crate::program::{Running, changed, only_run, records_with, regrind, root, run, run_folders, small_recipe};
 use regrind::journal::verify;
 
 /// No wrong input may keep anybody longer, on the busiest computer.
@@ -20,13 +20,6 @@ fn in_time(arguments: &[&str], home: &Path) -> (i32, String, String) {
     assert!(began.elapsed() < BOUNDED, "{arguments:?} took {:?}", began.elapsed());
     assert!(!ended.2.contains("panicked") && !ended.2.contains("fault of the program"), "{}", ended.2);
     ended
-}
-
-/// The only run folder under a folder.
-fn only_run(runs: &Path) -> PathBuf {
-    let mut folders: Vec<_> = fs::read_dir(runs).unwrap().map(|entry| entry.unwrap().path()).collect();
-    assert_eq!(folders.len(), 1, "{folders:?}");
-    folders.pop().unwrap()
 }
 
 fn recipe(home: &Path, speed: f64) -> String {
@@ -76,8 +69,8 @@ fn runs_that_begin_in_one_second_have_folders_of_their_own() {
         // The one that found its folder taken a moment ago says so and harms nothing.
         assert!(code == 0 || code == 2 && errors.contains("runs/"), "{code} {errors}");
     }
-    for folder in fs::read_dir(home.path().join("runs")).unwrap() {
-        assert!(verify(folder.unwrap().path()).unwrap().closed);
+    for folder in run_folders(&home.path().join("runs")) {
+        assert!(verify(folder).unwrap().closed);
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use crate::program::{changed, run, small_recipe};
+use crate::program::{changed, only_run, run, small_recipe};
 use crate::sample::cases;
 
 /// The simulated cell with a program's section, and patience: the grinder reads megabytes of a program before it answers, and no stall of the
@@ -35,7 +35,7 @@ fn a_part_is_ground_by_the_programs_of_every_dialect_until_it_is_accepted() {
         let programs: Vec<_> = there.filter(|file| file.extension().is_some_and(|e| e == extension)).collect();
         // One for each pass.
         assert!(programs.len() >= 2, "{dialect}: {programs:?}");
-        let kept = fs::read_dir(home.path().join("runs")).unwrap().next().unwrap().unwrap().path();
+        let kept = only_run(&home.path().join("runs"));
         let of_first = fs::read(kept.join(format!("cycle-0/toolpath.{extension}"))).unwrap();
         assert!(programs.iter().any(|file| fs::read(file).unwrap() == of_first), "{dialect}");
     }
@@ -72,7 +72,7 @@ fn a_part_is_ground_by_a_ball_that_leans_until_it_is_accepted() {
         let text = fs::read_to_string(program).unwrap();
         assert!(text.lines().filter(|line| line.contains("B-")).count() > 1000, "{dialect}");
         // A table of Z knows of no tilt.
-        let kept = fs::read_dir(home.path().join("runs")).unwrap().next().unwrap().unwrap().path();
+        let kept = only_run(&home.path().join("runs"));
         assert!(!kept.join("cycle-0/toolpath_z.csv").exists());
     }
 }

@@ -11,7 +11,7 @@ use regrind_sim::world::World;
 use serde::Deserialize as _;
 
 use crate::first_touches::{file_cell, hand_in, measured, open_plan};
-use crate::program::{Running, regrind, replaced, root, run, small_recipe};
+use crate::program::{Running, only_run, regrind, replaced, root, run, small_recipe};
 
 /// A folder with all that ships, prepared as the page says; returns the arguments of the run that it begins.
 fn shop() -> (tempfile::TempDir, Vec<String>) {
@@ -69,7 +69,7 @@ fn enter_at_the_terminal_that_asks_confirms_the_part() {
     let mut running = Running::new(command);
     let mut keys = running.keys();
     running.line("the question", |line| line.contains("press Enter here"));
-    let folder = fs::read_dir(home.path().join("runs")).unwrap().next().unwrap().unwrap().path().display().to_string();
+    let folder = only_run(&home.path().join("runs")).display().to_string();
     let asks = || run(&["status", &folder], home.path()).1.contains("confirm loaded");
     running.until("a run that asks for the part", |_| asks().then_some(()));
     keys.write_all(b"\n").unwrap();

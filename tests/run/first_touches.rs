@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::outlived::on_serial_lines;
-use crate::program::{Running, changed, records_with, regrind, run};
+use crate::program::{Running, changed, records_with, regrind, run, run_folders};
 use crate::study::touch;
 use regrind::recipe::Recipe;
 use regrind_sim::payload::{Feature, Plan, PointRecord, Status, Target};
@@ -49,15 +49,16 @@ fn touched_until(running: &mut Running, folder: &Path, alarm: &str, what: &str) 
     let said = running.said.last().unwrap().clone();
     assert!(said.contains(&name), "{what}: {said}");
     let home = folder.parent().unwrap().parent().unwrap();
-    assert_eq!(run(&["stop", &folder.display().to_string()], home).0, 0, "{what}");
+    let (code, _, told) = run(&["stop", &folder.display().to_string()], home);
+    assert_eq!(code, 0, "{what}: {told}\n{}", running.said.join("\n"));
     running.end();
     let collected = records_with(folder, "targets").into_iter().filter(|event| event["event"] == "collected");
     collected.map(|event| event["targets"].as_u64().unwrap()).sum()
 }
 
-/// The one run below a home.
-fn only_run(home: &Path, running: &mut Running) -> PathBuf {
-    running.until("a run folder", |_| Some(fs::read_dir(home.join("runs")).ok()?.next()?.unwrap().path()))
+/// Waits for the run below a home.
+fn begun_run(home: &Path, running: &mut Running) -> PathBuf {
+    running.until("a run folder", |_| run_folders(&home.join("runs")).pop())
 }
 
 #[test]
@@ -67,7 +68,7 @@ fn over_a_serial_line() {
         let _machines = on_serial_lines(home.path(), recipe(world));
         let mut running =
             Running::new(regrind(&["run", "part.toml", "--cell", "cell.toml", "--loaded", "--json"], home.path()));
-        let folder = only_run(home.path(), &mut running);
+        let folder = begun_run(home.path(), &mut running);
         let touched = touched_until(&mut running, &folder, alarm, what);
         assert!((1..=10).contains(&touched), "{what}: {touched} touches");
     }
@@ -84,7 +85,7 @@ fn by_files() {
         let world = World::new(WorldSpec::deserialize(toml::Value::Table(table)).unwrap()).unwrap();
         let mut running =
             Running::new(regrind(&["run", "part.toml", "--cell", "cell.toml", "--loaded", "--json"], home.path()));
-        let folder = only_run(home.path(), &mut running);
+        let folder = begun_run(home.path(), &mut running);
         measure_once(&mut running, home.path(), &world);
         let touched = touched_until(&mut running, &folder, alarm, what);
         assert!((1..=10).contains(&touched), "{what}: {touched} touches");

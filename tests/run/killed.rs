@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 
 use crate::outlived::{began_once, follow, on_serial_lines};
-use crate::program::{Running, changed, records_with, regrind};
+use crate::program::{Running, changed, only_run, records_with, regrind, run_folders};
 use crate::rig::{CMM, GRINDER, Rig, small};
 use crate::sample::seeds;
 use rand::rngs::StdRng;
@@ -40,7 +40,7 @@ pub fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
     };
     assert_eq!(signed(&["audit", "key"]).end().0, 0);
     let mut running = signed(&["run", "part.toml", "--cell", "cell.toml", "--runs", &runs, "--json"]);
-    let folder = || fs::read_dir(home.join(&runs)).ok()?.next()?.ok().map(|entry| entry.path());
+    let folder = || run_folders(&home.join(&runs)).pop();
     let mut kills = 0;
     loop {
         let lines = if kills < MOST_KILLS { chance.random_range(1..50) } else { usize::MAX };
@@ -138,7 +138,7 @@ fn over_a_serial_line_too() {
 fn killed_at_work(home: &Path) -> PathBuf {
     let arguments = ["run", "part.toml", "--cell", "cell.toml", "--json"];
     let mut running = Running::new(regrind(&arguments, home));
-    let folder = || fs::read_dir(home.join("runs")).ok()?.next()?.ok().map(|entry| entry.path());
+    let folder = || run_folders(&home.join("runs")).pop();
     assert_eq!(follow(&mut running, &folder, 14), None, "it is killed in the middle");
     folder().unwrap()
 }
@@ -209,7 +209,7 @@ fn killed_while(home: &Path, moment: &str) -> PathBuf {
     running.line(moment, |line| line.contains(moment));
     running.signal("KILL");
     running.end();
-    fs::read_dir(home.join("runs")).unwrap().next().unwrap().unwrap().path()
+    only_run(&home.join("runs"))
 }
 
 fn recover(home: &Path, typed: &str) -> (i32, String) {
@@ -243,8 +243,8 @@ async fn machines_that_hold_what_no_run_knows_are_brought_home_step_by_step() {
         }
         let (code, said) = recover(&home, "");
         assert!(code == 0 && said.matches("IDLE").count() == 2, "{said}");
-        for folder in fs::read_dir(home.join("runs")).unwrap() {
-            let verified = verify(folder.unwrap().path()).unwrap();
+        for folder in run_folders(&home.join("runs")) {
+            let verified = verify(folder).unwrap();
             assert!(verified.closed && verified.open_intents.is_empty(), "{verified:?}");
         }
     })
@@ -284,7 +284,7 @@ async fn what_cannot_be_taken_up_again_is_refused_before_anything_is_commanded()
     running.line("a pass", |line| line.contains("\"event\":\"started\""));
     running.signal("KILL");
     running.end();
-    let own = fs::read_dir(home.join("own")).unwrap().next().unwrap().unwrap().path();
+    let own = only_run(&home.join("own"));
     let (code, _, said) = resumed(&[own.to_str().unwrap()]);
     assert!(code == 2 && said.contains("ended with the program"), "{said}");
 }

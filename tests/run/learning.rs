@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use crate::program::{replaced, root, run};
+use crate::program::{replaced, root, run, run_folders};
 
 /// A folder of runs, and a recipe that learns.
 struct Shop {
@@ -41,8 +41,7 @@ impl Shop {
     }
 
     fn folders(&self) -> Vec<PathBuf> {
-        let Ok(entries) = fs::read_dir(self.home.path().join("runs")) else { return Vec::new() };
-        entries.map(|entry| entry.unwrap().path()).collect()
+        run_folders(&self.home.path().join("runs"))
     }
 }
 

@@ -15,7 +15,7 @@ use regrind::cell::{AlarmId, StateName};
 use regrind::drive::{Request, ask};
 use serde_json::Value;
 
-use crate::program::{Running, changed, regrind, replaced, root, run};
+use crate::program::{Running, changed, only_run, regrind, replaced, root, run, run_folders};
 
 /// Set for the test that runs within.
 const WITHIN: &str = "REGRIND_WITHIN_LINUXCNC";
@@ -138,7 +138,7 @@ fn ran_once(record: &str) -> bool {
 /// Lets a run go to its end, with a person beside it who lets it go on where it holds: LinuxCNC may be kept waiting on a busy computer until the
 /// cell holds before the step that it does not answer. Returns what was said.
 fn to_its_end(mut running: Running, home: &Path) -> String {
-    let folder = || fs::read_dir(home.join("runs")).ok()?.next()?.ok().map(|entry| entry.path());
+    let folder = || run_folders(&home.join("runs")).pop();
     while !running.is_over() {
         if let Some(folder) = folder()
             && let Ok(status) = ask(&folder, &Request::Status)
@@ -191,7 +191,7 @@ fn a_run_that_is_killed_while_linuxcnc_grinds_goes_on_with_the_same_pass() {
         first.signal("KILL");
         first.end();
         // It waits for a person who has looked at the machines.
-        let folder = fs::read_dir(home.join("runs")).unwrap().next().unwrap().unwrap().path();
+        let folder = only_run(&home.join("runs"));
         let resumed = Running::new(regrind(&["resume", folder.to_str().unwrap()], home));
         let told = to_its_end(resumed, home);
         assert!(told.contains("ACCEPTED"), "{told}");
@@ -210,7 +210,7 @@ fn stands_after(home: &Path, go_wrong: impl FnOnce()) -> (StateName, Vec<AlarmId
         std::thread::park_timeout(Duration::from_millis(20));
     }
     go_wrong();
-    let folder = fs::read_dir(home.join("runs")).unwrap().next().unwrap().unwrap().path();
+    let folder = only_run(&home.join("runs"));
     let mut seen = (StateName::Execute, Vec::new());
     let stands =
         |state| matches!(state, StateName::Held | StateName::Suspended | StateName::Aborted | StateName::Stopped);
@@ -295,7 +295,7 @@ fn a_program_that_the_controller_cannot_open_is_never_begun() {
         let mut running = Running::new(regrind(&["run", &recipe, "--cell", &cell, "--runs", "runs"], home));
         // It holds, and waits for somebody who sees to it.
         running.line("an alarm that names the folder", |line| line.contains("/tmp/nowhere"));
-        let folder = fs::read_dir(home.join("runs")).unwrap().next().unwrap().unwrap().path();
+        let folder = only_run(&home.join("runs"));
         run(&["abort", folder.to_str().unwrap(), "--reason", "seen"], home);
         let (code, errors) = running.end();
         println!("{code} {}\n{errors}", running.said.join("\n"));

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::data::data;
-use crate::program::{Running, changed, run};
+use crate::program::{Running, changed, only_run, run};
 use regrind::journal;
 use serde_json::Value;
 
@@ -78,10 +78,7 @@ impl Shop {
     }
 
     fn run_folder(&self) -> PathBuf {
-        let mut runs: Vec<_> =
-            fs::read_dir(self.home.path().join("runs")).unwrap().map(|e| e.unwrap().path()).collect();
-        assert_eq!(runs.len(), 1);
-        runs.remove(0)
+        only_run(&self.home.path().join("runs"))
     }
 
     /// Returns the one hand-over in an outbox whose name ends so.

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 use serde_json::Value;
 
-use crate::program::{Running, changed, regrind, root, run};
+use crate::program::{Running, changed, only_run, regrind, root, run, run_folders};
 use crate::sample::seeds;
 use crate::study::told_apart::Compared;
 use crate::study::{After, Bench};
@@ -39,8 +39,8 @@ fn ran(home: &Path, recipe: &str) -> (PathBuf, String) {
     fs::write(home.join("mirror.toml"), recipe).unwrap();
     let cell = root().join("config/sim.toml");
     let (_, out, err) = run(&["run", "mirror.toml", "--cell", cell.to_str().unwrap()], home);
-    let runs = fs::read_dir(home.join("runs")).unwrap_or_else(|_| panic!("{out}{err}"));
-    (runs.last().expect("a run").unwrap().path(), out + &err)
+    let folder = run_folders(&home.join("runs")).pop().unwrap_or_else(|| panic!("{out}{err}"));
+    (folder, out + &err)
 }
 
 fn rms_um(folder: &Path, cycle: usize) -> Option<f64> {
@@ -87,7 +87,7 @@ fn what_is_beyond_its_tolerance_is_asked_for_and_the_cell_is_shown_as_held() {
         let shown = notices.iter().rfind(|n| n["notice"] == "state").map(|n| n["state"].to_string());
         (asked && shown.is_some_and(|state| state.starts_with("\"Held"))).then_some(())
     });
-    let folder = fs::read_dir(home.path().join("runs")).unwrap().next().unwrap().unwrap().path();
+    let folder = only_run(&home.path().join("runs"));
     assert_eq!(run(&["resume", folder.to_str().unwrap(), "--reason", "measured"], home.path()).0, 0);
     let (code, errors) = program.end();
     assert_eq!(code, 0, "{errors}\n{}", program.said.join("\n"));

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::program::{Running, records_with, regrind, root, run, small_recipe};
+use crate::program::{Running, only_run, records_with, regrind, root, run, small_recipe};
 use regrind::cell::{
     Actor, AlarmId, Command, Ending, Event, Figures, Gate, GateFailure, Judgement, Phase, State, Tolerance, Verdict,
     samples,
@@ -71,7 +71,7 @@ pub fn json_in(folder: &Path, name: &str) -> Value {
 }
 
 pub fn the_run(home: &Path) -> PathBuf {
-    fs::read_dir(home.join("runs")).unwrap().next().unwrap().unwrap().path()
+    only_run(&home.join("runs"))
 }
 
 pub fn arguments(recipe: &Path) -> Vec<String> {
