@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use regrind::device::exchange::{
     CmmExchange, CmmFolders, Confirmed, Exchange, ExchangeError, ExchangeMachine, GrindOrder, GrinderExchange,
@@ -38,8 +38,10 @@ impl Shop {
         Self { _home: home, outbox, inbox }
     }
 
+    /// Settings by which a look tells what it found, however busy the computer is.
     fn cmm(&self) -> CmmExchange {
-        CmmExchange::new("SN 7", &self.outbox, &self.inbox)
+        let read_within = Duration::from_secs(300);
+        CmmExchange { read_within, ..CmmExchange::new("SN 7", &self.outbox, &self.inbox) }
     }
 
     fn grinder(&self, stable_for: Duration) -> GrinderFolders {
@@ -581,6 +583,43 @@ async fn a_measuring_machine_goes_through_the_states_of_a_wire() {
     assert_eq!(cmm.acknowledge(status.done).await.unwrap().state, State::Idle);
     assert_eq!(shop.handed(), ["SN_7_j3_c2.done"]);
     assert_eq!(answer_of(cmm.prepare(job).await), Answer::AlreadyBegun);
+}
+
+#[tokio::test]
+async fn while_a_large_file_is_read_the_job_is_held_and_let_go_on_and_then_it_is_told() {
+    let shop = Shop::new();
+    let folders = CmmFolders::new(CmmExchange { read_within: Duration::ZERO, ..at_once(shop.cmm()) });
+    let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, folders, ANSWERS_WITHIN);
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    let plan = plan(3);
+    let job = Job { job: 3, cycle: 2, digest: digest(&[plan.identity()]) };
+    cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
+    let armed = cmm.prepare(job).await.unwrap();
+    cmm.start(armed).await.unwrap();
+    // A map of nine million heights, none of them on the disk: it takes a while to read.
+    let mut header = vec![0; 834];
+    header[..10].copy_from_slice(&[0x88, 0x1b, 0x03, 0x6f, 0, 1, 0, 0, 0x03, 0x42]);
+    header[68..76].copy_from_slice(&[0x0b, 0xb8, 0x0b, 0xb8, 0x02, 0x25, 0x51, 0x00]);
+    for (at, value) in [(164, 0.5_f32), (168, 6.328e-7), (176, 1.0), (184, 1e-5)] {
+        header[at..at + 4].copy_from_slice(&value.to_be_bytes());
+    }
+    let path = shop.inbox.join("SN_7_c2.dat");
+    fs::write(&path, header).unwrap();
+    File::options().write(true).open(&path).unwrap().set_len(834 + 4 * 3000 * 3000).unwrap();
+    let attributes: String = (0..200_000).map(|k| format!(" a{k}=''")).collect();
+    shop.put("other.qif", &format!("<QIFDocument{attributes}/>"));
+    assert_eq!(cmm.status().await.unwrap().state, State::Execute);
+    assert_eq!(cmm.notes(), ["reading SN_7_c2.dat, other.qif"]);
+    assert_eq!(cmm.hold().await.unwrap().state, State::Held);
+    assert_eq!(cmm.resume().await.unwrap().state, State::Execute);
+    let started = Instant::now();
+    while !cmm.notes().iter().any(|note| note.contains("not taken")) {
+        assert!(started.elapsed() < Duration::from_secs(300), "{:?}", cmm.notes());
+        tokio::task::yield_now().await;
+        assert_eq!(cmm.status().await.unwrap().state, State::Execute);
+    }
+    assert_eq!(cmm.abort().await.unwrap().state, State::Aborted);
 }
 
 #[tokio::test]

@@ -34,6 +34,8 @@ pub struct CmmExchange {
     pub inbox: PathBuf,
     /// A file that has not changed for so long is complete.
     pub stable_for: Duration,
+    /// How long a look waits for what it finds to be read. What takes longer is told by a later look; meanwhile the job can be held.
+    pub read_within: Duration,
     /// What is known of the result files.
     pub content: Content,
     /// The names of result files; `{part}`, `{job}`, `{cycle}` and `*`.
@@ -64,6 +66,7 @@ impl CmmExchange {
             outbox: outbox.into(),
             inbox: inbox.into(),
             stable_for: Duration::from_secs(2),
+            read_within: READ_WITHIN,
             content: Content::default(),
             result: Pattern::new("{part}_c{cycle}.*"),
             stations: None,
@@ -132,7 +135,7 @@ struct Judging {
     judged: mpsc::Receiver<(Judgement, Vec<String>)>,
 }
 
-/// How long a look waits for what it finds to be read; what takes longer is told by a later one.
+/// How long a look waits for what it finds to be read, as a rule.
 const READ_WITHIN: Duration = Duration::from_millis(40);
 /// A file whose name says nothing is not looked into to see whether it belongs here, if it is larger.
 const MOST_TO_LOOK_INTO: u64 = 16 << 20;
@@ -219,7 +222,7 @@ impl CmmFolders {
             });
             self.judging = Some(Judging { job, found: found.to_owned(), judged });
         }
-        let judged = self.judging.as_ref()?.judged.recv_timeout(READ_WITHIN);
+        let judged = self.judging.as_ref()?.judged.recv_timeout(self.judge.settings.read_within);
         if matches!(judged, Err(mpsc::RecvTimeoutError::Timeout)) {
             return None;
         }
