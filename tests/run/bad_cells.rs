@@ -185,6 +185,46 @@ fn a_disk_that_fills_up_without_room_for_a_cycle_begins_none() {
     assert!(verify(&folder).unwrap().closed);
 }
 
+/// A file system of its own in a file, which the kernel turns read-only at its first error, as it does with a disk that fails.
+struct BrokenDisk {
+    folder: PathBuf,
+    device: String,
+}
+
+impl BrokenDisk {
+    fn at(folder: PathBuf) -> Self {
+        let (image, options) = (folder.with_extension("image"), "loop,errors=remount-ro");
+        fs::create_dir(&folder).unwrap();
+        fs::File::create(&image).unwrap().set_len(40 << 20).unwrap();
+        let done = |command: &mut Command| command.status().is_ok_and(|status| status.success());
+        assert!(done(Command::new("mkfs.ext4").arg("-q").arg(&image)), "a file system is made");
+        assert!(done(Command::new("mount").args(["-o", options]).args([&image, &folder])), "it is mounted");
+        let found = Command::new("findmnt").args(["-no", "SOURCE"]).arg(&folder).output().unwrap();
+        Self { folder, device: String::from_utf8(found.stdout).unwrap().trim().replace("/dev/", "") }
+    }
+
+    fn turn_read_only(&self) {
+        fs::write(format!("/sys/fs/ext4/{}/trigger_fs_error", self.device), "1").unwrap();
+    }
+}
+
+impl Drop for BrokenDisk {
+    fn drop(&mut self) {
+        // What stays mounted is gone with the machine.
+        let _ = Command::new("umount").arg("-l").arg(&self.folder).status();
+    }
+}
+
+#[test]
+#[ignore = "needs a user who may mount a disk that breaks: root"]
+fn a_disk_that_turns_read_only_holds_the_cell_and_loses_nothing() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = recipe(home.path(), 2000.0);
+    let disk = BrokenDisk::at(home.path().join("broken"));
+    let command = regrind(&["run", &recipe, "--cell", &sim_cell(), "--runs", "broken"], home.path());
+    fills_up(command, home.path(), "broken/small-", || disk.turn_read_only());
+}
+
 #[test]
 fn a_port_that_is_taken_cannot_be_simulated() {
     let home = tempfile::tempdir().unwrap();
