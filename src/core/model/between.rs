@@ -122,7 +122,7 @@ mod tests {
     use super::*;
 
     fn over(places: &[[f64; 2]]) -> Option<Between> {
-        Between::of(places, &Waves::over(places, Lay::NONE, 100))
+        Between::of(places, &Waves::over(places, Lay::NONE, 100, 0))
     }
 
     #[test]

@@ -41,6 +41,8 @@ const WAVES_A_POINT: f64 = 5.0;
 const FEWEST_WAVES: usize = 150;
 /// Points that are worked with one by one, at most; of more what their waves have in common.
 const MOST_WHOLE: usize = 600;
+/// Degree of the polynomials that many points are told by beside the waves. Few points take them for what wears a wheel or moves a part.
+const DEGREE: usize = 4;
 /// A wave that has this share of the strongest adds nothing, nor what is told apart by this share of the variance.
 const NOTHING: f64 = 1e-4;
 const NOT_APART: f64 = 1e-5;
@@ -154,7 +156,7 @@ impl Fields {
         let places = observed.places.clone();
         let n = places.len();
         let count = ((WAVES_A_POINT * n as f64) as usize).clamp(FEWEST_WAVES, MOST_WAVES[usize::from(n > MOST_WHOLE)]);
-        let waves = Waves::over(&places, kind.lay, count);
+        let waves = Waves::over(&places, kind.lay, count, if n > MOST_WHOLE { DEGREE } else { 0 });
         let whitening = whitening(&observed.path, n, kind.drift);
         let effects = whitened(&whitening, &observed.effects);
         let factor = super::dense::told_apart(effects.tr_mul(&effects))?;
@@ -250,7 +252,8 @@ impl Fields {
     fn node(&self, smoothness: Smoothness, range_mm: f64) -> Option<Node> {
         let (mut strengths, narrow) = self.waves.strengths(smoothness, range_mm);
         let least = NOTHING * strengths.iter().copied().fold(0.0, f64::max);
-        strengths.truncate(strengths.iter().take_while(|strength| **strength > least).count());
+        let last = strengths.iter().rposition(|strength| *strength > least);
+        strengths.truncate(last.map_or(0, |last| last + 1));
         let (r, c) = (self.reduced.rows.nrows(), strengths.len());
         let rows = Mat::from_fn(r, c, |k, wave| self.reduced.rows[(k, wave)] * strengths[wave]);
         let by_waves = c < r;

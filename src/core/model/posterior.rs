@@ -377,7 +377,7 @@ impl<'f> Posterior<'f> {
         (waves, stated)
     }
 
-    /// The mean over all fields of A K A' with K the covariance of the field, of what takes the waves to some sums: a row a sum, a column a wave. Fields
+    /// The mean over all fields of A K A' with K the covariance of the field by its cosines, of what takes the waves to some sums: a row a sum, a column a wave. Fields
     /// beyond what is seen count less. Also that of the square of the scatter, a touch's share of shorter waves in it.
     pub(super) fn covered(&self, sums: &DMatrix<f64>) -> (DMatrix<f64>, f64) {
         let p = sums.nrows();
@@ -390,7 +390,12 @@ impl<'f> Posterior<'f> {
             }
             let own2 = self.scale(number, tau).best_mm().powi(2);
             let strength2 = own2 * tau * node.scale;
-            let strong = DMatrix::from_fn(p, node.strengths.len(), |r, k| sums[(r, k)] * node.strengths[k]);
+            // Polynomials are let be as large as corners need. As forms of a part they would hide its place more than its forms do.
+            let cosines = self.fields.waves.count_of_polynomials()..node.strengths.len();
+            let strong = DMatrix::from_fn(p, cosines.len(), |r, k| {
+                let wave = cosines.start + k;
+                sums[(r, wave)] * node.strengths[wave]
+            });
             covered += &strong * strong.transpose() * (weight * strength2);
             scatter2 += weight * (own2 + strength2 * node.narrow);
             whole += weight;

@@ -1,4 +1,4 @@
-//! Cosines over a rectangle that is wider than the part: a field of any covariance is a sum of them.
+//! Cosines over a rectangle that is wider than the part, and low polynomials over the part: a field of any covariance is a sum of them.
 //!
 //! ```text
 //!  phi_ab(x, y) = c_a c_b cos(pi a u / L_u) cos(pi b v / L_v) / sqrt(L_u L_v)        c_0 = 1, else c = sqrt 2
@@ -7,6 +7,9 @@
 //!
 //! S is the spectral density of the covariance (Solin and Sarkka 2020). A cosine is level where it meets the edge of the rectangle; so the rectangle
 //! begins well before the part. u and v lie along and across the lay of the field.
+//!
+//! A field whose range is longer than the part still bends at the edge of the rectangle, where no cosine does, and is highest in the corners. Products of
+//! Legendre's polynomials beside the cosines have as much of its variance as these: a smooth long field is a polynomial over the part.
 
 use faer::Mat;
 
@@ -15,12 +18,18 @@ use super::{Lay, Smoothness};
 /// By how much the rectangle is wider than the part on either side, as a share of the longer side of the part.
 const WIDER: f64 = 0.15;
 
-/// The cosines of the longest waves over a rectangle.
+/// The cosines of the longest waves over a rectangle, and polynomials before them.
 pub(super) struct Waves {
     lay: Lay,
     corner_mm: [f64; 2],
     lengths_mm: [f64; 2],
-    /// a and b of each.
+    /// The middle of the part and half its lengths, between which the polynomials are laid.
+    middle_mm: [f64; 2],
+    halves_mm: [f64; 2],
+    degree: usize,
+    /// The degrees of each polynomial along and across.
+    degrees: Vec<[usize; 2]>,
+    /// a and b of each cosine.
     orders: Vec<[usize; 2]>,
     /// One more than the highest order along either axis.
     counts: [usize; 2],
@@ -29,8 +38,9 @@ pub(super) struct Waves {
 }
 
 impl Waves {
-    /// Takes so many waves over some places, those first of which a field with this lay has most.
-    pub(super) fn over(places: &[[f64; 2]], lay: Lay, count: usize) -> Self {
+    /// Takes so many cosines over some places, those first of which a field with this lay has most, and the polynomials up to a degree. What is
+    /// level or tilted is a motion of the part and none of them.
+    pub(super) fn over(places: &[[f64; 2]], lay: Lay, count: usize, degree: usize) -> Self {
         let spans = [0, 1].map(|axis| {
             let of = places.iter().map(|&place| turned(lay, place)[axis]);
             [of.clone().fold(f64::INFINITY, f64::min), of.fold(f64::NEG_INFINITY, f64::max)]
@@ -50,11 +60,21 @@ impl Waves {
         orders.truncate(count);
         let counts = [0, 1].map(|axis| orders.iter().map(|order| order[axis] + 1).max().unwrap_or(1));
         let numbers2 = orders.iter().map(|&order| number2(order)).collect();
-        Self { lay, corner_mm, lengths_mm, orders, counts, numbers2 }
+        let middle_mm = spans.map(|[low, high]| 0.5 * (low + high));
+        // Points on a line have a width for numbers' sake.
+        let halves_mm = spans.map(|[low, high]| (0.5 * (high - low)).max(0.01 * wider_mm));
+        let degrees = (2..=degree).flat_map(|whole| (0..=whole).map(move |b| [whole - b, b])).collect();
+        Self { lay, corner_mm, lengths_mm, middle_mm, halves_mm, degree, degrees, orders, counts, numbers2 }
     }
 
+    /// How many polynomials and cosines these are.
     pub(super) fn len(&self) -> usize {
-        self.orders.len()
+        self.degrees.len() + self.orders.len()
+    }
+
+    /// How many of these, the first ones, are polynomials.
+    pub(super) fn count_of_polynomials(&self) -> usize {
+        self.degrees.len()
     }
 
     /// Half the length of the shortest wave.
@@ -62,21 +82,27 @@ impl Waves {
         std::f64::consts::PI / self.numbers2.last().copied().unwrap_or(0.0).sqrt()
     }
 
-    /// The standard deviation of each wave's coefficient in a field of strength 1, and the share of the field's variance that is in shorter ones.
+    /// The standard deviation of each coefficient in a field of strength 1, and the share of the field's variance that is in shorter ones.
     pub(super) fn strengths(&self, smoothness: Smoothness, range_mm: f64) -> (Vec<f64>, f64) {
         let strength = |number2: &f64| density_mm2(smoothness, range_mm, *number2).sqrt();
         let last2 = self.numbers2.last().copied().unwrap_or(0.0);
-        (self.numbers2.iter().map(strength).collect(), beyond(smoothness, range_mm, last2))
+        let area_mm2 = self.lengths_mm[0] * self.lengths_mm[1];
+        let longest_mm = 2.0 * self.halves_mm[0].max(self.halves_mm[1]);
+        let is_long = smoothness != Smoothness::Never && range_mm >= longest_mm;
+        let of_polynomial = if is_long { (area_mm2 / self.degrees.len().max(1) as f64).sqrt() } else { 0.0 };
+        let polynomials = self.degrees.iter().map(|_| of_polynomial);
+        (polynomials.chain(self.numbers2.iter().map(strength)).collect(), beyond(smoothness, range_mm, last2))
     }
 
-    /// Every wave at some places: a row a place, a column a wave.
+    /// Every polynomial and cosine at some places: a row a place, a column each.
     pub(super) fn at(&self, places: &[[f64; 2]]) -> Mat<f64> {
-        let along: [Vec<Vec<f64>>; 2] = [0, 1].map(|axis| {
-            let at = places.iter().map(|&place| turned(self.lay, place)[axis]);
-            self.cosines(axis, &at.collect::<Vec<_>>())
-        });
+        let at_mm = [0, 1].map(|axis| places.iter().map(|&place| turned(self.lay, place)[axis]).collect::<Vec<f64>>());
+        let polynomials = [0, 1].map(|axis| self.polynomials(axis, &at_mm[axis]));
+        let cosines = [0, 1].map(|axis| self.cosines(axis, &at_mm[axis]));
+        let of_polynomials = self.degrees.iter().map(|order| (&polynomials, order));
+        let all = of_polynomials.chain(self.orders.iter().map(|order| (&cosines, order)));
         let mut waves = Mat::zeros(places.len(), self.len());
-        for (k, [a, b]) in self.orders.iter().enumerate() {
+        for (k, (along, [a, b])) in all.enumerate() {
             let column = waves.col_as_slice_mut(k);
             column.iter_mut().zip(along[0][*a].iter().zip(&along[1][*b])).for_each(|(value, (u, v))| *value = u * v);
         }
@@ -93,20 +119,40 @@ impl Waves {
         (0..self.counts[axis]).map(of).collect()
     }
 
+    /// Legendre's polynomials along an axis at some distances, each of the mean square of a cosine: a vector a degree, a number a distance.
+    fn polynomials(&self, axis: usize, at_mm: &[f64]) -> Vec<Vec<f64>> {
+        let root = self.lengths_mm[axis].sqrt().recip();
+        let places: Vec<f64> = at_mm.iter().map(|at| (at - self.middle_mm[axis]) / self.halves_mm[axis]).collect();
+        let mut all = vec![vec![1.0; places.len()], places.clone()];
+        for degree in 2..=self.degree {
+            let n = degree as f64;
+            let next = places.iter().zip(&all[degree - 1]).zip(&all[degree - 2]);
+            all.push(next.map(|((x, one), two)| ((2.0 * n - 1.0) * x * one - (n - 1.0) * two) / n).collect());
+        }
+        for (degree, values) in all.iter_mut().enumerate() {
+            let by = (2.0 * degree as f64 + 1.0).sqrt() * root;
+            values.iter_mut().for_each(|value| *value *= by);
+        }
+        all
+    }
+
     /// The waves along either axis of a grid, by which [`Self::on_grid`] tells fields there.
     pub(super) fn grid(&self, grid: &Grid) -> [Mat<f64>; 2] {
         [0, 1].map(|axis| {
             let at_mm: Vec<f64> =
                 (0..grid.counts[axis]).map(|k| grid.corner_mm[axis] + grid.spacing_mm * k as f64).collect();
-            let cosines = self.cosines(axis, &at_mm);
-            Mat::from_fn(at_mm.len(), cosines.len(), |r, c| cosines[c][r])
+            let all = [self.polynomials(axis, &at_mm), self.cosines(axis, &at_mm)].concat();
+            Mat::from_fn(at_mm.len(), all.len(), |r, c| all[c][r])
         })
     }
 
     /// A field by its coefficients at all nodes of a grid: u by v.
     pub(super) fn on_grid(&self, [along, across]: &[Mat<f64>; 2], coefficients: &[f64]) -> Mat<f64> {
-        let mut square = Mat::<f64>::zeros(self.counts[0], self.counts[1]);
-        self.orders.iter().zip(coefficients).for_each(|([a, b], of)| square[(*a, *b)] = *of);
+        let mut square = Mat::<f64>::zeros(along.ncols(), across.ncols());
+        let (polynomials, cosines) = coefficients.split_at(self.degrees.len().min(coefficients.len()));
+        self.degrees.iter().zip(polynomials).for_each(|([a, b], of)| square[(*a, *b)] = *of);
+        let first = [along.ncols() - self.counts[0], across.ncols() - self.counts[1]];
+        self.orders.iter().zip(cosines).for_each(|([a, b], of)| square[(first[0] + a, first[1] + b)] = *of);
         along * &square * across.transpose()
     }
 
@@ -177,7 +223,7 @@ mod tests {
         for (smoothness, near) in [(Smoothness::Never, 0.05), (Smoothness::Once, 0.02), (Smoothness::Endless, 0.02)] {
             for lay in [Lay::NONE, Lay::at(0.7, 3.0)] {
                 let field = Field { smoothness, lay, ..Field::new(1.0, 12.0) };
-                let waves = Waves::over(&PART, lay, 3000);
+                let waves = Waves::over(&PART, lay, 3000, 4);
                 for (a, b) in [([0.0, 0.0], [3.0, 1.0]), ([10.0, -5.0], [14.0, 2.0]), ([20.0, 10.0], [20.0, 2.0])] {
                     let [made, exact] = [covariance(&waves, &field, [a, b]), field.covariance_mm2(a, b)];
                     assert!((made - exact).abs() < near, "{smoothness:?} {lay:?} {a:?}: {made} {exact}");
@@ -191,15 +237,50 @@ mod tests {
 
     #[test]
     fn what_shorter_waves_would_have_is_told() {
-        let waves = Waves::over(&PART, Lay::NONE, 200);
+        let waves = Waves::over(&PART, Lay::NONE, 200, 0);
         let left = [20.0, 5.0, 1.0].map(|range_mm| waves.strengths(Smoothness::Never, range_mm).1);
         assert!(left[0] < 0.2 && left[1] > 0.3 && left[2] > 0.8 && left[2] < 1.0, "{left:?}");
         assert!(waves.strengths(Smoothness::Endless, 30.0).1 < 0.02);
     }
 
     #[test]
+    fn polynomials_over_the_part_are_independent_and_only_long_smooth_fields_have_them() {
+        let waves = Waves::over(&PART, Lay::NONE, 10, 4);
+        let count = waves.degrees.len();
+        assert_eq!(count, 12);
+        // Midpoints of 200 by 200 tiles; each polynomial has the mean square of a cosine, 1 / (78 mm 58 mm).
+        let at = |k: usize, n: f64| (k as f64 + 0.5) / 200.0 * 2.0 * n - n;
+        let tiles: Vec<[f64; 2]> = (0..40_000).map(|k| [at(k % 200, 30.0), at(k / 200, 20.0)]).collect();
+        let values = waves.at(&tiles);
+        for a in 0..count {
+            for b in 0..count {
+                let mean: f64 = (0..tiles.len()).map(|r| values[(r, a)] * values[(r, b)]).sum::<f64>() / 40_000.0;
+                let expected = if a == b { 1.0 } else { 0.0 };
+                assert!((mean * 78.0 * 58.0 - expected).abs() < 2e-3, "{a} {b}: {mean}");
+            }
+        }
+        // At (30, -20) the product of the polynomials of degree 2 is 1, and so 5 by their mean squares.
+        let two_by_two = waves.degrees.iter().position(|degrees| *degrees == [2, 2]).unwrap();
+        let corner = waves.at(&[[30.0, -20.0]])[(0, two_by_two)];
+        assert!((corner - 5.0 / (78.0_f64 * 58.0).sqrt()).abs() < 1e-12, "{corner}");
+        for (smoothness, range_mm, has) in [
+            (Smoothness::Endless, 61.0, true),
+            (Smoothness::Once, 61.0, true),
+            (Smoothness::Endless, 59.0, false),
+            (Smoothness::Never, 200.0, false),
+        ] {
+            let (strengths, _) = waves.strengths(smoothness, range_mm);
+            assert!(strengths[..count].iter().all(|strength| (*strength > 0.0) == has), "{smoothness:?} {range_mm}");
+        }
+        let line: Vec<[f64; 2]> = (0..30).map(|k| [f64::from(k), 1.0 + 1e-15 * f64::from(k % 3)]).collect();
+        assert!(
+            Waves::over(&line, Lay::at(0.3, 2.0), 10, 4).at(&line).col_iter().all(|column| column.norm_max() < 1e3)
+        );
+    }
+
+    #[test]
     fn on_a_grid_a_field_is_what_it_is_at_each_of_its_places() {
-        let waves = Waves::over(&PART, Lay::at(0.4, 2.0), 60);
+        let waves = Waves::over(&PART, Lay::at(0.4, 2.0), 60, 4);
         let grid = Grid { corner_mm: [-5.0, 2.0], spacing_mm: 1.5, counts: [4, 3] };
         let coefficients: Vec<f64> = (0..60).map(|k| (f64::from(k) * 0.7).sin()).collect();
         let on = waves.on_grid(&waves.grid(&grid), &coefficients);
