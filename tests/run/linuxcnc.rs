@@ -15,45 +15,19 @@ use regrind::cell::{AlarmId, StateName};
 use regrind::drive::{Request, ask};
 use serde_json::Value;
 
+use crate::namespaces::{ACCOUNT, in_namespaces};
 use crate::program::{Running, changed, only_run, regrind, replaced, root, run, run_folders};
 
-/// Set for the test that runs within.
-const WITHIN: &str = "REGRIND_WITHIN_LINUXCNC";
-/// LinuxCNC does not run as root.
-const ACCOUNT: [&str; 6] = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "env", "HOME=/tmp/home"];
+/// LinuxCNC does not run as root, and that account has a home of its own.
+const AT_HOME: [&str; 2] = ["env", "HOME=/tmp/home"];
 const FOLDER: &str = "/tmp/regrind-linuxcnc";
 
-/// Runs a test beside a controller of its own; `name` is its path in this program.
+/// Runs a test beside a controller of its own, for every controller here has the same address; `name` is its path in this program.
 fn beside_linuxcnc(name: &str, test: impl FnOnce(&Path)) {
-    if std::env::var_os(WITHIN).is_some() {
-        let home = tempfile::tempdir().unwrap();
+    in_namespaces(name, |home| {
         let _controller = controller();
-        return test(home.path());
-    }
-    // Locks of machines are kept outside /tmp too, and every controller here has the same address. What is tried may itself lie in one of these folders.
-    let prepare = "needed=\"$1 $2\"; shift 2
-    for folder in /tmp /run/lock /var/lock /var/tmp; do
-        [ -d $folder ] || continue
-        mount --bind $folder /mnt
-        mount -t tmpfs tmpfs $folder; chmod 1777 $folder
-        for path in $needed; do
-            case $path in $folder/*) mkdir -p $path; mount --bind /mnt/${path#$folder/} $path ;; esac
-        done
-        umount /mnt
-    done
-    ip link set lo up; exec \"$@\"";
-    let program = std::env::current_exe().unwrap();
-    let built = program.parent().and_then(Path::parent).unwrap();
-    let mut command = Command::new("unshare");
-    command.args(["--ipc", "--net", "--pid", "--mount", "--fork", "--mount-proc", "--kill-child"]);
-    command.args(["sh", "-euc", prepare, "sh"]).arg(root()).arg(built).arg(&program);
-    command.args(["--exact", name, "--include-ignored", "--nocapture"]);
-    command.env(WITHIN, "1").env_remove("TMPDIR").env_remove("DISPLAY");
-    let output = command.output().expect("unshare starts");
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    let (told, errors) = (text(&output.stdout), text(&output.stderr));
-    assert!(output.status.success() && told.contains("1 passed"), "{told}\n{errors}");
-    println!("{told}");
+        test(home);
+    });
 }
 
 /// Starts LinuxCNC as it is shipped, by an account of its own.
@@ -66,7 +40,7 @@ fn controller() -> Running {
     );
     assert!(Command::new("sh").args(["-euc", &script]).status().unwrap().success());
     let mut start = Command::new(ACCOUNT[0]);
-    start.args(&ACCOUNT[1..]).args(["/tmp/linuxcnc/start", FOLDER]).current_dir("/tmp");
+    start.args(&ACCOUNT[1..]).args(AT_HOME).args(["/tmp/linuxcnc/start", FOLDER]).current_dir("/tmp");
     let mut controller = Running::new(start);
     controller.line("controller", |line| line.starts_with("LinuxCNC answers"));
     controller
@@ -113,7 +87,8 @@ loading_turn_deg = 0.0005
 
 /// The shipped cell, whose programs are run by another account here.
 fn cell(home: &Path) -> String {
-    let words: Vec<String> = ACCOUNT.iter().chain(&["/tmp/linuxcnc/executed-path"]).map(|w| format!("{w:?}")).collect();
+    let words: Vec<String> =
+        ACCOUNT.iter().chain(&AT_HOME).chain(&["/tmp/linuxcnc/executed-path"]).map(|w| format!("{w:?}")).collect();
     let path = home.join("cell.toml");
     let by_account = [("[\"linuxcnc/executed-path\"]", format!("[{}]", words.join(", ")))];
     let changes: Vec<(&str, &str)> = by_account.iter().map(|(from, to)| (*from, to.as_str())).collect();
@@ -257,7 +232,7 @@ fn a_stop_circuit_that_opens_while_linuxcnc_grinds_is_a_fault_of_the_machine() {
         let (state, alarms) = stands_after(home, || {
             for words in [&["unlinkp", "iocontrol.0.emc-enable-in"][..], &["setp", "iocontrol.0.emc-enable-in", "0"]] {
                 let mut command = Command::new(ACCOUNT[0]);
-                command.args(&ACCOUNT[1..]).arg("halcmd").args(words);
+                command.args(&ACCOUNT[1..]).args(AT_HOME).arg("halcmd").args(words);
                 assert!(command.status().unwrap().success(), "{words:?}");
             }
         });

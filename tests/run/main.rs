@@ -27,10 +27,12 @@ mod keep;
 mod killed;
 mod learning;
 mod linuxcnc;
+mod local_users;
 mod lying;
 mod manual;
 mod mirror_cell;
 mod mirror_run;
+mod namespaces;
 mod orders;
 #[path = "../common/outlived.rs"]
 mod outlived;
