@@ -7,7 +7,7 @@
 use divan::Bencher;
 use nalgebra::DMatrix;
 use regrind::geometry::{Point, Pose};
-use regrind::model::{Dense, Field, Form, Given, Growing, Hyper, Observed};
+use regrind::model::{DensePosterior, Field, Form, Hyperparameters, IncrementalPosterior, ModelInputs, Observed};
 use regrind::registration::{Options, Registration, Start, register};
 use regrind::surface::{Nominal, Projection};
 use regrind_sim::form::FormError;
@@ -18,7 +18,8 @@ fn main() {
     divan::main();
 }
 
-const HYPER: Hyper = Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift: 0.0 };
+const HYPER: Hyperparameters =
+    Hyperparameters { field: Field::new(5e-3, 30.0), noise_sigma_mm: 3e-4, noise_autocorrelation: 0.0 };
 
 /// Points of a part of 102 x 62 mm with form, scatter, and the six motions of a part as effects.
 fn measured(count: u32) -> Observed {
@@ -30,7 +31,7 @@ fn measured(count: u32) -> Observed {
     let scatter = |k: usize| 5e-4 * ((k as f64 * 12.9898).sin() * 43_758.545_3).fract();
     let deviations_mm = places.iter().enumerate().map(|(k, &place)| shape(place) + scatter(k)).collect();
     let effects = motions(&places);
-    Observed { effects, ..Observed::without_effects(places, deviations_mm) }
+    Observed { fixed_effects: effects, ..Observed::without_effects(places, deviations_mm) }
 }
 
 /// What the six motions of a part that is bent both ways add at each place.
@@ -57,7 +58,7 @@ fn nodes(columns: u32, rows: u32) -> Vec<[f64; 2]> {
 #[divan::bench]
 fn a_batch_after_400_points(bencher: Bencher) {
     let (all, map) = (measured(420), nodes(40, 25));
-    bencher.bench(|| Dense::fit(&all, HYPER).unwrap().predict(&map));
+    bencher.bench(|| DensePosterior::fit(&all, HYPER).unwrap().predict(&map));
 }
 
 /// The same in place, beside 6,000 nodes: what is known of every one is brought up to date.
@@ -67,16 +68,16 @@ fn a_batch_after_400_points_in_place(bencher: Bencher) {
     let only = |from: usize, until: usize| Observed {
         places: all.places[from..until].to_vec(),
         deviations_mm: all.deviations_mm[from..until].to_vec(),
-        effects: all.effects.rows(from, until - from).into_owned(),
-        stated: DMatrix::zeros(until - from, 0),
+        fixed_effects: all.fixed_effects.rows(from, until - from).into_owned(),
+        random_effects: DMatrix::zeros(until - from, 0),
         path: Vec::new(),
     };
     let effects = motions(&map);
-    let mut before = Growing::over(map, effects, HYPER).unwrap();
-    before.tell(&only(0, 400)).unwrap();
+    let mut before = IncrementalPosterior::over(map, effects, HYPER).unwrap();
+    before.update(&only(0, 400)).unwrap();
     let batch = only(400, 420);
     bencher.with_inputs(|| before.clone()).bench_values(|mut model| {
-        model.tell(&batch).unwrap();
+        model.update(&batch).unwrap();
         model
     });
 }
@@ -85,13 +86,13 @@ fn a_batch_after_400_points_in_place(bencher: Bencher) {
 #[divan::bench(sample_count = 10)]
 fn a_measurement_of_1800_points(bencher: Bencher) {
     let found = registered(52, 35);
-    bencher.bench(|| Form::of(&found, &Given::default()).unwrap());
+    bencher.bench(|| Form::estimate(&found, &ModelInputs::default()).unwrap());
 }
 
 #[divan::bench(sample_count = 5)]
 fn a_scan_of_28476_points(bencher: Bencher) {
     let found = registered(226, 126);
-    bencher.bench(|| Form::of(&found, &Given::default()).unwrap());
+    bencher.bench(|| Form::estimate(&found, &ModelInputs::default()).unwrap());
 }
 
 /// A free form with an error of 1 um, touched in rows.
@@ -115,7 +116,7 @@ fn registered(columns: usize, rows: usize) -> Registration {
 #[divan::bench(sample_count = 5)]
 fn the_parameters_of_1800_points(bencher: Bencher) {
     let all = measured(1800);
-    bencher.bench(|| Hyper::of(&all, None).unwrap());
+    bencher.bench(|| Hyperparameters::estimate(&all, None).unwrap());
 }
 
 /// The same of points that were measured along a path, whose drift is searched too.
@@ -123,5 +124,5 @@ fn the_parameters_of_1800_points(bencher: Bencher) {
 fn the_parameters_of_1800_points_along_a_path(bencher: Bencher) {
     let all = measured(1800);
     let all = Observed { path: (0..1800).map(f64::from).collect(), ..all };
-    bencher.bench(|| Hyper::of(&all, None).unwrap());
+    bencher.bench(|| Hyperparameters::estimate(&all, None).unwrap());
 }

@@ -7,7 +7,7 @@
 //! standard uncertainties at the places asked for, the effects, and the milliseconds that it took.
 
 use nalgebra::DMatrix;
-use regrind::model::{Dense, Field, Hyper, Observed};
+use regrind::model::{DensePosterior, Field, Hyperparameters, Observed};
 use serde_json::{Value, json};
 
 fn main() {
@@ -24,14 +24,15 @@ fn main() {
     let columns = rows.first().map_or(0, Vec::len);
     let (seen, asked) = (places("places"), places("asked"));
     let effects = DMatrix::from_fn(seen.len(), columns, |r, c| rows[r][c]);
-    let observed = Observed { effects, ..Observed::without_effects(seen, numbers(&told["deviations_mm"])) };
+    let observed =
+        Observed { fixed_effects: effects, ..Observed::without_effects(seen, numbers(&told["deviations_mm"])) };
     let field = Field::new(number("sigma_mm"), number("range_mm"));
-    let hyper = Hyper { field, scatter_mm: number("scatter_mm"), drift: 0.0 };
+    let hyperparameters = Hyperparameters { field, noise_sigma_mm: number("scatter_mm"), noise_autocorrelation: 0.0 };
     let began = std::time::Instant::now();
-    let model = Dense::fit(&observed, hyper).expect("a model");
+    let model = DensePosterior::fit(&observed, hyperparameters).expect("a model");
     let said = model.predict(&asked);
     let ms = 1e3 * began.elapsed().as_secs_f64();
-    let of = |of: fn(&regrind::model::Predicted) -> f64| said.iter().map(of).collect::<Vec<f64>>();
-    let found: Vec<f64> = model.effects().0.iter().copied().collect();
+    let of = |of: fn(&regrind::model::Prediction) -> f64| said.iter().map(of).collect::<Vec<f64>>();
+    let found: Vec<f64> = model.estimated_effects().0.iter().copied().collect();
     println!("{}", json!({ "mean_mm": of(|p| p.mean_mm), "sigma_mm": of(|p| p.sigma_mm), "effects": found, "ms": ms }));
 }

@@ -13,7 +13,7 @@ use std::f64::consts::{PI, TAU};
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use regrind::geometry::{Point, Pose};
-use regrind::model::{Form, Given, Interval};
+use regrind::model::{Form, Interval, ModelInputs};
 use regrind::registration::{Deviation, Options, PointStatus, Start, register};
 use regrind::surface::{Nominal, Projection};
 use regrind_sim::form::FormError;
@@ -168,7 +168,7 @@ fn told(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64
         left_out.for_each(|k| cloud[k] = touch((&places[k], &again[k])));
         found = register(nominal, &cloud, &options).ok()?;
     }
-    let told = Form::of(&found, &Given::default()).ok()?;
+    let told = Form::estimate(&found, &ModelInputs::default()).ok()?;
     // The same part without scatter, where the registration found it: a tilt moves the feet, and over strong forms that is no effect of first order.
     let held = Options { start: Start::Pose(found.cmm_from_model), locked: [true; 6], ..options };
     let true_at = |places: &[[f64; 2]]| {

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use regrind::cell::{PvOf, Tolerance};
 use regrind::drive::Adaptive;
 use regrind::geometry::{Point, Pose, Vector};
-use regrind::model::{FEWEST, FIRST, Given, SoFar, Why, look, spread};
+use regrind::model::{FIRST_BATCH, MIN_TOUCHES, ModelInputs, PartialMeasurement, Reason, decide, farthest_points};
 use regrind::registration::{Options, Start, register};
 use regrind::surface::{Nominal, Projection};
 use regrind_sim::Rng;
@@ -151,44 +151,45 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
         pv_of: PvOf::MostPoints,
     };
     let adaptive = Adaptive { tolerance, accepted_risk: 0.025, most_cycles: 5 };
-    let given = Given { look_risk: adaptive.look_risk(), probe_scatter_mm: [SCATTER_MM, 0.15], ..Given::default() };
+    let given =
+        ModelInputs { look_risk: adaptive.look_risk(), probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() };
     let mut tried = vec![None; targets.len()];
     let mut touched: Vec<usize> = Vec::new();
     // As in a run: ten for the gates, then so many that a look says something.
-    let fewest = spread(&targets, FEWEST);
-    let mut next = fewest[FIRST..].to_vec();
-    fewest[..FIRST].iter().for_each(|&k| tried[k] = Some(0));
-    touched.extend(&fewest[..FIRST]);
+    let fewest = farthest_points(&targets, MIN_TOUCHES);
+    let mut next = fewest[FIRST_BATCH..].to_vec();
+    fewest[..FIRST_BATCH].iter().for_each(|&k| tried[k] = Some(0));
+    touched.extend(&fewest[..FIRST_BATCH]);
     for batch in 1.. {
         next.iter().for_each(|&k| tried[k] = Some(batch));
         touched.extend(&next);
         let cloud: Vec<Point> = touched.iter().map(|&k| centres[k]).collect();
         let options = Options { start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) };
         let found = register(nominal, &cloud, &options).expect("a registration");
-        let so_far = SoFar { targets: &targets, tried: &tried, touched: &touched };
-        let look = look(&found, &given, &so_far, &adaptive.purpose(true), seed).expect("a model");
-        if look.next.is_empty() {
+        let so_far = PartialMeasurement { targets: &targets, tried: &tried, touched: &touched };
+        let decision = decide(&found, &given, &so_far, &adaptive.purpose(true), seed).expect("a model");
+        if decision.next.is_empty() {
             let all: Vec<usize> = (0..targets.len()).filter(|&k| covers(k)).collect();
             let hit = touched.iter().filter(|&&k| covers(k)).count();
             // What would be seen of it by the whole pattern without scatter, and of the part without it.
             let planted = after_best_fit(&targets, |k| if covers(k) { surprise.height_mm } else { 0.0 });
             let without = after_best_fit(&targets, |k| form.height(targets[k].0.x, targets[k].0.y));
             let mean = |of: &dyn Fn(usize) -> f64| all.iter().map(|&k| of(k)).sum::<f64>() / all.len().max(1) as f64;
-            let told = mean(&|k| look.form.points[k].form.mean_mm - without[k]) / mean(&|k| planted[k]);
+            let told = mean(&|k| decision.form.points[k].form.mean_mm - without[k]) / mean(&|k| planted[k]);
             let whole = planted + without;
             let (rms_mm, pv_mm) = figures_mm(&whole);
             let conforms = rms_mm <= adaptive.tolerance.rms_mm && pv_mm <= adaptive.tolerance.pv_mm;
-            let is_accepted = look.why == Why::Within;
+            let is_accepted = decision.reason == Reason::Within;
             return Seen {
                 touches: touched.len(),
                 covered: all.len(),
                 hit,
-                found: look.why == Why::All || told > 0.5,
+                found: decision.reason == Reason::All || told > 0.5,
                 conforms,
                 is_wrong: is_accepted && !conforms,
             };
         }
-        next = look.next;
+        next = decision.next;
     }
     unreachable!()
 }

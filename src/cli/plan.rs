@@ -8,7 +8,7 @@ use regrind::compensation::path::{ArcSummary, Peak, Scallops, Summary, ToolPath}
 use regrind::config::{BUILT_IN, CellConfig};
 use regrind::drive::Task;
 use regrind::formats::gcode::GcodeError;
-use regrind::model::FIRST;
+use regrind::model::FIRST_BATCH;
 use regrind::recipe::Recipe;
 use regrind::setup::{self, SCALLOP_SHARE};
 use serde::Serialize;
@@ -434,7 +434,8 @@ fn words(d: &Document) -> String {
         match (d.targets, d.touches_are_chosen) {
             (0, _) => "where the operator takes the points".to_owned(),
             (targets, false) => counted(targets, "point"),
-            (targets, true) => format!("{FIRST} of {}, then batches until enough is known", counted(targets, "point")),
+            (targets, true) =>
+                format!("{FIRST_BATCH} of {}, then batches until enough is known", counted(targets, "point")),
         },
         d.sphere_points,
         d.tracks,

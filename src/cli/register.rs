@@ -9,7 +9,7 @@ use regrind::formats::{
     read_measured_with_notes, save_form, save_registration,
 };
 use regrind::geometry::Pose;
-use regrind::model::{AngleInterval, Form, Given, Interval, IsoFigures, SlopeFigures};
+use regrind::model::{AngleInterval, Form, Interval, IsoFigures, ModelInputs, SlopeFigures};
 use regrind::registration::{Coordinate, Loss, Method, Options, ProbeSide, Start, register};
 use regrind::surface::{Distance, Nominal, NominalKind, Projection};
 
@@ -117,7 +117,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     document.check().map_err(|what| Failure::NotFinite { what })?;
     save_registration(folder.path(), &document, &registration.deviations).map_err(Failure::NotSaved)?;
     let form = if arguments.model {
-        Some(Form::of(&registration, &Given::default()).map_err(Failure::NoModel)?)
+        Some(Form::estimate(&registration, &ModelInputs::default()).map_err(Failure::NoModel)?)
     } else {
         None
     };
@@ -230,13 +230,13 @@ fn form_in_words(form: &Form) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let within =
         |figure: &Interval| format!("{} um ({} to {})", um(figure.median_mm), um(figure.low_mm), um(figure.high_mm));
-    let Form { hyper, figures, frame_covariance, .. } = form;
-    let drift = match hyper.drift {
+    let Form { hyperparameters, figures, frame_covariance, .. } = form;
+    let drift = match hyperparameters.noise_autocorrelation {
         0.0 => String::new(),
         drift => format!(", of which the next point along the path has {} %", (100.0 * drift).round()),
     };
-    let lay = hyper.field.lay.angle_rad().map_or(String::new(), |angle_rad| {
-        let (times, degrees) = (three_digits(hyper.field.lay.stretch), angle_rad.to_degrees().round());
+    let lay = hyperparameters.field.lay.angle_rad().map_or(String::new(), |angle_rad| {
+        let (times, degrees) = (three_digits(hyperparameters.field.lay.stretch), angle_rad.to_degrees().round());
         format!(", {times} times as wide along {degrees} degrees from x as across")
     });
     let sigma = [0, 1, 2].map(|k| um(frame_covariance[(k, k)].sqrt())).join(", ");
@@ -255,9 +255,9 @@ fn form_in_words(form: &Form) -> String {
         within(&figures.rms),
         within(&figures.pv),
         within(&figures.pv_most_points),
-        um(hyper.field.sigma_mm),
-        three_digits(hyper.field.range_mm),
-        um(hyper.scatter_mm),
+        um(hyperparameters.field.sigma_mm),
+        three_digits(hyperparameters.field.range_mm),
+        um(hyperparameters.noise_sigma_mm),
     )
 }
 

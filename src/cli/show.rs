@@ -11,7 +11,7 @@ use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, Judgement, PvOf, To
 use regrind::document::visible;
 use regrind::drive::{CycleRow, Notice, SoFar};
 use regrind::formats::read_error_map;
-use regrind::model::FIRST;
+use regrind::model::FIRST_BATCH;
 use regrind::recipe::{Mode, Recipe};
 use regrind::report::in_air;
 use tokio::sync::mpsc;
@@ -193,8 +193,10 @@ impl Show {
         let (points, outliers) = (figures.points, figures.outliers);
         if let Some(TouchOn { targets, why }) = figures.touch_on.as_deref() {
             // Of the first touches nothing is known but that they belong to this part.
-            let known =
-                figures.form.filter(|_| points as usize > FIRST).map_or(String::new(), |_| format!("{pv}, {rms}; "));
+            let known = figures
+                .form
+                .filter(|_| points as usize > FIRST_BATCH)
+                .map_or(String::new(), |_| format!("{pv}, {rms}; "));
             self.line(&format!("cycle {cycle}: {known}{points} points; {targets} more, for {why}"))?;
             return self.picture(cycle);
         }

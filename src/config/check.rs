@@ -233,10 +233,10 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
     })
 }
 
-fn uncertainty(written: &UncertaintyTable) -> model::Machine {
+fn uncertainty(written: &UncertaintyTable) -> model::MachineUncertainty {
     const MILLIONTH: f64 = 1e-6;
     const UM: f64 = 1e-3;
-    model::Machine {
+    model::MachineUncertainty {
         scale: written.scale_ppm.map(|ppm| MILLIONTH * ppm),
         squareness_rad: written.squareness_urad.map(|urad| MILLIONTH * urad),
         probe_mm: UM * written.probe_um,

@@ -19,7 +19,7 @@ use crate::device::{RegisterMap, Signal, Timing, Wire};
 use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
 use crate::formats::gcode::Dialect;
 use crate::geometry::{Point, Pose};
-use crate::model::Machine;
+use crate::model::MachineUncertainty;
 
 pub use dialect::{dialect_schema, dialects, parse_dialect, read_dialect};
 #[cfg(feature = "plant")]
@@ -59,7 +59,7 @@ pub struct Cmm {
     /// Standard uncertainty of the temperature of the part that it tells.
     pub temperature_uncertainty_k: f64,
     /// What it does to all points together, as standard uncertainties.
-    pub uncertainty: Machine,
+    pub uncertainty: MachineUncertainty,
     /// The sphere on which the probe is checked.
     pub reference_sphere: Option<ReferenceSphere>,
     /// The box that the probe's centre must not leave.

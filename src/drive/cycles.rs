@@ -10,7 +10,7 @@ use super::task::{Cycle, Points, Product, Task};
 use crate::cell::Tolerance;
 use crate::device::{CorrectionMap, Pass, Plan};
 use crate::geometry::Pose;
-use crate::model::{FIRST, Taught, short_way, spread};
+use crate::model::{FIRST_BATCH, PartPriors, farthest_points, short_tour};
 
 /// The cycles, by number.
 #[derive(Default)]
@@ -101,13 +101,13 @@ impl Cycles {
 
     /// Returns what earlier parts taught of the fields of errors, with the last judged pass of either kind of this one. What other cells taught is
     /// left out: it would come back to them as this one's.
-    pub(super) fn taught(&self, task: &Task) -> Taught {
+    pub(super) fn taught(&self, task: &Task) -> PartPriors {
         let of_this_cell = task.learned.as_ref().filter(|learned| learned.taught_by.is_none());
         let mut taught = of_this_cell.map(|learned| learned.fields).unwrap_or_default();
         for is_corrected in [false, true] {
             let alike = |cycle: &&Cycle| cycle.is_judged() && cycle.correction.is_none() != is_corrected;
             if let Some(field) = self.0.values().filter(alike).filter_map(|cycle| cycle.field).next_back() {
-                taught.take(is_corrected, &field);
+                taught.update(is_corrected, &field);
             }
         }
         taught
@@ -141,7 +141,7 @@ fn batch(task: &Task, cycle: &mut Cycle, pose: &Pose, seated_anew: bool) -> Plan
         Some(next) => Arc::clone(next),
         None => {
             let places = task.places();
-            Arc::new(short_way(&places, spread(&places, FIRST)))
+            Arc::new(short_tour(&places, farthest_points(&places, FIRST_BATCH)))
         }
     };
     let is_first = cycle.batch == 0;

@@ -14,7 +14,7 @@ use crate::formats::gcode::GcodeError;
 use crate::formats::{CellRun, CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
 use crate::geometry::{Grid, Point, Pose, Sample, Vector};
 use crate::measuring::{self, Expansion, sphere_targets};
-use crate::model::{FIRST, Form, Hyper, Machine, Purpose, spread};
+use crate::model::{FIRST_BATCH, Form, Hyperparameters, MachineUncertainty, StoppingCriteria, farthest_points};
 use crate::registration::{
     Deviation, MapLimits, Method, Options, PointStatus, Registration, RegistrationError, Start, register,
 };
@@ -89,7 +89,7 @@ pub struct Task {
     /// How part and scales grow with their temperature, where the recipe tells it of the part.
     pub expansion: Option<Expansion>,
     /// What the measuring machine does to all points together, as its cell file states it.
-    pub machine: Machine,
+    pub machine: MachineUncertainty,
     /// What is accepted, as the plan of the cell has it.
     pub tolerance: Tolerance,
     /// How touches are chosen; none where all targets are touched.
@@ -124,7 +124,7 @@ pub struct Adaptive {
 
 impl Adaptive {
     /// Share of the first touches that is left where one of them finds nothing.
-    pub const ONE_MAY_MISS: f64 = 1.0 - 1.0 / FIRST as f64;
+    pub const ONE_MAY_MISS: f64 = 1.0 - 1.0 / FIRST_BATCH as f64;
     /// Looks that are taken at a measurement, most often: each may err with its share of the accepted risk.
     const LOOKS: f64 = 5.0;
     /// Share of the tolerance of the rms to which a form has to be known to be corrected: beside what a pass adds that is next to nothing.
@@ -139,14 +139,14 @@ impl Adaptive {
     }
 
     /// What a measurement after a pass is to tell.
-    pub fn purpose(&self, may_grind: bool) -> Purpose {
+    pub fn purpose(&self, may_grind: bool) -> StoppingCriteria {
         let Tolerance { pv_mm, rms_mm, pv_of, .. } = self.tolerance;
         let (pv_mm, pv_most_points_mm) = match pv_of {
             PvOf::All => (pv_mm, f64::INFINITY),
             PvOf::MostPoints => (f64::INFINITY, pv_mm),
         };
         let correction_mm = Self::KNOWN * rms_mm.min(Self::RMS_OF_PV * pv_mm.min(pv_most_points_mm));
-        Purpose { pv_mm, pv_most_points_mm, rms_mm, correction_mm, may_grind }
+        StoppingCriteria { pv_mm, pv_most_points_mm, rms_mm, correction_mm, may_grind }
     }
 }
 
@@ -186,7 +186,7 @@ pub(super) struct Cycle {
     pub(super) registration: Option<Arc<Registration>>,
     pub(super) form: Option<Arc<Form>>,
     /// What its points alone tell of the field of its error; none where they show none.
-    pub(super) field: Option<Hyper>,
+    pub(super) field: Option<Hyperparameters>,
     pub(super) error: Option<Arc<ErrorMap>>,
     /// What is known of the grinder with this cycle taken in.
     pub(super) known: Option<Arc<LearningState>>,
@@ -264,7 +264,7 @@ pub(super) struct Registered {
     /// What the model of the error says of it; none where it can say nothing.
     pub(super) form: Option<Form>,
     /// What the points alone tell of the field of the error.
-    pub(super) field: Option<Hyper>,
+    pub(super) field: Option<Hyperparameters>,
     pub(super) error: Option<ErrorMap>,
     pub(super) known: Option<LearningState>,
     pub(super) parameters: Option<Parameters>,
@@ -477,7 +477,7 @@ impl Task {
     /// Where the part may have been seated anew, a few targets as far apart as the part has them come first, and slowly: what lies
     /// otherwise than expected is met at them.
     pub fn plan(&self, level_mm: f64, cmm_from_model: &Pose, seated_anew: bool) -> Plan {
-        let first = if seated_anew { spread(&self.places(), CAREFUL_TARGETS) } else { Vec::new() };
+        let first = if seated_anew { farthest_points(&self.places(), CAREFUL_TARGETS) } else { Vec::new() };
         let rest = (0..self.targets.len()).filter(|k| !first.contains(k)).collect();
         self.plan_of(level_mm, cmm_from_model, (first, rest), true)
     }

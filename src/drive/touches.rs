@@ -5,12 +5,14 @@ use crate::compensation::{ErrorMap, told_map};
 use crate::device::Number;
 use crate::geometry::{Sample, Vector};
 use crate::measuring::Target;
-use crate::model::{self, FEWEST, Form, Given, MOST_BATCHES, SoFar, Why, short_way, spread};
+use crate::model::{
+    self, Form, MAX_BATCHES, MIN_TOUCHES, ModelInputs, PartialMeasurement, Reason, farthest_points, short_tour,
+};
 use crate::registration::{Deviation, PointStatus, Registration};
 use crate::surface::{OffsetSurface, Place, Side};
 
 // Behind the most batches comes one of all that is left, and a machine must not take it for another.
-const _: () = assert!(MOST_BATCHES < Number::BATCHES - 1);
+const _: () = assert!(MAX_BATCHES < Number::BATCHES - 1);
 
 /// What a look told.
 pub(super) struct Looked {
@@ -26,7 +28,7 @@ pub(super) fn look(
     adaptive: &Adaptive,
     (number, cycle): (u32, &Cycle),
     points: &Points,
-    (found, given): (&Registration, Given),
+    (found, given): (&Registration, ModelInputs),
 ) -> Looked {
     let places = task.places();
     let mut tried = vec![None; places.len()];
@@ -34,17 +36,17 @@ pub(super) fn look(
         targets.iter().for_each(|&target| tried[target] = Some(batch));
     }
     let open = |chosen: Vec<usize>| chosen.into_iter().filter(|&k| tried[k].is_none()).collect();
-    let first: Vec<usize> = open(spread(&places, FEWEST));
+    let first: Vec<usize> = open(farthest_points(&places, MIN_TOUCHES));
     if points.tried.len() == 1 && !first.is_empty() {
         let why = "the part is where it should be";
-        return Looked { form: Err(why.to_owned()), next: Some((short_way(&places, first), why)) };
+        return Looked { form: Err(why.to_owned()), next: Some((short_tour(&places, first), why)) };
     }
-    let so_far = SoFar { targets: &places, tried: &tried, touched: &points.of };
+    let so_far = PartialMeasurement { targets: &places, tried: &tried, touched: &points.of };
     let purpose = adaptive.purpose(u32::from(cycle.correction.cycle) < adaptive.most_cycles);
-    let given = Given { look_risk: adaptive.look_risk(), probability: adaptive.tolerance.probability, ..given };
-    match model::look(found, &given, &so_far, &purpose, u64::from(number)) {
+    let given = ModelInputs { look_risk: adaptive.look_risk(), probability: adaptive.tolerance.probability, ..given };
+    match model::decide(found, &given, &so_far, &purpose, u64::from(number)) {
         Ok(look) => {
-            let next = (!look.next.is_empty()).then(|| (look.next, in_words(look.why)));
+            let next = (!look.next.is_empty()).then(|| (look.next, in_words(look.reason)));
             Looked { form: Ok(look.form), next }
         }
         // What no model can be made of is touched everywhere.
@@ -108,20 +110,20 @@ fn on_nominal(task: &Task, near: &Target) -> Target {
     }
 }
 
-fn in_words(why: Why) -> &'static str {
+fn in_words(why: Reason) -> &'static str {
     match why {
-        Why::Within => "it is in tolerance",
-        Why::Known => "its form is known well enough for a correction",
-        Why::Enough => "another pass mends more than more touches would",
-        Why::All => "every target was touched",
-        Why::Few => "these are too few to say anything",
-        Why::Surprised => "the last touches are not where they were expected",
-        Why::Around => "a touch stands out, and around it nothing is known",
-        Why::Feature => "something narrow stands on the part, so every target is touched",
-        Why::Undecided => "it may be in tolerance and may not be",
-        Why::Unknown => "its form is not known well enough for a correction",
-        Why::Beyond => "it is out of tolerance, and no pass is left",
-        Why::Late => "so many batches were touched that the rest is touched at once",
+        Reason::Within => "it is in tolerance",
+        Reason::Known => "its form is known well enough for a correction",
+        Reason::Enough => "another pass mends more than more touches would",
+        Reason::All => "every target was touched",
+        Reason::Few => "these are too few to say anything",
+        Reason::Surprised => "the last touches are not where they were expected",
+        Reason::Around => "a touch stands out, and around it nothing is known",
+        Reason::Feature => "something narrow stands on the part, so every target is touched",
+        Reason::Undecided => "it may be in tolerance and may not be",
+        Reason::Unknown => "its form is not known well enough for a correction",
+        Reason::Beyond => "it is out of tolerance, and no pass is left",
+        Reason::Late => "so many batches were touched that the rest is touched at once",
     }
 }
 
@@ -129,5 +131,5 @@ fn in_words(why: Why) -> &'static str {
 pub(super) fn map(task: &Task, form: &Form) -> Option<ErrorMap> {
     let of = |p: &model::FormPoint| (Sample { at_mm: p.at_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
     let told: Vec<_> = form.points.iter().map(of).collect();
-    told_map(&told, &task.map, form.hyper.scatter_mm).ok()
+    told_map(&told, &task.map, form.hyperparameters.noise_sigma_mm).ok()
 }

@@ -23,7 +23,7 @@ use crate::formats::{
 };
 use crate::geometry::{Point, Vector};
 use crate::measuring::fit_sphere;
-use crate::model::{self, Form, Given, Lesson, Priors, Taught};
+use crate::model::{self, Form, ModelInputs, PartFit, PartPriors, Prior};
 use crate::registration::{Options, PointStatus as Fate, Registration, Verdict, weak_for_compensation};
 
 use super::maps;
@@ -336,23 +336,23 @@ fn registered(
         return Err(Unfinished::For(why));
     }
     found.allow_for_radius(points.radius_sigma_mm.hypot(task.machine.reference_sphere_mm));
-    let given = Given {
+    let given = ModelInputs {
         machine: task.machine,
         priors: priors(task, cycle, before),
         radius_sigma_mm: points.radius_sigma_mm,
         scale_sigma,
         datum: task.held(),
         is_corrected: !cycle.correction.is_none(),
-        probe_scatter_mm: points.probe_scatter_mm,
+        probe_noise_mm: points.probe_scatter_mm,
         area: maps::area(task),
-        ..Given::default()
+        ..ModelInputs::default()
     };
     let looked = task.adaptive.as_ref().filter(|_| !points.tried.is_empty());
     let looked_at = looked.is_some();
     let looked = looked.map(|adaptive| touches::look(task, adaptive, (number, cycle), points, (&found, given)));
     let (form, next) = match looked {
         Some(touches::Looked { form, next }) => (form, next),
-        None => (Form::of(&found, &given).map_err(|error| error.to_string()), None),
+        None => (Form::estimate(&found, &given).map_err(|error| error.to_string()), None),
     };
     if looked_at && next.is_none() {
         files.settle().and_then(|()| save_points(task, files, points)).map_err(unfinished)?;
@@ -416,7 +416,7 @@ fn registered(
         let why = "a touch stands alone: it is made again, and a few around it".to_owned();
         figures.touch_on = Some(Box::new(TouchOn { targets, why }));
     }
-    let field = next.is_none().then(|| form.as_ref().ok()?.alone).flatten();
+    let field = next.is_none().then(|| form.as_ref().ok()?.hyperparameters_without_prior).flatten();
     Ok(Registered { registration: found, form: form.ok(), field, error, known, parameters, set, figures, next, again })
 }
 
@@ -427,11 +427,11 @@ fn offered(told: &compensation::Parameters) -> impl Iterator<Item = String> {
 
 /// What is expected of the field of the error of a cycle: what earlier parts taught of passes of its kind, or else the pass before it in this run, if it was
 /// of the same kind.
-fn priors(task: &Task, cycle: &Cycle, before: Option<&Cycle>) -> Option<Priors> {
+fn priors(task: &Task, cycle: &Cycle, before: Option<&Cycle>) -> Option<Prior> {
     let is_corrected = !cycle.correction.is_none();
-    let taught = task.learned.as_ref().and_then(|learned| learned.fields.of(is_corrected));
+    let taught = task.learned.as_ref().and_then(|learned| learned.fields.fit(is_corrected));
     let alike = before.filter(|before| before.correction.is_none() != is_corrected);
-    let of_this_part = || Some(Lesson::after(None, &alike?.field?));
+    let of_this_part = || Some(PartFit::updated(None, &alike?.field?));
     taught.or_else(of_this_part).map(|lesson| lesson.priors())
 }
 
@@ -477,7 +477,7 @@ fn figures(
     let outliers = found.deviations.iter().filter(|d| d.status == Fate::Outlier).count() as u32;
     // What the filter takes out is what a point scatters by: noise of the probe and the finest texture.
     let filtered_mm = error.map_or(verdict.residual_sigma_mm, |map| map.point_sigma_mm);
-    let scatter_mm = form.map_or(filtered_mm, |form| form.hyper.scatter_mm);
+    let scatter_mm = form.map_or(filtered_mm, |form| form.hyperparameters.noise_sigma_mm);
     let pv_robust_mm = pv_of_most(used(found).map(|d| d.deviation_mm));
     // Of two extreme points, each uncertain by the scatter; k = 2.
     let pv_expanded_mm = 2.0 * 2f64.sqrt() * scatter_mm;
@@ -526,8 +526,9 @@ fn figures(
 
 /// Counts what nobody states of what the uncertainty is made of; where nothing is held its place is no contribution.
 fn unstated(task: &Task, form: &Form) -> Option<[u32; 2]> {
-    let counts =
-        |share: &&model::Share| share.is_stated || share.source != model::Source::Datum || task.held().is_some();
+    let counts = |share: &&model::BudgetEntry| {
+        share.is_stated || share.source != model::UncertaintySource::Datum || task.held().is_some()
+    };
     let all: Vec<_> = form.budget.iter().filter(counts).collect();
     let some = all.iter().filter(|share| !share.is_stated).count();
     (!all.is_empty()).then_some([some as u32, all.len() as u32])
@@ -698,7 +699,7 @@ fn asks(cycle: &Cycle) -> Vec<String> {
 }
 
 /// What the next part of this kind can begin with; none where this run did not get so far.
-pub(super) fn learned(task: &Task, run: String, (cycle, fields): (&Cycle, Taught)) -> Option<Learned> {
+pub(super) fn learned(task: &Task, run: String, (cycle, fields): (&Cycle, PartPriors)) -> Option<Learned> {
     let known = cycle.known.as_deref()?;
     let wrong = [Response::SignFlipped, Response::Mirrored, Response::NoEffect, Response::Doubled];
     if cycle.figures.as_ref()?.response.is_some_and(|response| wrong.contains(&response)) {

@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::document::StandardUncertainty;
 use super::error::FormatError;
 use super::registration::{write_json_atomic, write_rows};
-use regrind_core::model::{Form, FormPoint, Interval, IsoFigures, Share, SlopeFigures};
+use regrind_core::model::{BudgetEntry, Form, FormPoint, Interval, IsoFigures, SlopeFigures};
 use regrind_core::registration::Registration;
 
 /// The columns of `form.csv`.
@@ -40,7 +40,7 @@ struct FormDocument<'a> {
     pv: Interval,
     pv_99_8: Interval,
     /// What the standard uncertainties of the figures come from; the squares of all add up.
-    budget: &'a [Share],
+    budget: &'a [BudgetEntry],
     /// The slopes of the smooth form, and what ISO 10110-5 says of the form; absent where the points are too few.
     #[serde(skip_serializing_if = "Option::is_none")]
     slope: Option<SlopeFigures>,
@@ -68,13 +68,13 @@ pub fn save_form(
     let sigma = |k: usize| covariance[(k, k)].max(0.0).sqrt();
     let document = FormDocument {
         simulation,
-        form_sigma_mm: form.hyper.field.sigma_mm,
-        form_range_mm: form.hyper.field.range_mm,
-        form_smoothness: form.hyper.field.smoothness.name(),
-        form_lay_stretch: form.hyper.field.lay.stretch,
-        form_lay_deg: form.hyper.field.lay.angle_rad().map(f64::to_degrees),
-        scatter_mm: form.hyper.scatter_mm,
-        scatter_drift: form.hyper.drift,
+        form_sigma_mm: form.hyperparameters.field.sigma_mm,
+        form_range_mm: form.hyperparameters.field.range_mm,
+        form_smoothness: form.hyperparameters.field.smoothness.name(),
+        form_lay_stretch: form.hyperparameters.field.lay.stretch,
+        form_lay_deg: form.hyperparameters.field.lay.angle_rad().map(f64::to_degrees),
+        scatter_mm: form.hyperparameters.noise_sigma_mm,
+        scatter_drift: form.hyperparameters.noise_autocorrelation,
         form_is_seen: form.is_seen,
         degrees_of_freedom: form.degrees_of_freedom,
         rms: form.figures.rms,

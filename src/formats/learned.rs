@@ -8,7 +8,7 @@ use thiserror::Error;
 use super::FormatError;
 use super::whole::read_whole;
 use regrind_core::compensation::{Alike, Correction, LearningState, Set, Shared};
-use regrind_core::model::Taught;
+use regrind_core::model::PartPriors;
 
 /// The file in a run folder.
 pub const LEARNED: &str = "learned.json";
@@ -34,7 +34,7 @@ pub struct Learned {
     pub known: LearningState,
     /// What this part and those before it taught of the fields of their errors; nothing in files of earlier versions.
     #[serde(default)]
-    pub fields: Taught,
+    pub fields: PartPriors,
     /// What other cells have to have in common with the passes to begin with what was learned; nothing in files of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub kind: Option<String>,
@@ -87,7 +87,7 @@ pub enum LearnedError {
 impl Learned {
     /// What a run leaves to the next part.
     pub fn new(simulation: bool, setting: String, run: String, correction: Correction, known: LearningState) -> Self {
-        let (fields, kind, taught_by) = (Taught::default(), None, None);
+        let (fields, kind, taught_by) = (PartPriors::default(), None, None);
         Self { layout: LAYOUT, simulation, setting, run, correction, known, fields, kind, taught_by }
     }
 
@@ -104,12 +104,12 @@ impl Learned {
         let known: Vec<&LearningState> = others.iter().map(|(_, other)| &other.known).collect();
         let Shared { known, differ } = fresh.begun_with(&known, alike, none.grid)?;
         let runs: Vec<CellRun> = others.iter().map(|(from, _)| from.clone()).collect();
-        let fields: Vec<Taught> = others.iter().map(|(_, other)| other.fields).collect();
+        let fields: Vec<PartPriors> = others.iter().map(|(_, other)| other.fields).collect();
         let named: Vec<String> = runs.iter().map(|CellRun { cell, run }| format!("{run} of {cell}")).collect();
         let correction = none.changed(&known, None);
         let taught_by = Some(TaughtBy { runs, differ, comparisons: alike.comparisons() });
         let learned = Self::new(simulation, setting, named.join(" and "), correction, known);
-        Some(Self { taught_by, ..learned.with_fields(Taught::of_machines(&fields)) })
+        Some(Self { taught_by, ..learned.with_fields(PartPriors::pooled(&fields)) })
     }
 
     /// The same for other cells too, that have this in common with it.
@@ -120,7 +120,7 @@ impl Learned {
 
     /// The same with what was taught of the fields.
     #[must_use]
-    pub fn with_fields(self, fields: Taught) -> Self {
+    pub fn with_fields(self, fields: PartPriors) -> Self {
         Self { fields, ..self }
     }
 
@@ -199,7 +199,7 @@ impl Learned {
         if self.correction.set.as_ref().is_some_and(|set| !set.is_sound(grid.len())) {
             return Some("a parameter of its correction cannot be, or is of another grid".into());
         }
-        if !self.fields.is_sound() {
+        if !self.fields.is_valid() {
             return Some("a number of what it knows of the fields of errors cannot be".into());
         }
         (!self.known.is_sound()).then(|| "a number of what it knows of the grinder cannot be".into())
@@ -224,7 +224,7 @@ mod tests {
     use super::*;
     use regrind_core::compensation::{ErrorMap, GainRule, MapOptions, Seen};
     use regrind_core::geometry::Grid;
-    use regrind_core::model::{Field, Hyper};
+    use regrind_core::model::{Field, Hyperparameters};
 
     const GRID: Grid = Grid { columns: 5, rows: 4, first_mm: [-2.0, -1.5], spacing_mm: [1.0, 1.0] };
 
@@ -290,8 +290,11 @@ mod tests {
 
     #[test]
     fn fields_are_kept_and_a_file_without_them_has_taught_nothing_of_them() {
-        let mut fields = Taught::default();
-        fields.take(true, &Hyper { field: Field::new(1e-3, 15.0), scatter_mm: 3e-4, drift: 0.0 });
+        let mut fields = PartPriors::default();
+        fields.update(
+            true,
+            &Hyperparameters { field: Field::new(1e-3, 15.0), noise_sigma_mm: 3e-4, noise_autocorrelation: 0.0 },
+        );
         let text = serde_json::to_string(&learned().with_fields(fields)).unwrap();
         assert_eq!(read(&text).unwrap().unwrap().0.fields, fields);
         // As earlier versions wrote it.

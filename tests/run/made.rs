@@ -4,7 +4,7 @@ use regrind::cell::PvOf;
 use regrind::compensation::told_map;
 use regrind::drive::Adaptive;
 use regrind::geometry::{Point, Sample, Vector};
-use regrind::model::{self, FEWEST, FIRST, Form, FormFigures, FormPoint, Given, SoFar};
+use regrind::model::{self, FIRST_BATCH, Form, FormFigures, FormPoint, MIN_TOUCHES, ModelInputs, PartialMeasurement};
 use regrind::registration::Registration;
 use regrind_sim::body::Body;
 use regrind_sim::spec::WorldSpec;
@@ -138,14 +138,14 @@ impl Line<'_> {
         let (touched, seconds) = self.touch(level_mm, &all);
         let points: Vec<Point> = touched.iter().map(|(_, point)| *point).collect();
         let found = self.registered(&points, level_mm);
-        let figures = Form::of(&found, &self.given()).unwrap().figures;
+        let figures = Form::estimate(&found, &self.given()).unwrap().figures;
         let error = self.error(&found);
         Took { touches: all.len(), seconds, why: String::new(), figures, found, error }
     }
 
     /// What the reference sphere tells of the probe.
-    fn given(&self) -> Given {
-        Given { probe_scatter_mm: [1e-3 * self.bench.spec.cmm.noise_um, 0.15], ..Given::default() }
+    fn given(&self) -> ModelInputs {
+        ModelInputs { probe_noise_mm: [1e-3 * self.bench.spec.cmm.noise_um, 0.15], ..ModelInputs::default() }
     }
 
     fn chosen(&self, level_mm: f64, seed: u64, cycle: u32) -> Took {
@@ -153,10 +153,10 @@ impl Line<'_> {
         let (tolerance, most_cycles) = (self.bench.plan.tolerance, self.bench.plan.max_cycles);
         let adaptive = Adaptive { tolerance, accepted_risk: 0.025, most_cycles };
         let purpose = adaptive.purpose(cycle < most_cycles);
-        let given = Given { look_risk: adaptive.look_risk(), ..self.given() };
+        let given = ModelInputs { look_risk: adaptive.look_risk(), ..self.given() };
         let mut tried = vec![None; targets.len()];
         let (mut all, mut seconds, mut path) = (Vec::new(), 0.0, Vec::new());
-        let mut next = model::short_way(targets, model::spread(targets, FIRST));
+        let mut next = model::short_tour(targets, model::farthest_points(targets, FIRST_BATCH));
         for batch in 0.. {
             let (touched, took_s) = self.touch(level_mm, &next);
             next.iter().for_each(|&k| tried[k] = Some(batch));
@@ -167,19 +167,19 @@ impl Line<'_> {
             if batch == 0 {
                 // The gates look at these; then so many more that a look says something.
                 let more: Vec<usize> =
-                    model::spread(targets, FEWEST).into_iter().filter(|&k| tried[k].is_none()).collect();
-                next = model::short_way(targets, more);
+                    model::farthest_points(targets, MIN_TOUCHES).into_iter().filter(|&k| tried[k].is_none()).collect();
+                next = model::short_tour(targets, more);
                 continue;
             }
             let found = self.registered(&points, level_mm);
-            let so_far = SoFar { targets, tried: &tried, touched: &of };
-            let look = model::look(&found, &given, &so_far, &purpose, seed).unwrap();
-            path.push(format!("{}{:?}", all.len(), look.why));
+            let so_far = PartialMeasurement { targets, tried: &tried, touched: &of };
+            let look = model::decide(&found, &given, &so_far, &purpose, seed).unwrap();
+            path.push(format!("{}{:?}", all.len(), look.reason));
             if look.next.is_empty() {
                 let form = &look.form;
                 let of = |p: &FormPoint| (Sample { at_mm: p.at_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
                 let told: Vec<_> = form.points.iter().map(of).collect();
-                let error = told_map(&told, &self.bench.task.map, form.hyper.scatter_mm).unwrap();
+                let error = told_map(&told, &self.bench.task.map, form.hyperparameters.noise_sigma_mm).unwrap();
                 let why = path.join(" ");
                 return Took { touches: all.len(), seconds, why, figures: form.figures, found, error };
             }

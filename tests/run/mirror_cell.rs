@@ -12,7 +12,7 @@ use regrind::device::exchange::{
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
 use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::geometry::{Point, Pose, Twist, Vector};
-use regrind::model::{Form, Given, Interval, ModelError, Priors, Sessions};
+use regrind::model::{Form, Interval, ModelError, ModelInputs, Prior, Sessions};
 use regrind::registration::{
     MapLimits, Options, PointStatus, Registration, Start, lateral_error, register, weak_for_compensation,
 };
@@ -185,11 +185,11 @@ fn session(data: &Path, nominal: &Nominal, name: &str) -> (Vec<Point>, Registrat
 fn told(by: &Registration, of: &Registration) -> (f64, f64) {
     let used: Vec<_> = of.deviations.iter().filter(|d| d.status == PointStatus::Used).collect();
     let places: Vec<(Point, Vector)> = used.iter().map(|d| (d.point, d.normal)).collect();
-    let form = Form::over(by, &Given::default(), &places).unwrap();
+    let form = Form::estimate_at(by, &ModelInputs::default(), &places).unwrap();
     let off: Vec<[f64; 2]> = used
         .iter()
         .zip(&form.points)
-        .map(|(d, p)| [d.deviation_mm - p.form.mean_mm, p.form.sigma_mm.hypot(form.hyper.scatter_mm)])
+        .map(|(d, p)| [d.deviation_mm - p.form.mean_mm, p.form.sigma_mm.hypot(form.hyperparameters.noise_sigma_mm)])
         .collect();
     let n = off.len() as f64;
     let rms_um = 1e3 * (off.iter().map(|[off, _]| off * off).sum::<f64>() / n).sqrt();
@@ -248,16 +248,16 @@ fn a_session_that_was_not_seen_is_foretold_with_what_its_stations_will_differ_by
     let days = names.map(|name| (session(&data, &nominal, name).1, stations(&data, name)));
     let (mut hits, mut count) = (0, 0);
     for [a, b] in [[0, 1], [1, 0]] {
-        let known = Sessions::of(&[(&days[a].0, &days[a].1)]).unwrap();
-        let unseen = Sessions::of(&[(&days[b].0, &days[b].1)]).unwrap();
-        let between = known.between(&Priors::of_size(3000.0)).unwrap();
-        let told = between.foretell(&known, &unseen).unwrap();
+        let known = Sessions::from_registrations(&[(&days[a].0, &days[a].1)]).unwrap();
+        let unseen = Sessions::from_registrations(&[(&days[b].0, &days[b].1)]).unwrap();
+        let between = known.between_session_variance(&Prior::for_size(3000.0)).unwrap();
+        let told = between.predict(&known, &unseen).unwrap();
         let found = unseen.deviations_mm();
         let pairs = || told.iter().zip(found);
         let within = pairs().filter(|(t, d)| (*d - t.mean_mm).abs() <= t.half_width_mm()).count();
         (hits, count) = (hits + within, count + found.len());
         let share = within as f64 / found.len() as f64;
-        let degrees = told.iter().map(|t| t.degrees).fold(f64::INFINITY, f64::min);
+        let degrees = told.iter().map(|t| t.degrees_of_freedom).fold(f64::INFINITY, f64::min);
         println!("{} left out, by the {} stations of {}: {between:.5?}", names[b], between.sessions, names[a]);
         println!(
             "  found {:.1} um rms, foretold {:.1}, off by {:.1}, sigma {:.1}; {:.1} % within 95 %, {degrees:.1} degrees of freedom at least",
@@ -270,7 +270,9 @@ fn a_session_that_was_not_seen_is_foretold_with_what_its_stations_will_differ_by
         assert!((0.90..=0.99).contains(&share), "{share}");
         // One day as one session does not tell what another day brings.
         let one = vec![1; days[a].1.len()];
-        let alone = Sessions::of(&[(&days[a].0, &one)]).unwrap().between(&Priors::of_size(3000.0));
+        let alone = Sessions::from_registrations(&[(&days[a].0, &one)])
+            .unwrap()
+            .between_session_variance(&Prior::for_size(3000.0));
         assert_eq!(alone.err(), Some(ModelError::TooFewSessions { sessions: 1, least: 2 }));
     }
     println!("{:.1} % of {count} points of both days within 95 %", 100.0 * hits as f64 / count as f64);
@@ -283,7 +285,7 @@ fn a_fifth_of_the_points_says_what_all_say_of_a_session() {
     let nominal = nominal();
     for name in ["20250824_M1_1", "20250825_M1"] {
         let (cloud, whole) = session(&data, &nominal, name);
-        let of_all = Form::of(&whole, &Given::default()).unwrap();
+        let of_all = Form::estimate(&whole, &ModelInputs::default()).unwrap();
         println!(
             "{name}: {} points, {:.1} um rms, {:.1} um PV",
             cloud.len(),
@@ -294,7 +296,7 @@ fn a_fifth_of_the_points_says_what_all_say_of_a_session() {
         for first in 0..5 {
             let few: Vec<Point> = cloud.iter().skip(first).step_by(5).copied().collect();
             let fifth = registered(&nominal, &few, [false; 6]);
-            let form = Form::of(&fifth, &Given::default()).unwrap();
+            let form = Form::estimate(&fifth, &ModelInputs::default()).unwrap();
             println!(
                 "  {} of them: {:.1} um rms, {:.1} um PV; form RMS {}; PV {}",
                 few.len(),

@@ -8,15 +8,15 @@ use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector};
 
 use super::Observed;
-use super::fields::Fields;
-use super::machine::Source;
+use super::hypotheses::FieldHypotheses;
+use super::machine_uncertainty::UncertaintySource;
 use super::posterior::Posterior;
 
 /// What one source makes of the standard uncertainty of the figures: the squares of all add up.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
-pub struct Share {
+pub struct BudgetEntry {
     /// The source.
-    pub source: Source,
+    pub source: UncertaintySource,
     /// Whether anything tells how large it is; where nothing does, it is taken for 0.
     pub is_stated: bool,
     /// Of the root mean square.
@@ -26,7 +26,7 @@ pub struct Share {
 }
 
 /// Forms that may have been, a column each, with their places and the motions that are taken off there.
-pub(super) struct Drawn<'a> {
+pub(super) struct SampledFigures<'a> {
     pub(super) forms: &'a DMatrix<f64>,
     pub(super) places: &'a [[f64; 2]],
     pub(super) effects: &'a DMatrix<f64>,
@@ -47,12 +47,12 @@ struct Parts {
 }
 
 /// Parts the standard uncertainties of root mean square and peak to valley; nothing where they cannot be.
-pub(super) fn parted(
-    (observed, sources): (&Observed, &[Source]),
-    (fields, posterior): (&Fields, &Posterior),
-    drawn: &Drawn,
+pub(super) fn decompose(
+    (observed, sources): (&Observed, &[UncertaintySource]),
+    (fields, posterior): (&FieldHypotheses, &Posterior),
+    drawn: &SampledFigures,
     uncertainties_mm: [f64; 2],
-) -> Vec<Share> {
+) -> Vec<BudgetEntry> {
     let (slopes, ground_in) = slopes(drawn);
     let of = |figure: usize| {
         let mut parts = parts(observed, fields, posterior, (drawn.places, &slopes[figure]))?;
@@ -60,22 +60,22 @@ pub(super) fn parted(
             parts.stated.clone_from(&ground_in[figure]);
         }
         let whole = parts.scatter + parts.form + parts.pose + parts.stated.iter().sum::<f64>();
-        let share = |source: Source| match source {
-            Source::Scatter => parts.scatter,
-            Source::Form => parts.form,
-            Source::Pose => parts.pose,
+        let share = |source: UncertaintySource| match source {
+            UncertaintySource::Scatter => parts.scatter,
+            UncertaintySource::Form => parts.form,
+            UncertaintySource::Pose => parts.pose,
             _ => parts.stated.iter().zip(sources).filter(|(_, of)| **of == source).map(|(part, _)| part).sum(),
         };
-        let of_whole = Source::ALL.map(|source| uncertainties_mm[figure] * (share(source) / whole).sqrt());
+        let of_whole = UncertaintySource::ALL.map(|source| uncertainties_mm[figure] * (share(source) / whole).sqrt());
         of_whole.iter().all(|part| part.is_finite()).then_some(of_whole)
     };
     let (Some(rms), Some(pv)) = (of(0), of(1)) else { return Vec::new() };
-    let told = [Source::Scatter, Source::Form, Source::Pose];
-    let one = |(k, &source): (usize, &Source)| {
+    let told = [UncertaintySource::Scatter, UncertaintySource::Form, UncertaintySource::Pose];
+    let one = |(k, &source): (usize, &UncertaintySource)| {
         let is_stated = told.contains(&source) || sources.contains(&source);
-        Share { source, is_stated, rms_mm: rms[k], pv_99_8_mm: pv[k] }
+        BudgetEntry { source, is_stated, rms_mm: rms[k], pv_99_8_mm: pv[k] }
     };
-    Source::ALL.iter().enumerate().map(one).collect()
+    UncertaintySource::ALL.iter().enumerate().map(one).collect()
 }
 
 /// Tells what the uncertainty of a sum a'f over places comes from: the variance of the field is that of sigma^2 D z with z of variance 1, and the
@@ -85,22 +85,22 @@ pub(super) fn parted(
 /// is left; that the motions are not known adds the rest.
 fn parts(
     observed: &Observed,
-    fields: &Fields,
+    fields: &FieldHypotheses,
     posterior: &Posterior,
     (places, slopes): (&[[f64; 2]], &DVector<f64>),
 ) -> Option<Parts> {
     let (node, tau, scatter_mm) = posterior.best()?;
     let field2 = tau * node.scale * scatter_mm.powi(2);
-    let scatter2 = scatter_mm.powi(2) + field2 * node.narrow;
+    let scatter2 = scatter_mm.powi(2) + field2 * node.truncated_variance;
     let slopes = Mat::from_fn(1, slopes.len(), |_, c| slopes[c]);
-    let sums = slopes * fields.waves.at(places);
-    let own = Mat::from_fn(node.strengths.len(), 1, |k, _| sums[(0, k)] * node.strengths[k]);
+    let sums = slopes * fields.basis.at(places);
+    let own = Mat::from_fn(node.standard_deviations.len(), 1, |k, _| sums[(0, k)] * node.standard_deviations[k]);
     let rows = fields.with_effects(node);
     let known = rows.nrows() - fields.effects();
     // The stated effects in the coordinates, behind the motions, and the part of them that no wave shows.
-    let (coordinates, products) = fields.coordinates(&observed.stated);
-    let of_effects = fields.of_effects(&observed.stated);
-    let stated = observed.stated.ncols();
+    let (coordinates, products) = fields.coordinates(&observed.random_effects);
+    let of_effects = fields.of_effects(&observed.random_effects);
+    let stated = observed.random_effects.ncols();
     let shown = DMatrix::from_fn(stated, stated, |a, b| {
         products[(a, b)] - (0..known).map(|k| coordinates[(k, a)] * coordinates[(k, b)]).sum::<f64>()
     });
@@ -141,7 +141,7 @@ fn parts(
 /// was ground in, column by column; what a motion does to them is nothing.
 ///
 /// What was ground in makes a form whether it adds to the others or not: its slope is as often up as down, and its square is not 0.
-fn slopes(drawn: &Drawn) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
+fn slopes(drawn: &SampledFigures) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
     let (n, count) = drawn.forms.shape();
     let mut slopes = [DVector::zeros(n), DVector::zeros(n)];
     let none = DMatrix::zeros(n, 0);

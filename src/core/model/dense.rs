@@ -10,11 +10,11 @@ use faer::linalg::solvers::{Llt, Solve};
 use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector};
 
-use super::{Hyper, ModelError, Observed};
+use super::{Hyperparameters, ModelError, Observed};
 
 /// What the model says of a place.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Predicted {
+pub struct Prediction {
     /// The field, the most probable value.
     pub mean_mm: f64,
     /// Its standard uncertainty; the scatter of a further point is not in it.
@@ -22,8 +22,8 @@ pub struct Predicted {
 }
 
 /// A model that knows some points.
-pub struct Dense {
-    hyper: Hyper,
+pub struct DensePosterior {
+    hyperparameters: Hyperparameters,
     places: Vec<[f64; 2]>,
     factor: Llt<f64>,
     /// K^-1 (d - H b).
@@ -36,26 +36,26 @@ pub struct Dense {
     likelihood: f64,
 }
 
-impl Dense {
+impl DensePosterior {
     /// Fits the effects and the field to what was measured; takes time as the cube of the number of points.
     ///
     /// # Errors
     /// Rows that do not belong together, numbers that are none, parameters that are not above 0, effects that cannot be told apart.
-    pub fn fit(observed: &Observed, hyper: Hyper) -> Result<Self, ModelError> {
-        Self::with(observed, hyper, |_, _| 0.0)
+    pub fn fit(observed: &Observed, hyperparameters: Hyperparameters) -> Result<Self, ModelError> {
+        Self::with(observed, hyperparameters, |_, _| 0.0)
     }
 
     /// The same with what else pairs of observed points have in common, which no other place has a part of.
     pub(super) fn with(
         observed: &Observed,
-        hyper: Hyper,
+        hyperparameters: Hyperparameters,
         shared_mm2: impl Fn(usize, usize) -> f64,
     ) -> Result<Self, ModelError> {
         let Observed { places, deviations_mm, .. } = observed;
         let Solved { effects, factor, solved, gram, towards, log_det, .. } =
-            Solved::with(observed, &hyper, shared_mm2)?;
-        let (n, p, vague) = (places.len(), effects.ncols(), observed.effects.ncols());
-        let gram = told_apart(with_stated(gram, vague))?;
+            Solved::with(observed, &hyperparameters, shared_mm2)?;
+        let (n, p, vague) = (places.len(), effects.ncols(), observed.fixed_effects.ncols());
+        let gram = checked_cholesky(with_stated(gram, vague))?;
         let found = gram.solve(&towards);
         let mut weights = solved.col_as_slice(p).to_vec();
         for a in 0..p {
@@ -64,7 +64,7 @@ impl Dense {
         let squares = dot(deviations_mm, &weights);
         let log_gram: f64 = 2.0 * gram.l_dirty().diagonal().iter().map(|v| v.ln()).sum::<f64>();
         Ok(Self {
-            hyper,
+            hyperparameters,
             places: places.clone(),
             weights,
             effects: solved.subcols(0, p).to_owned(),
@@ -88,16 +88,16 @@ impl Dense {
 
     /// Returns the effects and their covariance, those that are stated behind the others: with the motions of the part as effects, where its nominal frame is, and how well
     /// that is known beside a field that nobody knows either.
-    pub fn effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
+    pub fn estimated_effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
         (&self.found, &self.covariance)
     }
 
     /// Tells the field at some places, the effects taken off.
-    pub fn predict(&self, places: &[[f64; 2]]) -> Vec<Predicted> {
+    pub fn predict(&self, places: &[[f64; 2]]) -> Vec<Prediction> {
         let p = self.found.len();
-        let across = self.hyper.field.pairs().across(&self.places, places);
+        let across = self.hyperparameters.field.pairs().across(&self.places, places);
         let solved = self.factor.solve(&across);
-        let sigma2 = self.hyper.field.sigma_mm * self.hyper.field.sigma_mm;
+        let sigma2 = self.hyperparameters.field.sigma_mm * self.hyperparameters.field.sigma_mm;
         (0..places.len())
             .map(|c| {
                 let column = across.col_as_slice(c);
@@ -105,7 +105,7 @@ impl Dense {
                 let known = dot(column, solved.col_as_slice(c));
                 let moved = DVector::from_fn(p, |a, _| dot(self.effects.col_as_slice(a), column));
                 let by_effects = if p == 0 { 0.0 } else { moved.dot(&(&self.covariance * &moved)) };
-                Predicted { mean_mm, sigma_mm: (sigma2 - known + by_effects).max(0.0).sqrt() }
+                Prediction { mean_mm, sigma_mm: (sigma2 - known + by_effects).max(0.0).sqrt() }
             })
             .collect()
     }
@@ -113,7 +113,7 @@ impl Dense {
     /// The same, with the covariance of every pair of the places.
     pub(super) fn predict_together(&self, places: &[[f64; 2]]) -> (Vec<f64>, Mat<f64>) {
         let p = self.found.len();
-        let pairs = self.hyper.field.pairs();
+        let pairs = self.hyperparameters.field.pairs();
         let across = pairs.across(&self.places, places);
         let solved = self.factor.solve(&across);
         let moved = self.effects.transpose() * &across;
@@ -139,14 +139,18 @@ struct Solved {
 }
 
 impl Solved {
-    fn with(observed: &Observed, hyper: &Hyper, shared_mm2: impl Fn(usize, usize) -> f64) -> Result<Self, ModelError> {
+    fn with(
+        observed: &Observed,
+        hyperparameters: &Hyperparameters,
+        shared_mm2: impl Fn(usize, usize) -> f64,
+    ) -> Result<Self, ModelError> {
         observed.check()?;
-        hyper.check()?;
+        hyperparameters.check()?;
         let Observed { places, deviations_mm, path, .. } = observed;
         let effects = observed.all_effects();
         let (n, p) = (places.len(), effects.ncols());
-        let scatter2 = hyper.scatter_mm * hyper.scatter_mm;
-        let pairs = hyper.field.pairs();
+        let scatter2 = hyperparameters.noise_sigma_mm * hyperparameters.noise_sigma_mm;
+        let pairs = hyperparameters.field.pairs();
         let mut covariance = Mat::zeros(n, n);
         for c in 0..n {
             // Only the lower triangle is read.
@@ -155,9 +159,10 @@ impl Solved {
             column.iter_mut().zip(c..).for_each(|(v, r)| *v += shared_mm2(r, c));
             match path.is_empty() {
                 true => column[0] += scatter2,
-                false => {
-                    column.iter_mut().zip(&path[c..]).for_each(|(v, at)| *v += scatter2 * hyper.shared(at - path[c]))
-                }
+                false => column
+                    .iter_mut()
+                    .zip(&path[c..])
+                    .for_each(|(v, at)| *v += scatter2 * hyperparameters.noise_correlation(at - path[c])),
             }
         }
         let factor = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
@@ -184,7 +189,7 @@ fn with_stated(mut gram: DMatrix<f64>, vague: usize) -> DMatrix<f64> {
 }
 
 /// The factor of H'K^-1 H; none where a direction of it is nothing beside the others.
-pub(super) fn told_apart(gram: DMatrix<f64>) -> Result<nalgebra::Cholesky<f64, nalgebra::Dyn>, ModelError> {
+pub(super) fn checked_cholesky(gram: DMatrix<f64>) -> Result<nalgebra::Cholesky<f64, nalgebra::Dyn>, ModelError> {
     const LEAST: f64 = 1e-12;
     if gram.nrows() == 0 {
         return gram.cholesky().ok_or(ModelError::EffectsAlike);
@@ -204,15 +209,16 @@ mod tests {
     use super::super::Field;
     use super::*;
 
-    const HYPER: Hyper = Hyper { field: Field::new(2.0, 20.0), scatter_mm: 0.5, drift: 0.0 };
+    const HYPER: Hyperparameters =
+        Hyperparameters { field: Field::new(2.0, 20.0), noise_sigma_mm: 0.5, noise_autocorrelation: 0.0 };
 
     #[test]
     fn of_one_point_it_is_what_is_worked_out_by_hand() {
         // k = 4, s^2 = 0.25: mean = 4 / 4.25 * 3, variance = 4 - 16 / 4.25.
-        let model = Dense::fit(&Observed::without_effects(vec![[1.0, 2.0]], vec![3.0]), HYPER).unwrap();
+        let model = DensePosterior::fit(&Observed::without_effects(vec![[1.0, 2.0]], vec![3.0]), HYPER).unwrap();
         let [at, far] = model.predict(&[[1.0, 2.0], [1e4, 0.0]])[..] else { panic!() };
         assert!((at.mean_mm - 12.0 / 4.25).abs() < 1e-14 && (at.sigma_mm.powi(2) - (4.0 - 16.0 / 4.25)).abs() < 1e-14);
-        assert_eq!(far, Predicted { mean_mm: 0.0, sigma_mm: 2.0 });
+        assert_eq!(far, Prediction { mean_mm: 0.0, sigma_mm: 2.0 });
         let by_hand = -0.5 * (4.25_f64.ln() + 9.0 / 4.25 + std::f64::consts::TAU.ln());
         assert!((model.log_likelihood() - by_hand).abs() < 1e-14);
     }
@@ -221,8 +227,11 @@ mod tests {
     fn what_is_stated_of_one_point_is_what_is_worked_out_by_hand() {
         // k = 4, s^2 = 0.25, e^2 = 2.25: of the 3 that were found the field has 4 / 6.5.
         let stated = DMatrix::from_element(1, 1, 1.5);
-        let model =
-            Dense::fit(&Observed { stated, ..Observed::without_effects(vec![[1.0, 2.0]], vec![3.0]) }, HYPER).unwrap();
+        let model = DensePosterior::fit(
+            &Observed { random_effects: stated, ..Observed::without_effects(vec![[1.0, 2.0]], vec![3.0]) },
+            HYPER,
+        )
+        .unwrap();
         let told = model.predict(&[[1.0, 2.0]])[0];
         assert!(
             (told.mean_mm - 12.0 / 6.5).abs() < 1e-14 && (told.sigma_mm.powi(2) - (4.0 - 16.0 / 6.5)).abs() < 1e-13
@@ -234,19 +243,19 @@ mod tests {
     #[test]
     fn of_two_points_of_a_path_it_is_what_is_worked_out_by_hand() {
         // No step of the field between them: K = [4.25 4.125; 4.125 4.25] by a drift of a half, and so the sum has 16.75 for 12 of the field.
-        let drifting = Hyper { drift: 0.5, ..HYPER };
+        let drifting = Hyperparameters { noise_autocorrelation: 0.5, ..HYPER };
         let at = |path: [f64; 2]| Observed {
             path: path.to_vec(),
             ..Observed::without_effects(vec![[1.0, 2.0]; 2], vec![3.0, 1.0])
         };
-        let model = Dense::fit(&at([7.0, 8.0]), drifting).unwrap();
+        let model = DensePosterior::fit(&at([7.0, 8.0]), drifting).unwrap();
         let told = model.predict(&[[1.0, 2.0]])[0];
         // mean = 4 (w1 + w2), w1 + w2 = (3 + 1) / (4.25 + 4.125); variance = 4 - 16 * 2 / 8.375.
         assert!((told.mean_mm - 4.0 * 4.0 / 8.375).abs() < 1e-13, "{told:?}");
         assert!((told.sigma_mm.powi(2) - (4.0 - 32.0 / 8.375)).abs() < 1e-13, "{told:?}");
         // Far apart on the path they scatter on their own.
-        let apart = Dense::fit(&at([7.0, 900.0]), drifting).unwrap();
-        let alone = Dense::fit(&at([7.0, 8.0]), HYPER).unwrap();
+        let apart = DensePosterior::fit(&at([7.0, 900.0]), drifting).unwrap();
+        let alone = DensePosterior::fit(&at([7.0, 8.0]), HYPER).unwrap();
         assert!((apart.log_likelihood() - alone.log_likelihood()).abs() < 1e-13);
     }
 
@@ -268,18 +277,18 @@ mod tests {
         let with = |deviations_mm| Observed {
             places: places.clone(),
             deviations_mm,
-            effects: effects.clone(),
+            fixed_effects: effects.clone(),
             ..Observed::without_effects(places.clone(), Vec::new())
         };
-        let [a, b] = [still, moved].map(|d| Dense::fit(&with(d), HYPER).unwrap());
+        let [a, b] = [still, moved].map(|d| DensePosterior::fit(&with(d), HYPER).unwrap());
         // What is planted comes back on top of what the field itself has along it.
-        assert!((b.effects().0 - a.effects().0 - &planted).norm() < 1e-9);
+        assert!((b.estimated_effects().0 - a.estimated_effects().0 - &planted).norm() < 1e-9);
         let asked = [[30.0, 20.0], [70.0, 10.0]];
         for (p, q) in a.predict(&asked).into_iter().zip(b.predict(&asked)) {
             assert!((p.mean_mm - q.mean_mm).abs() < 1e-9 && (p.sigma_mm - q.sigma_mm).abs() < 1e-12);
         }
         // The place of a part with a field of 2 mm and a range of a third of it is known to much worse than its points scatter.
-        let height = a.effects().1[(0, 0)].sqrt();
+        let height = a.estimated_effects().1[(0, 0)].sqrt();
         assert!(height > 10.0 * 0.5 / 120.0_f64.sqrt(), "{height}");
     }
 
@@ -287,15 +296,18 @@ mod tests {
     fn moving_everything_moves_nothing() {
         let at = places(80);
         let away: Vec<[f64; 2]> = at.iter().map(|[x, y]| [x + 1e4, y - 3e3]).collect();
-        let fit =
-            |places: &[[f64; 2]]| Dense::fit(&Observed::without_effects(places.to_vec(), wave(&at)), HYPER).unwrap();
+        let fit = |places: &[[f64; 2]]| {
+            DensePosterior::fit(&Observed::without_effects(places.to_vec(), wave(&at)), HYPER).unwrap()
+        };
         let (here, there) = (fit(&at).predict(&[[11.0, 12.0]])[0], fit(&away).predict(&[[10_011.0, -2988.0]])[0]);
         assert!((here.mean_mm - there.mean_mm).abs() < 1e-9 && (here.sigma_mm - there.sigma_mm).abs() < 1e-9);
     }
 
     #[test]
     fn what_is_no_model_is_refused_in_words() {
-        let of = |observed: &Observed, hyper| Dense::fit(observed, hyper).err().unwrap().to_string();
+        let of = |observed: &Observed, hyperparameters| {
+            DensePosterior::fit(observed, hyperparameters).err().unwrap().to_string()
+        };
         let two = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0, f64::NAN]);
         assert_eq!(of(&two, HYPER), "point 2 has a number that is none");
         let none = Observed::without_effects(vec![], vec![]);
@@ -303,18 +315,18 @@ mod tests {
         let odd = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0]);
         assert!(of(&odd, HYPER).contains("do not belong together"));
         let good = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0; 2]);
-        assert!(of(&good, Hyper { scatter_mm: 0.0, ..HYPER }).contains("the scatter is 0 mm"));
-        for drift in [1.0, -0.1, f64::NAN] {
-            assert!(of(&good, Hyper { drift, ..HYPER }).contains("below 1"));
+        assert!(of(&good, Hyperparameters { noise_sigma_mm: 0.0, ..HYPER }).contains("the scatter is 0 mm"));
+        for noise_autocorrelation in [1.0, -0.1, f64::NAN] {
+            assert!(of(&good, Hyperparameters { noise_autocorrelation, ..HYPER }).contains("below 1"));
         }
         for path in [vec![0.0; good.places.len() + 1], vec![f64::NAN; good.places.len()]] {
             assert!(of(&Observed { path, ..good.clone() }, HYPER).contains("belong together"));
         }
         let alike = Observed {
-            effects: DMatrix::from_element(9, 2, 1.0),
+            fixed_effects: DMatrix::from_element(9, 2, 1.0),
             ..Observed::without_effects(places(9), vec![0.0; 9])
         };
         assert!(of(&alike, HYPER).contains("cannot be told apart"));
-        assert!(Dense::fit(&good, HYPER).is_ok(), "two points at one place");
+        assert!(DensePosterior::fit(&good, HYPER).is_ok(), "two points at one place");
     }
 }

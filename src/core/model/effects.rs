@@ -2,9 +2,9 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::fields::{Fields, Kind};
+use super::hypotheses::{FieldHypotheses, NoiseKind};
 use super::posterior::Posterior;
-use super::{Dense, ModelError, Observed, Priors, Smoothness};
+use super::{DensePosterior, ModelError, Observed, Prior, Smoothness};
 
 /// Points whose every pair is worked with, at most: what tells an effect of the whole part is wide, and more of them tell no more.
 const MOST_TOGETHER: usize = 600;
@@ -14,14 +14,14 @@ const FEW: f64 = 1e-3;
 
 /// Effects with their covariance.
 #[derive(Clone, Debug)]
-pub struct Effects {
+pub struct EffectEstimates {
     /// Each in units of its column.
     pub values: DVector<f64>,
     /// Their covariance, in which is what the field may have made of them.
     pub covariance: DMatrix<f64>,
 }
 
-impl Effects {
+impl EffectEstimates {
     /// Tells the effects by generalised least squares (Aitken 1935), b = (H'K^-1 H)^-1 H'K^-1 d with the covariance (H'K^-1 H)^-1.
     ///
     /// K is that of the fields that the points speak for whatever the effects are, each as much as it is spoken for: the
@@ -29,23 +29,23 @@ impl Effects {
     ///
     /// # Errors
     /// Too few points, columns that are alike, rows that do not belong together.
-    pub fn of(observed: &Observed, priors: &Priors) -> Result<Self, ModelError> {
+    pub fn estimate(observed: &Observed, priors: &Prior) -> Result<Self, ModelError> {
         priors.check()?;
         let n = observed.places.len();
         let most = n.min(MOST_TOGETHER);
         let chosen: Vec<usize> = (0..most).map(|k| k * n / most.max(1)).collect();
-        let some = observed.only(&chosen);
-        let fields = Fields::over(&some, Kind::PLAIN)?;
+        let some = observed.subset(&chosen);
+        let fields = FieldHypotheses::over(&some, NoiseKind::PLAIN)?;
         // A smooth field tells a rough form wrongly: the rougher ones are careful.
         let rough = |smoothness| smoothness == Smoothness::Once;
-        let mut likely = Posterior::of(&fields, &some, Some(priors), None).likely(rough);
+        let mut likely = Posterior::of(&fields, &some, Some(priors), None).weighted_hyperparameters(rough);
         likely.retain(|(_, weight)| *weight > FEW);
         let whole: f64 = likely.iter().map(|(_, weight)| weight).sum();
-        let p = observed.effects.ncols() + observed.stated.ncols();
+        let p = observed.fixed_effects.ncols() + observed.random_effects.ncols();
         let (mut values, mut squares) = (DVector::zeros(p), DMatrix::zeros(p, p));
-        for (hyper, weight) in likely {
-            let model = Dense::fit(&some, hyper)?;
-            let (found, covariance) = model.effects();
+        for (hyperparameters, weight) in likely {
+            let model = DensePosterior::fit(&some, hyperparameters)?;
+            let (found, covariance) = model.estimated_effects();
             values += found * (weight / whole);
             squares += (covariance + found * found.transpose()) * (weight / whole);
         }

@@ -15,7 +15,7 @@ pub struct Field {
     /// How smooth it is.
     pub smoothness: Smoothness,
     /// The direction along which it is wider.
-    pub lay: Lay,
+    pub lay: Anisotropy,
 }
 
 /// How smooth a field is: the nu of its Matern covariance, or how often it can be differentiated.
@@ -31,7 +31,7 @@ pub enum Smoothness {
 
 /// The direction along which a field is wider than across, as the tracks of a wheel make it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Lay {
+pub struct Anisotropy {
     /// The direction, a unit vector.
     pub along: [f64; 2],
     /// How many times as wide it is along as across; 1 where all directions are alike.
@@ -49,7 +49,7 @@ impl Smoothness {
     }
 }
 
-impl Lay {
+impl Anisotropy {
     /// All directions are alike.
     pub const NONE: Self = Self { along: [1.0, 0.0], stretch: 1.0 };
 
@@ -69,7 +69,7 @@ impl Lay {
 impl Field {
     /// A field that is the same in all directions and can be differentiated once.
     pub const fn new(sigma_mm: f64, range_mm: f64) -> Self {
-        Self { sigma_mm, range_mm, smoothness: Smoothness::Once, lay: Lay::NONE }
+        Self { sigma_mm, range_mm, smoothness: Smoothness::Once, lay: Anisotropy::NONE }
     }
 
     /// Returns the covariance of the field at two places.
@@ -85,7 +85,7 @@ impl Field {
 
     /// Takes the plane to one in which the field is alike in all directions; an area stays as large as it is.
     pub(super) fn straightened(&self, at: [f64; 2]) -> [f64; 2] {
-        let Lay { along: [c, s], stretch } = self.lay;
+        let Anisotropy { along: [c, s], stretch } = self.lay;
         if stretch == 1.0 {
             return at;
         }
@@ -100,7 +100,7 @@ impl Field {
                 return Err(ModelError::Hyper { what, value });
             }
         }
-        let Lay { along: [c, s], stretch } = self.lay;
+        let Anisotropy { along: [c, s], stretch } = self.lay;
         let is_lay = stretch.is_finite() && stretch >= 1.0 && (c.hypot(s) - 1.0).abs() < 1e-9;
         if is_lay { Ok(()) } else { Err(ModelError::Lay { along: [c, s], stretch }) }
     }
@@ -143,18 +143,18 @@ mod tests {
 
     #[test]
     fn along_its_lay_a_field_is_wider_and_its_range_is_the_mean_of_both() {
-        let field = Field { lay: Lay::at(0.5, 4.0), ..Field::new(2.0, 30.0) };
+        let field = Field { lay: Anisotropy::at(0.5, 4.0), ..Field::new(2.0, 30.0) };
         let at = |r: f64, angle: f64| field.covariance_mm2([1.0, 1.0], [1.0 + r * angle.cos(), 1.0 + r * angle.sin()]);
         let alike = Field::new(2.0, 30.0).covariance_mm2([0.0; 2], [20.0, 0.0]);
         // 4 times as wide along as across: twice and half of the mean.
         assert!((at(40.0, 0.5) - alike).abs() < 1e-12, "{} {alike}", at(40.0, 0.5));
         assert!((at(10.0, 0.5 + std::f64::consts::FRAC_PI_2) - alike).abs() < 1e-12);
         assert_eq!(field.covariance_mm2([3.0, 4.0], [3.0, 4.0]), 4.0);
-        let angle_deg = |angle: f64| Lay::at(f64::to_radians(angle), 2.0).angle_rad().unwrap().to_degrees();
+        let angle_deg = |angle: f64| Anisotropy::at(f64::to_radians(angle), 2.0).angle_rad().unwrap().to_degrees();
         for (angle, told) in [(30.0, 30.0), (120.0, -60.0), (-150.0, 30.0), (90.0, 90.0)] {
             assert!((angle_deg(angle) - told).abs() < 1e-9, "{angle}: {}", angle_deg(angle));
         }
-        assert_eq!(Lay::NONE.angle_rad(), None);
+        assert_eq!(Anisotropy::NONE.angle_rad(), None);
     }
 
     #[test]
@@ -162,9 +162,11 @@ mod tests {
         let of = |field: Field| field.check().err().map(|error| error.to_string()).unwrap_or_default();
         assert!(of(Field::new(0.0, 1.0)).contains("the field is 0 mm"));
         assert!(of(Field::new(1.0, f64::INFINITY)).contains("the range is inf mm"));
-        for lay in [Lay::at(0.0, 0.5), Lay::at(f64::NAN, 2.0), Lay { along: [1.0, 1.0], stretch: 2.0 }] {
+        for lay in
+            [Anisotropy::at(0.0, 0.5), Anisotropy::at(f64::NAN, 2.0), Anisotropy { along: [1.0, 1.0], stretch: 2.0 }]
+        {
             assert!(of(Field { lay, ..Field::new(1.0, 1.0) }).contains("lay"));
         }
-        assert!(of(Field { lay: Lay::at(3.0, 5.0), ..Field::new(1.0, 1.0) }).is_empty());
+        assert!(of(Field { lay: Anisotropy::at(3.0, 5.0), ..Field::new(1.0, 1.0) }).is_empty());
     }
 }

@@ -7,7 +7,7 @@ use nalgebra::DMatrix;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::{Given, Interval};
+use super::{Interval, ModelInputs};
 use crate::form::{IsoFits, IsoOfForm, SlopesAt};
 
 /// What figures of an area go by.
@@ -65,11 +65,11 @@ pub struct IsoFigures {
 
 impl SlopeFigures {
     /// Of smooth forms, a column each, and of those that tell extremes from above.
-    pub(super) fn of(slopes: &SlopesAt, forms: &[DMatrix<f64>; 2], (is_seen, given): (bool, &Given)) -> Self {
+    pub(super) fn of(slopes: &SlopesAt, forms: &[DMatrix<f64>; 2], (is_seen, inputs): (bool, &ModelInputs)) -> Self {
         let found = forms.each_ref().map(|forms| each(forms, |form| slopes.of(form)));
         let [rms, largest] = [0, 1].map(|k| {
             let values = |of: usize| found[of].iter().map(|of| of[k]).collect();
-            let of = Interval::of(values(0), (Vec::new(), (k == 1).then(|| values(1)).into_iter()), is_seen, given);
+            let of = Interval::of(values(0), (Vec::new(), (k == 1).then(|| values(1)).into_iter()), is_seen, inputs);
             AngleInterval { median_rad: of.median_mm, low_rad: of.low_mm, high_rad: of.high_mm }
         });
         Self { rms, largest, integration_mm: slopes.integration_mm, places: slopes.nodes }
@@ -78,14 +78,14 @@ impl SlopeFigures {
 
 impl IsoFigures {
     /// Of forms, a column each, and of those that tell extremes from above.
-    pub(super) fn of(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool, given: &Given) -> Self {
+    pub(super) fn of(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool, inputs: &ModelInputs) -> Self {
         let found = forms.each_ref().map(|forms| each(forms, |form| fits.of(form)));
         let values = |k: usize, of: fn(&IsoOfForm) -> f64| found[k].iter().map(of).collect::<Vec<f64>>();
         let interval = |of: fn(&IsoOfForm) -> f64, has_low: bool| {
-            Interval::of(values(0, of), (Vec::new(), std::iter::empty()), has_low, given)
+            Interval::of(values(0, of), (Vec::new(), std::iter::empty()), has_low, inputs)
         };
         let extreme = |of: fn(&IsoOfForm) -> f64| {
-            Interval::of(values(0, of), (Vec::new(), std::iter::once(values(1, of))), is_seen, given)
+            Interval::of(values(0, of), (Vec::new(), std::iter::once(values(1, of))), is_seen, inputs)
         };
         let power_rim = interval(|of| of.power_rim_mm, true);
         let has_sign = power_rim.low_mm * power_rim.high_mm > 0.0;

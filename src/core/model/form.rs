@@ -10,15 +10,15 @@ use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SymmetricEigen, Vector6};
 
 use rayon::prelude::*;
 
-use super::between::Between;
-use super::budget::{self, Share};
-use super::fields::Fields;
-use super::machine::{Effects, Machine, Source, unsound};
+use super::budget::{self, BudgetEntry};
+use super::hypotheses::FieldHypotheses;
+use super::intermediate::IntermediateNodes;
+use super::machine_uncertainty::{MachineEffects, MachineUncertainty, UncertaintySource, unsound};
 use super::normals::Normals;
-use super::posterior::{Draws, Posterior, Probe, Which, laid};
+use super::posterior::{HypothesisSet, NoisePrior, Posterior, PosteriorSamples, select_hypotheses};
 use super::spacing_mm;
 use super::{AreaOptions, IsoFigures, SlopeFigures};
-use super::{Hyper, ModelError, Observed, Predicted, Priors};
+use super::{Hyperparameters, ModelError, Observed, Prediction, Prior};
 use crate::form::{IsoFits, SlopesAt};
 use crate::geometry::{Nearest, Point, Vector};
 use crate::registration::{Deviation, LEAST_SIGMA_MM, PointStatus, Registration, robust_sigma};
@@ -27,7 +27,7 @@ use crate::registration::{Deviation, LEAST_SIGMA_MM, PointStatus, Registration, 
 #[derive(Clone, Debug)]
 pub struct Form {
     /// How strong and how wide the form is, and how far the probe scatters.
-    pub hyper: Hyper,
+    pub hyperparameters: Hyperparameters,
     /// Covariance of the pose as the place of the nominal frame: of the twist [v; omega] in the model frame, as that of the registration,
     /// which is how well the same pose would be found again. Units mm^2, mm rad, rad^2. Directions that were held have no variance.
     pub frame_covariance: Matrix6<f64>,
@@ -43,9 +43,9 @@ pub struct Form {
     /// How well the smooth form is known: the RMS of its standard uncertainty over all places.
     pub known_mm: f64,
     /// What the standard uncertainties of the figures come from, source by source; empty where they cannot be parted.
-    pub budget: Vec<Share>,
+    pub budget: Vec<BudgetEntry>,
     /// What the points alone tell of the parameters, whatever was expected of them: it teaches of the parts that follow. None where no form is seen.
-    pub alone: Option<Hyper>,
+    pub hyperparameters_without_prior: Option<Hyperparameters>,
     /// Whether the points show a form at all. Where they do not, the figures are known from above alone, and their intervals begin at 0.
     pub is_seen: bool,
     /// How many degrees of freedom the fit leaves the points that the fields are told by.
@@ -60,7 +60,7 @@ pub struct FormPoint {
     /// Where, in the model frame.
     pub at_mm: [f64; 2],
     /// The form there and its standard uncertainty.
-    pub form: Predicted,
+    pub form: Prediction,
     /// Standard uncertainty of what of it is smooth: what a correction can be made by.
     pub smooth_sigma_mm: f64,
 }
@@ -86,13 +86,13 @@ pub struct Interval {
     pub low_mm: f64,
     /// Above it with a probability of 2.5 %.
     pub high_mm: f64,
-    /// Below it with the probability of [`Given::look_risk`]: for who looks more than once.
+    /// Below it with the probability of [`ModelInputs::look_risk`]: for who looks more than once.
     #[serde(skip)]
     pub least_mm: f64,
     /// Above it with that probability.
     #[serde(skip)]
     pub most_mm: f64,
-    /// Below it with the probability of [`Given::probability`]: for who judges.
+    /// Below it with the probability of [`ModelInputs::probability`]: for who judges.
     #[serde(skip)]
     pub accepted_mm: f64,
     /// Below each of them with one of [`Interval::PROBABILITIES`].
@@ -125,73 +125,78 @@ impl Form {
     ///
     /// # Errors
     /// Too few points, and points that leave nothing to tell the form by.
-    pub fn of(registration: &Registration, given: &Given) -> Result<Self, ModelError> {
-        let seen = Seen::of(registration, given, true)?;
-        let posterior = seen.posterior(given);
+    pub fn estimate(registration: &Registration, inputs: &ModelInputs) -> Result<Self, ModelError> {
+        let seen = FittedModel::of(registration, inputs, true)?;
+        let posterior = seen.posterior(inputs);
         let chosen: Vec<usize> = thinned(seen.observed.places.len()).collect();
-        let some = seen.observed.only(&chosen);
+        let some = seen.observed.subset(&chosen);
         let at = |chosen: &[usize]| seen.ground_in.as_ref().map(|ground_in| ground_in.select_rows(chosen));
-        let of = |draws: Draws, is_between: bool| {
-            let drawn = seen.drawn(draws, some.places.clone(), some.effects.clone(), is_between);
-            let drawn = Drawn { chosen: chosen.clone(), ..drawn }.known_as(&seen.observed);
+        let of = |draws: PosteriorSamples, is_between: bool| {
+            let drawn = seen.drawn(draws, some.places.clone(), some.fixed_effects.clone(), is_between);
+            let drawn = SampledForms { chosen: chosen.clone(), ..drawn }.known_as(&seen.observed);
             drawn.without(at(&seen.of_all(&chosen)).as_ref())
         };
-        let whole = |drawn: Drawn, apart: &[usize], given: &Given| {
-            seen.with_those(apart, drawn.with_the_scatter(&seen.observed, &posterior, given), given).after_best_fit()
+        let whole = |drawn: SampledForms, apart: &[usize], inputs: &ModelInputs| {
+            seen.with_those(apart, drawn.with_the_scatter(&seen.observed, &posterior, inputs), inputs).after_best_fit()
         };
-        let drawn = of(posterior.draws(Which::All, SAMPLES, 1), true);
-        let slope = seen.slope(given, &posterior, &drawn);
-        let drawn = whole(drawn, &seen.apart, given);
+        let drawn = of(posterior.samples(HypothesisSet::All, SAMPLES, 1), true);
+        let slope = seen.slope(inputs, &posterior, &drawn);
+        let drawn = whole(drawn, &seen.apart, inputs);
         let form = if seen.is_chance { &[][..] } else { &seen.agreed };
         let least =
-            whole(of(posterior.draws(Which::Smooth, FEWER, 2), false), form, &least_form(&posterior, given)).told_by();
+            whole(of(posterior.samples(HypothesisSet::Smooth, FEWER, 2), false), form, &least_form(&posterior, inputs))
+                .told_by();
         let most = match posterior.is_rough() > MAY_BE {
-            true => whole(of(posterior.draws(Which::Rough, FEWER, 3), false), &seen.apart, given).told_by(),
+            true => whole(of(posterior.samples(HypothesisSet::Rough, FEWER, 3), false), &seen.apart, inputs).told_by(),
             false => Vec::new(),
         };
         let ground_in = at(&drawn.chosen);
-        Ok(Self { slope, ..seen.form(given, &posterior, (&drawn, [&least, &most]), ground_in, true) })
+        Ok(Self { slope, ..seen.form(inputs, &posterior, (&drawn, [&least, &most]), ground_in, true) })
     }
 
     /// Tells the form at places of the part that need not have been touched: points of the nominal surface with their normals, in the model
     /// frame. The figures are those of all of them.
     ///
-    /// What is too narrow for the distance of the points is told from the scatter of the probe by [`Given::probe_scatter_mm`] alone. As
+    /// What is too narrow for the distance of the points is told from the scatter of the probe by [`ModelInputs::probe_scatter_mm`] alone. As
     /// nothing says how wide it is, every place has one of its own.
     ///
     /// # Errors
     /// Those of [`Form::of`].
-    pub fn over(registration: &Registration, given: &Given, places: &[(Point, Vector)]) -> Result<Self, ModelError> {
-        Self::told_over(registration, given, places, true)
+    pub fn estimate_at(
+        registration: &Registration,
+        inputs: &ModelInputs,
+        places: &[(Point, Vector)],
+    ) -> Result<Self, ModelError> {
+        Self::estimate_with(registration, inputs, places, true)
     }
 
     /// The same; where not all is asked for without slopes, ISO figures and the budget, which cost most where few points were touched.
-    pub(super) fn told_over(
+    pub(super) fn estimate_with(
         registration: &Registration,
-        given: &Given,
+        inputs: &ModelInputs,
         places: &[(Point, Vector)],
         is_whole: bool,
     ) -> Result<Self, ModelError> {
-        let seen = Seen::of(registration, given, false)?;
-        let posterior = seen.posterior(given);
+        let seen = FittedModel::of(registration, inputs, false)?;
+        let posterior = seen.posterior(inputs);
         let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
         let effects = seen.motions.rows(places.iter().copied());
         // Many more places than touches are close enough to each other.
         let is_between = places.len() < 2 * seen.kept.len();
         let at = places.iter().map(plane).collect();
-        let drawn = seen.drawn(posterior.draws(Which::All, SAMPLES, 1), at, effects, is_between);
-        let drawn = Drawn { untouched: (0..places.len()).collect(), ..drawn };
+        let drawn = seen.drawn(posterior.samples(HypothesisSet::All, SAMPLES, 1), at, effects, is_between);
+        let drawn = SampledForms { untouched: (0..places.len()).collect(), ..drawn };
         let drawn = drawn.rough_where_touched(&seen.observed.places).known_as(&seen.observed);
         let ground_in = seen.ground_in.is_some().then(|| seen.stated.columns(places.iter().copied()));
         let drawn = drawn.without(ground_in.as_ref());
-        let slope = if is_whole { seen.slope(given, &posterior, &drawn) } else { None };
-        let drawn = seen.with_those(&seen.apart, drawn.with_what_is_narrow(given), given).after_best_fit();
-        Ok(Self { slope, ..seen.form(given, &posterior, (&drawn, [&[], &[]]), ground_in, is_whole) })
+        let slope = if is_whole { seen.slope(inputs, &posterior, &drawn) } else { None };
+        let drawn = seen.with_those(&seen.apart, drawn.with_what_is_narrow(inputs), inputs).after_best_fit();
+        Ok(Self { slope, ..seen.form(inputs, &posterior, (&drawn, [&[], &[]]), ground_in, is_whole) })
     }
 }
 
 /// A registration as the model sees it, with what speaks for which parameters.
-struct Seen {
+struct FittedModel {
     motions: Motions,
     /// What was observed at all points that were used.
     all: Observed,
@@ -205,25 +210,25 @@ struct Seen {
     kept: Vec<usize>,
     observed: Observed,
     /// What is stated of all points together.
-    stated: Effects,
+    stated: MachineEffects,
     /// What of that has been ground into the part, at all points: nothing before the first correction.
     ground_in: Option<DMatrix<f64>>,
-    fields: Fields,
+    fields: FieldHypotheses,
 }
 
-impl Seen {
+impl FittedModel {
     /// Lays the fields, without the points that none of them explains.
-    fn of(registration: &Registration, given: &Given, at_points: bool) -> Result<Self, ModelError> {
+    fn of(registration: &Registration, inputs: &ModelInputs, at_points: bool) -> Result<Self, ModelError> {
         /// Each round tells the parameters anew, and without the tallest of a defect its flanks stand out.
         const ROUNDS: usize = 3;
-        if let Some(priors) = &given.priors {
+        if let Some(priors) = &inputs.priors {
             priors.check()?;
         }
         /// So many touches lie around one.
         const AROUND: f64 = 8.0;
-        let mut seen = Self::with_all_in_the_fit(registration, given, at_points)?;
+        let mut seen = Self::with_all_in_the_fit(registration, inputs, at_points)?;
         for _ in 0..ROUNDS {
-            let more = seen.unexplained(given);
+            let more = seen.unexplained(inputs);
             let apart = seen.apart.len() + more.len();
             if more.is_empty() || apart as f64 > MOST_APART * seen.all.places.len() as f64 {
                 break;
@@ -231,9 +236,9 @@ impl Seen {
             let mut apart = [&seen.apart[..], &more[..]].concat();
             apart.sort_unstable();
             let kept: Vec<usize> = (0..seen.all.places.len()).filter(|k| apart.binary_search(k).is_err()).collect();
-            let observed = seen.all.only(&kept);
+            let observed = seen.all.subset(&kept);
             // What is left may be too few to tell anything; then it is told with them.
-            let Ok(fields) = Fields::over(&observed, seen.fields.kind) else { break };
+            let Ok(fields) = FieldHypotheses::over(&observed, seen.fields.kind) else { break };
             seen = Self { apart, kept, observed, fields, ..seen };
         }
         let left_out = registration.deviations.iter().filter(|d| d.status == PointStatus::Outlier).count();
@@ -242,13 +247,19 @@ impl Seen {
         Ok(Self { is_chance: by_chance > MAY_BE, ..seen })
     }
 
-    fn posterior(&self, given: &Given) -> Posterior<'_> {
-        Posterior::of(&self.fields, &self.observed, given.priors.as_ref(), probe(given))
+    fn posterior(&self, inputs: &ModelInputs) -> Posterior<'_> {
+        Posterior::of(&self.fields, &self.observed, inputs.priors.as_ref(), probe(inputs))
     }
 
     /// Forms at some places, in the frame of the registration: with the motions that take each to what was found.
-    fn drawn(&self, draws: Draws, places: Vec<[f64; 2]>, effects: DMatrix<f64>, is_between: bool) -> Drawn {
-        let Observed { effects: rows, stated, deviations_mm, .. } = &self.observed;
+    fn drawn(
+        &self,
+        draws: PosteriorSamples,
+        places: Vec<[f64; 2]>,
+        effects: DMatrix<f64>,
+        is_between: bool,
+    ) -> SampledForms {
+        let Observed { fixed_effects: rows, random_effects: stated, deviations_mm, .. } = &self.observed;
         let weights = rows * inverse_of_products(rows);
         let found = weights.tr_mul(&DVector::from_column_slice(deviations_mm));
         let beside = weights.tr_mul(stated) * &draws.stated;
@@ -258,18 +269,18 @@ impl Seen {
             let of_form = &sums * waves;
             DMatrix::from_fn(rows.ncols(), waves.ncols(), |m, c| found[m] - beside[(m, c)] - of_form[(m, c)])
         });
-        Drawn::by(&self.fields, draws, (places, effects), &moved, is_between)
+        SampledForms::by(&self.fields, draws, (places, effects), &moved, is_between)
     }
 
     /// The points that are further from the field than its scatter lets any of them be, of all that were used.
-    fn unexplained(&self, given: &Given) -> Vec<usize> {
+    fn unexplained(&self, inputs: &ModelInputs) -> Vec<usize> {
         /// Of fewer points nobody knows what is usual.
         const FEWEST: usize = 40;
-        let Observed { places, deviations_mm, effects, stated, .. } = &self.observed;
+        let Observed { places, deviations_mm, fixed_effects: effects, random_effects: stated, .. } = &self.observed;
         if places.len() < FEWEST {
             return Vec::new();
         }
-        let posterior = self.posterior(given);
+        let posterior = self.posterior(inputs);
         let (waves, of_stated) = posterior.mean();
         let told = self.fields.at_points(&waves);
         let moved = stated * of_stated;
@@ -277,7 +288,7 @@ impl Seen {
         let residuals_mm = best_fitted(DMatrix::from_fn(places.len(), 1, |k, _| left(k)), effects);
         let (middle_mm, sigma_mm) = robust_sigma(residuals_mm.iter().copied());
         // Where a field goes through every point, what is left of them is no scatter.
-        let scatter_mm = posterior.middle().scatter_mm;
+        let scatter_mm = posterior.mean_hyperparameters().noise_sigma_mm;
         let limit_mm = STANDS_OUT * sigma_mm.max(0.5 * scatter_mm).max(LEAST_SIGMA_MM);
         let stands_out = |k: &usize| (residuals_mm[*k] - middle_mm).abs() > limit_mm;
         self.of_all(&(0..places.len()).filter(stands_out).collect::<Vec<_>>())
@@ -290,10 +301,10 @@ impl Seen {
 
     /// Puts points that no field explains into what is drawn, each with the height that was found there but for the scatter of a touch:
     /// in their order among the points, or in place of the nearest of other places.
-    fn with_those(&self, apart: &[usize], drawn: Drawn, given: &Given) -> Drawn {
+    fn with_those(&self, apart: &[usize], drawn: SampledForms, inputs: &ModelInputs) -> SampledForms {
         let (rows, at_points) = (drawn.places.len(), !drawn.chosen.is_empty());
         let chosen = self.of_all(&drawn.chosen);
-        let drawn = Drawn { chosen, ..drawn };
+        let drawn = SampledForms { chosen, ..drawn };
         if apart.is_empty() {
             return drawn;
         }
@@ -305,14 +316,14 @@ impl Seen {
             apart.truncate((count * rows).div_ceil(self.kept.len().max(1)));
             apart.sort_unstable();
         }
-        let found = self.touched_at(&apart, &drawn, given);
+        let found = self.touched_at(&apart, &drawn, inputs);
         if at_points { drawn.beside(found) } else { drawn.replaced_by(&found) }
     }
 
     /// What some of the points found, as often as forms are drawn.
-    fn touched_at(&self, points: &[usize], drawn: &Drawn, given: &Given) -> Drawn {
-        let stated = self.all.stated.select_rows(points) * &drawn.stated;
-        let of_probe = |mm: f64| probe(given).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
+    fn touched_at(&self, points: &[usize], drawn: &SampledForms, inputs: &ModelInputs) -> SampledForms {
+        let stated = self.all.random_effects.select_rows(points) * &drawn.stated;
+        let of_probe = |mm: f64| probe(inputs).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
         let mut forms = [0, 1].map(|_| DMatrix::zeros(points.len(), drawn.scatter_mm.len()));
         for c in 0..drawn.scatter_mm.len() {
             let mut normals = Normals::new(6, c as u64);
@@ -325,11 +336,11 @@ impl Seen {
                 forms[1][(r, c)] = found_mm - alike_mm;
             }
         }
-        let found = Drawn {
+        let found = SampledForms {
             all: drawn.all.is_some().then(|| forms[0].clone()),
             forms,
             places: points.iter().map(|&k| self.all.places[k]).collect(),
-            effects: self.all.effects.select_rows(points),
+            effects: self.all.fixed_effects.select_rows(points),
             chosen: points.to_vec(),
             untouched: Vec::new(),
             smooth_sigma_mm: vec![mean(&drawn.scatter_mm); points.len()],
@@ -342,24 +353,28 @@ impl Seen {
     }
 
     /// Lays the fields over the points that the pose was fitted to. The others are far from the surface, and no field.
-    fn with_all_in_the_fit(registration: &Registration, given: &Given, at_points: bool) -> Result<Self, ModelError> {
+    fn with_all_in_the_fit(
+        registration: &Registration,
+        inputs: &ModelInputs,
+        at_points: bool,
+    ) -> Result<Self, ModelError> {
         let all = registration.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Used);
         let (path, used): (Vec<f64>, Vec<&Deviation>) = all.map(|(k, d)| (k as f64, d)).unzip();
         if used.is_empty() {
             return Err(ModelError::TooFewPoints { points: 0, least: 7 });
         }
         let motions = Motions::of(registration, used.iter().map(|d| d.point));
-        let stated = motions.stated(registration, given)?;
+        let stated = motions.stated(registration, inputs)?;
         let columns = stated.columns(used.iter().map(|d| (d.point, d.normal)));
         let (shown, ground_in) =
-            if given.is_corrected { (DMatrix::zeros(used.len(), 0), Some(columns)) } else { (columns, None) };
-        let observed = Observed { stated: shown, ..motions.observed(&used) };
+            if inputs.is_corrected { (DMatrix::zeros(used.len(), 0), Some(columns)) } else { (columns, None) };
+        let observed = Observed { random_effects: shown, ..motions.observed(&used) };
         let path = if at_points && is_path(&observed.places) { path } else { Vec::new() };
         let observed = Observed { path, ..observed };
         let (kept, apart): (Vec<usize>, Vec<usize>) = (0..used.len()).partition(|&k| used[k].in_fit);
         let (all, observed) =
-            if apart.is_empty() { (observed.clone(), observed) } else { (observed.clone(), observed.only(&kept)) };
-        let fields = laid(&observed)?;
+            if apart.is_empty() { (observed.clone(), observed) } else { (observed.clone(), observed.subset(&kept)) };
+        let fields = select_hypotheses(&observed)?;
         Ok(Self {
             motions,
             all,
@@ -375,68 +390,72 @@ impl Seen {
     }
 
     /// The slopes of what is drawn, before anything is added that has none.
-    fn slope(&self, given: &Given, posterior: &Posterior, drawn: &Drawn) -> Option<SlopeFigures> {
-        let slopes = SlopesAt::over(&drawn.places, given.area.integration_mm)?;
+    fn slope(&self, inputs: &ModelInputs, posterior: &Posterior, drawn: &SampledForms) -> Option<SlopeFigures> {
+        let slopes = SlopesAt::over(&drawn.places, inputs.area.integration_mm)?;
         let smooth = [0, 1].map(|k| best_fitted(drawn.forms[k].clone(), &drawn.effects));
-        Some(SlopeFigures::of(&slopes, &smooth, (is_seen(posterior), given)))
+        Some(SlopeFigures::of(&slopes, &smooth, (is_seen(posterior), inputs)))
     }
 
     /// The form by what is drawn, without its slopes; `ground_in` is what of it each of the stated effects may have made there.
     fn form(
         &self,
-        given: &Given,
+        inputs: &ModelInputs,
         posterior: &Posterior,
-        (drawn, ends): (&Drawn, [&[[f64; 3]]; 2]),
+        (drawn, ends): (&SampledForms, [&[[f64; 3]]; 2]),
         ground_in: Option<DMatrix<f64>>,
         is_whole: bool,
     ) -> Form {
         let ground_into_kept = self.ground_in.as_ref().map(|columns| columns.select_rows(&self.kept));
-        let alike = ground_into_kept.as_ref().unwrap_or(&self.observed.stated);
+        let alike = ground_into_kept.as_ref().unwrap_or(&self.observed.random_effects);
         let covariance = of_the_fit(&self.observed, (&self.fields, posterior), alike);
         // What stands apart is seen, whatever the rest shows.
         let is_seen = is_seen(posterior) || !self.apart.is_empty();
-        let figures = drawn.figures(is_seen, ends, given);
-        let budget = if is_whole { self.budget(given, posterior, drawn, ground_in, &figures) } else { Vec::new() };
-        let iso = IsoFits::over(&drawn.places, given.area.middle_mm).filter(|_| is_whole);
-        let hyper = posterior.middle();
-        let alone = match given.priors {
-            None => hyper,
-            Some(_) => self.posterior(&Given { priors: None, ..*given }).middle(),
+        let figures = drawn.figures(is_seen, ends, inputs);
+        let budget = if is_whole { self.budget(inputs, posterior, drawn, ground_in, &figures) } else { Vec::new() };
+        let iso = IsoFits::over(&drawn.places, inputs.area.middle_mm).filter(|_| is_whole);
+        let hyperparameters = posterior.mean_hyperparameters();
+        let alone = match inputs.priors {
+            None => hyperparameters,
+            Some(_) => self.posterior(&ModelInputs { priors: None, ..*inputs }).mean_hyperparameters(),
         };
         Form {
-            hyper,
-            alone: is_seen.then_some(alone),
+            hyperparameters: hyperparameters,
+            hyperparameters_without_prior: is_seen.then_some(alone),
             frame_covariance: self.motions.to_twist(&covariance),
             points: drawn.points(),
             figures,
             budget,
-            iso: iso.map(|fits| IsoFigures::of(&fits, &drawn.forms, is_seen, given)),
+            iso: iso.map(|fits| IsoFigures::of(&fits, &drawn.forms, is_seen, inputs)),
             slope: None,
             known_mm: drawn.known_mm(),
             is_seen,
-            degrees_of_freedom: posterior.free(),
-            is_of_few: is_of_few(posterior, given),
+            degrees_of_freedom: posterior.degrees_of_freedom(),
+            is_of_few: is_of_few(posterior, inputs),
         }
     }
 }
 
-impl Seen {
+impl FittedModel {
     fn budget(
         &self,
-        given: &Given,
+        inputs: &ModelInputs,
         posterior: &Posterior,
-        drawn: &Drawn,
+        drawn: &SampledForms,
         ground_in: Option<DMatrix<f64>>,
         figures: &FormFigures,
-    ) -> Vec<Share> {
+    ) -> Vec<BudgetEntry> {
         let ground_in = ground_in.map(|columns| best_fitted(columns, &drawn.effects));
-        let of_drawn =
-            budget::Drawn { forms: &drawn.forms[0], places: &drawn.places, effects: &drawn.effects, ground_in };
+        let of_drawn = budget::SampledFigures {
+            forms: &drawn.forms[0],
+            places: &drawn.places,
+            effects: &drawn.effects,
+            ground_in,
+        };
         let uncertainties_mm = [figures.rms, figures.pv_most_points].map(|of| of.standard_mm());
         let sources = self.stated.sources();
         let mut budget =
-            budget::parted((&self.observed, &sources), (&self.fields, posterior), &of_drawn, uncertainties_mm);
-        budget.retain(|share| share.source != Source::Datum || given.datum.is_some());
+            budget::decompose((&self.observed, &sources), (&self.fields, posterior), &of_drawn, uncertainties_mm);
+        budget.retain(|share| share.source != UncertaintySource::Datum || inputs.datum.is_some());
         budget
     }
 }
@@ -449,25 +468,25 @@ fn is_seen(posterior: &Posterior) -> bool {
 /// Takes all of the scatter for that of the probe, where it may be: by this a form is told from below.
 ///
 /// A reference sphere that was touched some twenty times tells the scatter of the probe to 15 %. What the points scatter by more need be no form.
-fn least_form(posterior: &Posterior, given: &Given) -> Given {
+fn least_form(posterior: &Posterior, inputs: &ModelInputs) -> ModelInputs {
     /// A probe that scatters by so many standard uncertainties more than was found is none.
     const MAY_SCATTER: f64 = 2.0;
-    match probe(given) {
-        Some([probe_mm, u]) if posterior.middle().scatter_mm < probe_mm * (MAY_SCATTER * u).exp() => {
-            Given { probe_scatter_mm: [0.0; 2], ..*given }
+    match probe(inputs) {
+        Some([probe_mm, u]) if posterior.mean_hyperparameters().noise_sigma_mm < probe_mm * (MAY_SCATTER * u).exp() => {
+            ModelInputs { probe_noise_mm: [0.0; 2], ..*inputs }
         }
-        _ => *given,
+        _ => *inputs,
     }
 }
 
 /// Whether the points are too few to tell the form from a scatter that nothing else tells.
-fn is_of_few(posterior: &Posterior, given: &Given) -> bool {
-    posterior.free() < FEW_FREE && probe(given).is_none()
+fn is_of_few(posterior: &Posterior, inputs: &ModelInputs) -> bool {
+    posterior.degrees_of_freedom() < FEW_FREE && probe(inputs).is_none()
 }
 
 /// What is known of the scatter of the probe itself.
-fn probe(given: &Given) -> Probe {
-    (given.probe_scatter_mm[0] > 0.0).then_some(given.probe_scatter_mm)
+fn probe(inputs: &ModelInputs) -> NoisePrior {
+    (inputs.probe_noise_mm[0] > 0.0).then_some(inputs.probe_noise_mm)
 }
 
 fn mean(of: &[f64]) -> f64 {
@@ -499,11 +518,11 @@ fn thinned(of: usize) -> impl Iterator<Item = usize> {
 
 /// What the points cannot tell of themselves.
 #[derive(Clone, Copy, Debug)]
-pub struct Given {
+pub struct ModelInputs {
     /// What is known of form and scatter beforehand; without it what every part of its size is like.
-    pub priors: Option<Priors>,
+    pub priors: Option<Prior>,
     /// What the machine does to all points together, as its cell file states it.
-    pub machine: Machine,
+    pub machine: MachineUncertainty,
     /// Standard uncertainty of the radius of the probe as it was found: it moves every point along its normal alike.
     pub radius_sigma_mm: f64,
     /// Standard uncertainty of all lengths, as a share of them: that of temperature and expansion.
@@ -517,7 +536,7 @@ pub struct Given {
     pub is_corrected: bool,
     /// How far the probe itself scatters, and to what share of that it is known: what points scatter by more is form, too narrow to be told
     /// otherwise. 0 where nothing tells; all of the scatter is the probe's then.
-    pub probe_scatter_mm: [f64; 2],
+    pub probe_noise_mm: [f64; 2],
     /// With what probability a figure may be beyond either of the bounds [`Interval::least_mm`] and [`Interval::most_mm`].
     pub look_risk: f64,
     /// With what probability a figure must be within its limit to be accepted.
@@ -526,16 +545,16 @@ pub struct Given {
     pub area: AreaOptions,
 }
 
-impl Default for Given {
+impl Default for ModelInputs {
     fn default() -> Self {
         Self {
             priors: None,
-            machine: Machine::default(),
+            machine: MachineUncertainty::default(),
             radius_sigma_mm: 0.0,
             scale_sigma: 0.0,
             datum: None,
             is_corrected: false,
-            probe_scatter_mm: [0.0; 2],
+            probe_noise_mm: [0.0; 2],
             look_risk: 0.005,
             probability: 0.975,
             area: AreaOptions::default(),
@@ -545,13 +564,17 @@ impl Default for Given {
 
 /// The covariance of the motions as the registration finds them, by least squares of deviations that a form makes alike: A+ (K + s^2) A+'
 /// with A+ = (H'H)^-1 H' (Aitken 1935), and of what adds to all points alike. K is the mean of those of all fields that it may be.
-fn of_the_fit(observed: &Observed, (fields, posterior): (&Fields, &Posterior), alike: &DMatrix<f64>) -> DMatrix<f64> {
-    let rows = &observed.effects;
+fn of_the_fit(
+    observed: &Observed,
+    (fields, posterior): (&FieldHypotheses, &Posterior),
+    alike: &DMatrix<f64>,
+) -> DMatrix<f64> {
+    let rows = &observed.fixed_effects;
     let inverse = inverse_of_products(rows);
     // A+, a row a point.
     let weights = rows * &inverse;
-    let (covered, scatter2) = posterior.covered(&fields.sums(&weights));
-    let drift = fields.kind.drift;
+    let (covered, scatter2) = posterior.mean_covariance(&fields.sums(&weights));
+    let drift = fields.kind.autocorrelation;
     let of_alike = weights.tr_mul(alike);
     inverse * (scatter2 * (1.0 + drift) / (1.0 - drift)) + covered + &of_alike * of_alike.transpose()
 }
@@ -563,7 +586,7 @@ fn inverse_of_products(effects: &DMatrix<f64>) -> DMatrix<f64> {
 }
 
 /// Forms that may have been, a column each, at some places.
-struct Drawn {
+struct SampledForms {
     /// The forms, and those by fields that follow the points more closely: by these the upper ends of extremes are told.
     forms: [DMatrix<f64>; 2],
     /// Where the points are few: forms that are all of what was found, but for the scatter.
@@ -582,32 +605,32 @@ struct Drawn {
     /// How much of what is stated each has beside it.
     stated: DMatrix<f64>,
     /// The same forms between the places.
-    between: Option<Beside>,
+    between: Option<IntermediateForms>,
 }
 
 /// Forms between places.
-struct Beside {
-    between: Between,
+struct IntermediateForms {
+    between: IntermediateNodes,
     forms: [DMatrix<f64>; 2],
     effects: DMatrix<f64>,
 }
 
-impl Drawn {
+impl SampledForms {
     /// At some places, each with so much of the motions there, and where it is asked for between them.
     fn by(
-        fields: &Fields,
-        draws: Draws,
+        fields: &FieldHypotheses,
+        draws: PosteriorSamples,
         (places, effects): (Vec<[f64; 2]>, DMatrix<f64>),
         moved: &[DMatrix<f64>; 2],
         is_between: bool,
     ) -> Self {
-        let Draws { waves, scatter_mm, narrow_mm, stated } = draws;
+        let PosteriorSamples { waves, scatter_mm, narrow_mm, stated } = draws;
         let count = scatter_mm.len();
-        let at = fields.waves.at(&places);
+        let at = fields.basis.at(&places);
         let firsts: Vec<usize> = (0..count).step_by(A_TIME).collect();
         let is_between = is_between && places.len() < MOST_PLACES;
-        let between = if is_between { Between::of(&places, &fields.waves) } else { None };
-        let axes = between.as_ref().map(|between| fields.waves.grid(&between.grid));
+        let between = if is_between { IntermediateNodes::of(&places, &fields.basis) } else { None };
+        let axes = between.as_ref().map(|between| fields.basis.grid(&between.grid));
         let mut forms = waves.each_ref().map(|waves| {
             let some = |first: &usize| {
                 let of = &at * waves.subcols(*first, A_TIME.min(count - first));
@@ -618,19 +641,19 @@ impl Drawn {
         let between = between.zip(axes).map(|(between, axes)| {
             let on = waves.each_ref().map(|waves| {
                 let one = |c: usize| {
-                    let field = fields.waves.on_grid(&axes, waves.col_as_slice(c));
+                    let field = fields.basis.on_grid(&axes, waves.col_as_slice(c));
                     let along = between.grid.counts[0];
                     between.nodes.iter().map(|node| field[(node % along, node / along)]).collect::<Vec<f64>>()
                 };
                 let all = (0..count).into_par_iter().flat_map_iter(one).collect();
                 DMatrix::from_vec(between.nodes.len(), count, all)
             });
-            Beside { effects: between.rows(&effects), forms: on, between }
+            IntermediateForms { effects: between.rows(&effects), forms: on, between }
         });
         let mut between = between;
         for (k, moved) in moved.iter().enumerate() {
             forms[k] += &effects * moved;
-            if let Some(Beside { forms, effects, .. }) = &mut between {
+            if let Some(IntermediateForms { forms, effects, .. }) = &mut between {
                 forms[k] += &*effects * moved;
             }
         }
@@ -665,7 +688,7 @@ impl Drawn {
     /// Tells how well the smooth form is known. What is stated moves the part too, and so do motions at other places: neither is form.
     fn known_as(self, observed: &Observed) -> Self {
         let at_points = !self.chosen.is_empty();
-        let smooth_sigma_mm = match at_points && observed.stated.ncols() == 0 {
+        let smooth_sigma_mm = match at_points && observed.random_effects.ncols() == 0 {
             true => spread_mm(&self.forms[0]),
             false => spread_mm(&best_fitted(self.forms[0].clone(), &self.effects)),
         };
@@ -676,16 +699,16 @@ impl Drawn {
     ///
     /// What a smooth form leaves of the observations is the scatter of the probe and, as far as it is more than that, form. That share of what is left at a point is form; how much more or less is as uncertain as
     /// the scatter of the probe lets it be.
-    fn with_the_scatter(mut self, observed: &Observed, posterior: &Posterior, given: &Given) -> Self {
+    fn with_the_scatter(mut self, observed: &Observed, posterior: &Posterior, inputs: &ModelInputs) -> Self {
         // Motions are left of the observations as well, and what is stated: neither is scatter. Between the touches the forms have all of their motions.
-        let seen = observed.only(&self.chosen);
+        let seen = observed.subset(&self.chosen);
         let effects = seen.all_effects();
         let base = if effects.ncols() > 0 { effects.qr().q() } else { effects };
         let fitted = |column: DMatrix<f64>| &column - &base * base.tr_mul(&column);
         let found = &seen.deviations_mm;
-        if is_of_few(posterior, given) {
+        if is_of_few(posterior, inputs) {
             let mut all = DMatrix::zeros(found.len(), self.scatter_mm.len());
-            let free = posterior.free().max(1.0);
+            let free = posterior.degrees_of_freedom().max(1.0);
             for (c, mut form) in all.column_iter_mut().enumerate() {
                 let mut normals = Normals::new(7, c as u64);
                 // So few points may by chance have found less than the form has elsewhere: its variance is told like that of a sample.
@@ -701,7 +724,7 @@ impl Drawn {
             let rows = forms.nrows();
             let of = |(c, form): (usize, &mut [f64])| {
                 let mut normals = Normals::new(2, c as u64);
-                let [probe_mm, more_mm] = parted(scatter_mm[c], narrow_mm[c], given, &mut normals);
+                let [probe_mm, more_mm] = parted(scatter_mm[c], narrow_mm[c], inputs, &mut normals);
                 let is_form = more_mm.powi(2) / (probe_mm.powi(2) + more_mm.powi(2)).max(f64::MIN_POSITIVE);
                 if is_form < 1e-6 {
                     return;
@@ -714,28 +737,28 @@ impl Drawn {
             };
             forms.as_mut_slice().par_chunks_mut(rows.max(1)).enumerate().for_each(of);
         }
-        self.narrow_between(given);
+        self.narrow_between(inputs);
         self
     }
 
     /// Adds what is too narrow to be told at places that were not touched: what the scatter is more than that of the probe, and short waves.
-    fn with_what_is_narrow(mut self, given: &Given) -> Self {
+    fn with_what_is_narrow(mut self, inputs: &ModelInputs) -> Self {
         let Self { forms, scatter_mm, narrow_mm, .. } = &mut self;
         forms
             .iter_mut()
             .zip(narrow_mm)
-            .for_each(|(forms, narrow_mm)| add_narrow(forms, (scatter_mm, narrow_mm), given, 4));
-        self.narrow_between(given);
+            .for_each(|(forms, narrow_mm)| add_narrow(forms, (scatter_mm, narrow_mm), inputs, 4));
+        self.narrow_between(inputs);
         self
     }
 
-    fn narrow_between(&mut self, given: &Given) {
+    fn narrow_between(&mut self, inputs: &ModelInputs) {
         let Self { between, scatter_mm, narrow_mm, .. } = self;
-        if let Some(Beside { forms, .. }) = between {
+        if let Some(IntermediateForms { forms, .. }) = between {
             forms
                 .iter_mut()
                 .zip(narrow_mm)
-                .for_each(|(forms, narrow_mm)| add_narrow(forms, (scatter_mm, narrow_mm), given, 8));
+                .for_each(|(forms, narrow_mm)| add_narrow(forms, (scatter_mm, narrow_mm), inputs, 8));
         }
     }
 
@@ -754,7 +777,7 @@ impl Drawn {
             }
         };
         self.forms.iter_mut().for_each(|forms| take(forms, columns));
-        if let Some(Beside { between, forms, .. }) = &mut self.between {
+        if let Some(IntermediateForms { between, forms, .. }) = &mut self.between {
             let columns = between.rows(columns);
             forms.iter_mut().for_each(|forms| take(forms, &columns));
         }
@@ -818,7 +841,7 @@ impl Drawn {
         self.all.iter_mut().for_each(|all| {
             fit(all);
         });
-        if let Some(Beside { forms, effects, .. }) = &mut self.between {
+        if let Some(IntermediateForms { forms, effects, .. }) = &mut self.between {
             for (forms, taken) in forms.iter_mut().zip(&taken) {
                 // What the registration was free to do is seen by the points: the factor has an inverse.
                 if let Some(moved) = upper.solve_upper_triangular(taken) {
@@ -836,7 +859,7 @@ impl Drawn {
             let mean_mm = row.sum() / count;
             let sigma_mm = (row.iter().map(|v| (v - mean_mm).powi(2)).sum::<f64>() / (count - 1.0)).sqrt();
             let smooth_sigma_mm = self.smooth_sigma_mm[k];
-            FormPoint { at_mm: *at_mm, form: Predicted { mean_mm, sigma_mm }, smooth_sigma_mm }
+            FormPoint { at_mm: *at_mm, form: Prediction { mean_mm, sigma_mm }, smooth_sigma_mm }
         };
         self.places.iter().enumerate().map(of).collect()
     }
@@ -854,7 +877,7 @@ impl Drawn {
     }
 
     /// The figures; where no form is seen they are known from above alone.
-    fn figures(&self, is_seen: bool, [least, most]: [&[[f64; 3]]; 2], given: &Given) -> FormFigures {
+    fn figures(&self, is_seen: bool, [least, most]: [&[[f64; 3]]; 2], inputs: &ModelInputs) -> FormFigures {
         let [plain, rough] =
             [0, 1].map(|k| self.figures_of(&self.forms[k], self.between.as_ref().map(|of| &of.forms[0])));
         let all = self.all.as_ref().map(|all| self.figures_of(all, None));
@@ -862,7 +885,7 @@ impl Drawn {
             let of = |figures: &[[f64; 3]]| figures.iter().map(|of| of[k]).collect::<Vec<f64>>();
             let others = if k == 0 { most } else { &rough };
             let higher = [Some(others), all.as_deref()].into_iter().flatten().filter(|of| !of.is_empty()).map(of);
-            Interval::of(of(&plain), (of(least), higher), is_seen, given)
+            Interval::of(of(&plain), (of(least), higher), is_seen, inputs)
         };
         FormFigures { rms: interval(0), pv: interval(1), pv_most_points: interval(2) }
     }
@@ -897,10 +920,10 @@ fn ends(of: impl Iterator<Item = f64>) -> [f64; 2] {
 }
 
 /// Adds to every place of each form what is too narrow to be told there.
-fn add_narrow(forms: &mut DMatrix<f64>, (scatter_mm, narrow_mm): (&[f64], &[f64]), given: &Given, stream: u64) {
+fn add_narrow(forms: &mut DMatrix<f64>, (scatter_mm, narrow_mm): (&[f64], &[f64]), inputs: &ModelInputs, stream: u64) {
     let rows = forms.nrows();
     let of = |(c, form): (usize, &mut [f64])| {
-        let [_, more_mm] = parted(scatter_mm[c], narrow_mm[c], given, &mut Normals::new(2, c as u64));
+        let [_, more_mm] = parted(scatter_mm[c], narrow_mm[c], inputs, &mut Normals::new(2, c as u64));
         let mut normals = Normals::new(stream, c as u64);
         if more_mm > 0.0 {
             form.iter_mut().for_each(|value| *value += more_mm * normals.next());
@@ -911,8 +934,8 @@ fn add_narrow(forms: &mut DMatrix<f64>, (scatter_mm, narrow_mm): (&[f64], &[f64]
 
 /// The scatter of the probe and what beside it is too narrow a form, each as it may be. Where nothing tells how
 /// far the probe scatters all of the scatter is its own.
-fn parted(scatter_mm: f64, narrow_mm: f64, given: &Given, normals: &mut Normals) -> [f64; 2] {
-    let Some([probe_mm, probe_u]) = probe(given) else { return [scatter_mm, narrow_mm] };
+fn parted(scatter_mm: f64, narrow_mm: f64, inputs: &ModelInputs, normals: &mut Normals) -> [f64; 2] {
+    let Some([probe_mm, probe_u]) = probe(inputs) else { return [scatter_mm, narrow_mm] };
     let own_mm = (probe_mm * (probe_u * normals.next()).exp()).min(scatter_mm);
     [own_mm, (scatter_mm.powi(2) - own_mm.powi(2)).max(0.0).sqrt().hypot(narrow_mm)]
 }
@@ -948,7 +971,7 @@ impl Interval {
         mut values: Vec<f64>,
         (mut lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
         has_low: bool,
-        given: &Given,
+        inputs: &ModelInputs,
     ) -> Self {
         values.sort_unstable_by(f64::total_cmp);
         lower.sort_unstable_by(f64::total_cmp);
@@ -958,7 +981,7 @@ impl Interval {
                 of
             })
             .collect();
-        let Given { look_risk, probability, .. } = *given;
+        let ModelInputs { look_risk, probability, .. } = *inputs;
         let nth = |of: &[f64], share: f64| of[((of.len() - 1) as f64 * share).round() as usize];
         let at = |share: f64| {
             let own = nth(&values, share);
@@ -1008,21 +1031,25 @@ impl Motions {
         Observed {
             places: used.iter().map(|d| [d.point.x, d.point.y]).collect(),
             deviations_mm: used.iter().map(|d| d.deviation_mm).collect(),
-            effects: self.rows(used.iter().map(|d| (d.point, d.normal))),
-            stated: DMatrix::zeros(used.len(), 0),
+            fixed_effects: self.rows(used.iter().map(|d| (d.point, d.normal))),
+            random_effects: DMatrix::zeros(used.len(), 0),
             path: Vec::new(),
         }
     }
 
     /// What is stated of all points together, about their middle.
-    pub(super) fn stated(&self, registration: &Registration, given: &Given) -> Result<Effects, ModelError> {
-        let of_others = [given.radius_sigma_mm, given.scale_sigma];
-        let datum = given.datum.unwrap_or_default();
-        if let Some((what, value)) = unsound(&given.machine, of_others, &datum) {
+    pub(super) fn stated(
+        &self,
+        registration: &Registration,
+        inputs: &ModelInputs,
+    ) -> Result<MachineEffects, ModelError> {
+        let of_others = [inputs.radius_sigma_mm, inputs.scale_sigma];
+        let datum = inputs.datum.unwrap_or_default();
+        if let Some((what, value)) = unsound(&inputs.machine, of_others, &datum) {
             return Err(ModelError::Stated { what, value });
         }
         let model_from_machine = registration.cmm_from_model.rotation.transpose();
-        Ok(Effects::new(given.machine, of_others, self.centre, model_from_machine).held(datum))
+        Ok(MachineEffects::new(inputs.machine, of_others, self.centre, model_from_machine).held(datum))
     }
 
     /// What a unit of each motion adds to the distance of each point from the surface.

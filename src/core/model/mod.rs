@@ -17,54 +17,57 @@
 //!
 //! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
 
-mod between;
+mod basis;
 mod budget;
 mod dense;
 mod effects;
 mod error;
 mod field;
-mod fields;
 mod figures;
 mod form;
-mod growing;
-mod hill;
-mod kind;
-mod machine;
+mod hypotheses;
+mod incremental;
+mod intermediate;
+mod machine_uncertainty;
 mod matern;
+mod nelder_mead;
+mod noise_kind;
 mod normals;
+mod part_priors;
 mod posterior;
 mod priors;
 mod sessions;
-mod taught;
-mod touches;
-mod waves;
+mod stopping;
 
-pub use budget::Share;
-pub use dense::{Dense, Predicted};
-pub use effects::Effects;
+pub use budget::BudgetEntry;
+pub use dense::{DensePosterior, Prediction};
+pub use effects::EffectEstimates;
 pub use error::ModelError;
-pub use field::{Field, Lay, Smoothness};
+pub use field::{Anisotropy, Field, Smoothness};
 pub use figures::{AngleInterval, AreaOptions, IsoFigures, SlopeFigures};
-pub use form::{Form, FormFigures, FormPoint, Given, Interval};
-pub use growing::Growing;
-pub use machine::{Machine, Source};
-pub use priors::Priors;
-pub use sessions::{Between, Foretold, Sessions};
-pub use taught::{Lesson, Taught};
-pub use touches::{FEWEST, FIRST, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread};
+pub use form::{Form, FormFigures, FormPoint, Interval, ModelInputs};
+pub use incremental::IncrementalPosterior;
+pub use machine_uncertainty::{MachineUncertainty, UncertaintySource};
+pub use part_priors::{PartFit, PartPriors};
+pub use priors::Prior;
+pub use sessions::{BetweenSessionVariance, PredictionInterval, Sessions};
+pub use stopping::{
+    FIRST_BATCH, MAX_BATCHES, MIN_TOUCHES, PartialMeasurement, Reason, StoppingCriteria, StoppingDecision, decide,
+    farthest_points, short_tour,
+};
 
 use nalgebra::DMatrix;
 
 /// What the model has to know before it can tell anything.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Hyper {
+pub struct Hyperparameters {
     /// The field.
     pub field: Field,
     /// Standard deviation by which a point scatters by itself.
-    pub scatter_mm: f64,
+    pub noise_sigma_mm: f64,
     /// How much of its scatter the next point along the path has, from 0, where each scatters on its own, to below 1: a scanning
     /// probe drifts. Points k steps apart share this to the power of k.
-    pub drift: f64,
+    pub noise_autocorrelation: f64,
 }
 
 /// What was measured. All three have a row a point.
@@ -75,9 +78,9 @@ pub struct Observed {
     /// What.
     pub deviations_mm: Vec<f64>,
     /// What a unit of each effect that nobody knows adds to it, such as the motions of the part; may have no column.
-    pub effects: DMatrix<f64>,
+    pub fixed_effects: DMatrix<f64>,
     /// What a standard uncertainty of each effect that somebody states adds to it, such as those of the machine; may have no column.
-    pub stated: DMatrix<f64>,
+    pub random_effects: DMatrix<f64>,
     /// Which point of a path each of them is; empty where they were not measured along one.
     pub path: Vec<f64>,
 }
@@ -86,30 +89,26 @@ impl Observed {
     /// Deviations of which nothing moves them all.
     pub fn without_effects(places: Vec<[f64; 2]>, deviations_mm: Vec<f64>) -> Self {
         let [effects, stated] = [0, 0].map(|columns| DMatrix::zeros(places.len(), columns));
-        Self { places, deviations_mm, effects, stated, path: Vec::new() }
+        Self { places, deviations_mm, fixed_effects: effects, random_effects: stated, path: Vec::new() }
     }
 
     /// Some of them.
-    fn only(&self, chosen: &[usize]) -> Self {
+    fn subset(&self, chosen: &[usize]) -> Self {
         Self {
             places: chosen.iter().map(|&k| self.places[k]).collect(),
             deviations_mm: chosen.iter().map(|&k| self.deviations_mm[k]).collect(),
-            effects: self.effects.select_rows(chosen),
-            stated: self.stated.select_rows(chosen),
+            fixed_effects: self.fixed_effects.select_rows(chosen),
+            random_effects: self.random_effects.select_rows(chosen),
             path: self.path_of(chosen),
         }
     }
 
     /// The effects that nobody knows, and beside them those that are stated.
     fn all_effects(&self) -> DMatrix<f64> {
-        let (n, p) = self.effects.shape();
-        DMatrix::from_fn(
-            n,
-            p + self.stated.ncols(),
-            |r, c| {
-                if c < p { self.effects[(r, c)] } else { self.stated[(r, c - p)] }
-            },
-        )
+        let (n, p) = self.fixed_effects.shape();
+        DMatrix::from_fn(n, p + self.random_effects.ncols(), |r, c| {
+            if c < p { self.fixed_effects[(r, c)] } else { self.random_effects[(r, c - p)] }
+        })
     }
 
     fn path_of(&self, chosen: &[usize]) -> Vec<f64> {
@@ -118,7 +117,7 @@ impl Observed {
 
     /// Says what makes these no observations.
     fn check(&self) -> Result<(), ModelError> {
-        let Self { places, deviations_mm, effects, stated, path } = self;
+        let Self { places, deviations_mm, fixed_effects: effects, random_effects: stated, path } = self;
         let (points, columns) = (places.len(), effects.ncols());
         let has_path = path.len() == points && path.iter().all(|value| value.is_finite());
         if deviations_mm.len() != points
@@ -151,34 +150,34 @@ fn spacing_mm(places: &[[f64; 2]]) -> f64 {
     (span(0) * span(1) / places.len() as f64).sqrt()
 }
 
-impl Hyper {
+impl Hyperparameters {
     /// Finds the parameters that what was measured speaks for, as one number each: the middle of those that may be.
     ///
     /// # Errors
     /// Rows that do not belong together, too few points, effects that cannot be told apart, expectations that cannot be.
-    pub fn of(observed: &Observed, priors: Option<&Priors>) -> Result<Self, ModelError> {
+    pub fn estimate(observed: &Observed, priors: Option<&Prior>) -> Result<Self, ModelError> {
         if let Some(priors) = priors {
             priors.check()?;
         }
         observed.check()?;
-        let fields = posterior::laid(observed)?;
-        Ok(posterior::Posterior::of(&fields, observed, priors, None).middle())
+        let fields = posterior::select_hypotheses(observed)?;
+        Ok(posterior::Posterior::of(&fields, observed, priors, None).mean_hyperparameters())
     }
 
     /// How much of their scatter two points share that are so many steps of the path apart.
-    fn shared(&self, steps: f64) -> f64 {
+    fn noise_correlation(&self, steps: f64) -> f64 {
         // Further apart nothing is left of it.
         const FAR: f64 = 36.0;
-        if self.drift == 0.0 {
+        if self.noise_autocorrelation == 0.0 {
             return if steps == 0.0 { 1.0 } else { 0.0 };
         }
-        let power = steps.abs() * self.drift.ln();
+        let power = steps.abs() * self.noise_autocorrelation.ln();
         if power < -FAR { 0.0 } else { power.exp() }
     }
 
     /// Says what makes these no parameters.
     fn check(&self) -> Result<(), ModelError> {
-        let Self { field, scatter_mm, drift } = *self;
+        let Self { field, noise_sigma_mm: scatter_mm, noise_autocorrelation: drift } = *self;
         field.check()?;
         if !(scatter_mm.is_finite() && scatter_mm > 0.0) {
             return Err(ModelError::Hyper { what: "scatter", value: scatter_mm });

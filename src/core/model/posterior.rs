@@ -11,10 +11,10 @@ use faer::Mat;
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 use rayon::prelude::*;
 
-use super::fields::{Fields, Kind, Node, strengths};
-use super::kind::kinds;
+use super::hypotheses::{FieldHypotheses, FieldHypothesis, NoiseKind, variance_ratios};
+use super::noise_kind::candidates;
 use super::normals::Normals;
-use super::{Field, Hyper, ModelError, Observed, Priors, Smoothness};
+use super::{Field, Hyperparameters, ModelError, Observed, Prior, Smoothness};
 
 /// By how much the variance of fields is raised for the upper ends of extremes, that of rough ones less, and lowered for the lower ends.
 const UNDER: f64 = 16.0;
@@ -29,25 +29,25 @@ const STRONGER: f64 = 3.0;
 ///
 /// # Errors
 /// Those of [`Fields::over`].
-pub(super) fn laid(observed: &Observed) -> Result<Fields, ModelError> {
-    let (plain, drifting) = kinds(observed);
-    let fields = Fields::over(observed, plain)?;
+pub(super) fn select_hypotheses(observed: &Observed) -> Result<FieldHypotheses, ModelError> {
+    let (plain, drifting) = candidates(observed);
+    let fields = FieldHypotheses::over(observed, plain)?;
     let Some(drifting) = drifting else { return Ok(fields) };
-    let other = Fields::over(observed, drifting)?;
+    let other = FieldHypotheses::over(observed, drifting)?;
     let [without, with] = [&fields, &other].map(|of| Posterior::of(of, observed, None, None).log_likelihood());
     Ok(if with > without { other } else { fields })
 }
 
 /// What is known of the scatter of the probe beforehand: its size, and the standard deviation of the logarithm of that.
-pub(super) type Probe = Option<[f64; 2]>;
+pub(super) type NoisePrior = Option<[f64; 2]>;
 
 /// Fields with their probabilities.
 pub(super) struct Posterior<'f> {
-    fields: &'f Fields,
+    fields: &'f FieldHypotheses,
     observed: &'f Observed,
-    probe: Probe,
+    probe: NoisePrior,
     /// U' of what was found and of what is stated, by node.
-    seen: Vec<Seen>,
+    seen: Vec<Projected>,
     /// The logarithm of the density of each node and strength, the strengths of a node side by side.
     densities: Vec<Vec<f64>>,
     /// By how much the likelihood of the best field is above that of none, in its logarithm.
@@ -56,7 +56,7 @@ pub(super) struct Posterior<'f> {
 }
 
 /// What a node sees: the columns are what was found, and behind it what is stated.
-struct Seen {
+struct Projected {
     /// U' of the columns.
     v: Mat<f64>,
     /// The products of all columns, less those of V.
@@ -65,7 +65,7 @@ struct Seen {
 
 /// Which fields are drawn.
 #[derive(Clone, Copy, PartialEq)]
-pub(super) enum Which {
+pub(super) enum HypothesisSet {
     /// All that may be, and beside them those that follow the points more closely.
     All,
     /// The smooth ones, and beside them those that draw peaks down: what scatters unlike a normal probe looks like a rough field.
@@ -74,7 +74,7 @@ pub(super) enum Which {
     Rough,
 }
 
-impl Which {
+impl HypothesisSet {
     fn has(self, smoothness: Smoothness) -> bool {
         let is_rough = smoothness == Smoothness::Never;
         match self {
@@ -95,7 +95,7 @@ impl Which {
 }
 
 /// Fields that were drawn.
-pub(super) struct Draws {
+pub(super) struct PosteriorSamples {
     /// The coefficients of their waves, a column each, by either variance.
     pub(super) waves: [Mat<f64>; 2],
     /// The scatter of each, and the standard deviation of what is in waves that are too short to be told, of either kind.
@@ -106,28 +106,34 @@ pub(super) struct Draws {
 }
 
 impl<'f> Posterior<'f> {
-    pub(super) fn of(fields: &'f Fields, observed: &'f Observed, priors: Option<&Priors>, probe: Probe) -> Self {
-        let stated = observed.stated.ncols();
+    pub(super) fn of(
+        fields: &'f FieldHypotheses,
+        observed: &'f Observed,
+        priors: Option<&Prior>,
+        probe: NoisePrior,
+    ) -> Self {
+        let stated = observed.random_effects.ncols();
         let columns = DMatrix::from_fn(observed.places.len(), 1 + stated, |r, c| match c {
             0 => observed.deviations_mm[r],
-            c => observed.stated[(r, c - 1)],
+            c => observed.random_effects[(r, c - 1)],
         });
         let (coordinates, products) = fields.coordinates(&columns);
-        let see = |node: &Node| {
-            let v = node.vectors.transpose() * &coordinates;
+        let see = |node: &FieldHypothesis| {
+            let v = node.eigenvectors.transpose() * &coordinates;
             let rest = DMatrix::from_fn(1 + stated, 1 + stated, |a, b| {
                 products[(a, b)] - (0..v.nrows()).map(|k| v[(k, a)] * v[(k, b)]).sum::<f64>()
             });
-            Seen { v, rest }
+            Projected { v, rest }
         };
-        let seen: Vec<Seen> = fields.nodes.iter().map(see).collect();
+        let seen: Vec<Projected> = fields.hypotheses.iter().map(see).collect();
         let posterior =
             Self { fields, observed, probe, seen, densities: Vec::new(), evidence: 0.0, squares: products[(0, 0)] };
-        let of = |(k, node): (usize, &Node)| {
-            let likelihoods: Vec<f64> = strengths().map(|tau| posterior.scale(k, tau).integral()).collect();
+        let of = |(k, node): (usize, &FieldHypothesis)| {
+            let likelihoods: Vec<f64> =
+                variance_ratios().map(|tau| posterior.noise_likelihood(k, tau).log_marginal()).collect();
             let expected = |(at, likelihood): (usize, &f64)| {
                 let expected = priors.map_or(node.prior[at], |priors| {
-                    let tau = strengths().nth(at).unwrap_or_default();
+                    let tau = variance_ratios().nth(at).unwrap_or_default();
                     priors.log_density(node.range_mm, (tau * node.scale).sqrt().recip())
                 });
                 likelihood + expected
@@ -135,9 +141,9 @@ impl<'f> Posterior<'f> {
             let densities: Vec<f64> = likelihoods.iter().enumerate().map(expected).collect();
             (likelihoods, densities)
         };
-        let all: Vec<(Vec<f64>, Vec<f64>)> = fields.nodes.par_iter().enumerate().map(of).collect();
+        let all: Vec<(Vec<f64>, Vec<f64>)> = fields.hypotheses.par_iter().enumerate().map(of).collect();
         let best = all.iter().flat_map(|(likelihoods, _)| likelihoods).copied().fold(f64::NEG_INFINITY, f64::max);
-        let none = if fields.nodes.is_empty() { best } else { posterior.scale(0, 0.0).integral() };
+        let none = if fields.hypotheses.is_empty() { best } else { posterior.noise_likelihood(0, 0.0).log_marginal() };
         let densities: Vec<Vec<f64>> = all.into_iter().map(|(_, densities)| densities).collect();
         Self { densities, evidence: best - none, ..posterior }
     }
@@ -149,17 +155,18 @@ impl<'f> Posterior<'f> {
             let top = all.iter().copied().fold(f64::NEG_INFINITY, f64::max);
             top + all.iter().map(|of| (of - top).exp()).sum::<f64>().ln()
         };
-        let expected = sum(&mut self.fields.nodes.iter().flat_map(|node| &node.prior).copied());
+        let expected = sum(&mut self.fields.hypotheses.iter().flat_map(|node| &node.prior).copied());
         sum(&mut self.densities.iter().flatten().copied()) - expected + self.fields.log_whitened
     }
 
     /// What tells the scatter by a node and a strength.
-    fn scale(&self, node: usize, tau: f64) -> Scale {
-        let (Node { values, narrow, scale, .. }, Seen { v, rest }) = (&self.fields.nodes[node], &self.seen[node]);
+    fn noise_likelihood(&self, node: usize, tau: f64) -> NoiseLikelihood {
+        let (FieldHypothesis { eigenvalues: values, truncated_variance: narrow, scale, .. }, Projected { v, rest }) =
+            (&self.fields.hypotheses[node], &self.seen[node]);
         let stated = rest.nrows() - 1;
         let alike = 1.0 + scale * narrow * tau;
         let mut products = rest / alike;
-        let mut logs = (self.fields.free - values.len() as f64) * alike.ln();
+        let mut logs = (self.fields.degrees_of_freedom - values.len() as f64) * alike.ln();
         for (k, l) in values.iter().enumerate() {
             let own = 1.0 + scale * (l + narrow) * tau;
             logs += own.ln();
@@ -169,24 +176,24 @@ impl<'f> Posterior<'f> {
                 }
             }
         }
-        Scale::of(&products, logs, self.fields.free, self.probe)
+        NoiseLikelihood::of(&products, logs, self.fields.degrees_of_freedom, self.probe)
     }
 
     /// The most probable node and strength, with the scatter by them.
-    pub(super) fn best(&self) -> Option<(&Node, f64, f64)> {
-        let (number, tau, _) = self.probabilities(Which::All).into_iter().max_by(|a, b| a.2.total_cmp(&b.2))?;
-        Some((&self.fields.nodes[number], tau, self.scale(number, tau).best_mm()))
+    pub(super) fn best(&self) -> Option<(&FieldHypothesis, f64, f64)> {
+        let (number, tau, _) = self.probabilities(HypothesisSet::All).into_iter().max_by(|a, b| a.2.total_cmp(&b.2))?;
+        Some((&self.fields.hypotheses[number], tau, self.noise_likelihood(number, tau).mode_mm()))
     }
 
     /// How probable it is that the field is one of the rough ones.
     pub(super) fn is_rough(&self) -> f64 {
-        let is = |of: &(usize, f64, f64)| Which::Rough.has(self.fields.nodes[of.0].smoothness);
-        self.probabilities(Which::All).iter().filter(|of| is(of)).map(|of| of.2).sum()
+        let is = |of: &(usize, f64, f64)| HypothesisSet::Rough.has(self.fields.hypotheses[of.0].smoothness);
+        self.probabilities(HypothesisSet::All).iter().filter(|of| is(of)).map(|of| of.2).sum()
     }
 
     /// How many degrees of freedom the fit leaves.
-    pub(super) fn free(&self) -> f64 {
-        self.fields.free
+    pub(super) fn degrees_of_freedom(&self) -> f64 {
+        self.fields.degrees_of_freedom
     }
 
     /// The root mean square of what the fit leaves.
@@ -195,71 +202,85 @@ impl<'f> Posterior<'f> {
     }
 
     /// The probability of each node and strength of some kinds, all together 1.
-    fn probabilities(&self, which: Which) -> Vec<(usize, f64, f64)> {
-        let chosen = || self.densities.iter().enumerate().filter(|of| which.has(self.fields.nodes[of.0].smoothness));
+    fn probabilities(&self, which: HypothesisSet) -> Vec<(usize, f64, f64)> {
+        let chosen =
+            || self.densities.iter().enumerate().filter(|of| which.has(self.fields.hypotheses[of.0].smoothness));
         let top = chosen().flat_map(|(_, of)| of).copied().fold(f64::NEG_INFINITY, f64::max);
-        let all = chosen()
-            .flat_map(|(node, of)| strengths().zip(of).map(move |(tau, density)| (node, tau, (density - top).exp())));
+        let all = chosen().flat_map(|(node, of)| {
+            variance_ratios().zip(of).map(move |(tau, density)| (node, tau, (density - top).exp()))
+        });
         let some: Vec<_> = all.filter(|(.., weight)| *weight > 1e-7).collect();
         let whole: f64 = some.iter().map(|(.., weight)| weight).sum();
         some.into_iter().map(|(node, tau, weight)| (node, tau, weight / whole)).collect()
     }
 
     /// The parameters of one node and strength.
-    fn hyper(&self, node: usize, tau: f64) -> Hyper {
-        let Node { smoothness, range_mm, scale, .. } = &self.fields.nodes[node];
+    fn hyperparameters(&self, node: usize, tau: f64) -> Hyperparameters {
+        let FieldHypothesis { smoothness, range_mm, scale, .. } = &self.fields.hypotheses[node];
         // No deviation at all is a field of no strength.
-        let scatter_mm = self.scale(node, tau).best_mm().max(f64::MIN_POSITIVE.sqrt());
+        let scatter_mm = self.noise_likelihood(node, tau).mode_mm().max(f64::MIN_POSITIVE.sqrt());
         let sigma_mm = scatter_mm * (tau * scale).sqrt();
-        let Kind { lay, drift } = self.fields.kind;
-        Hyper { field: Field { sigma_mm, range_mm: *range_mm, smoothness: *smoothness, lay }, scatter_mm, drift }
+        let NoiseKind { lay, autocorrelation: drift } = self.fields.kind;
+        Hyperparameters {
+            field: Field { sigma_mm, range_mm: *range_mm, smoothness: *smoothness, lay },
+            noise_sigma_mm: scatter_mm,
+            noise_autocorrelation: drift,
+        }
     }
 
     /// How much less likely a field is whose strength is beyond what is seen: of it the points would show next to nothing.
-    fn doubt(&self, hyper: &Hyper) -> f64 {
-        let beyond = (hyper.field.sigma_mm / self.rms_mm().max(f64::MIN_POSITIVE)).ln().max(0.0) / STRONGER.ln();
+    fn doubt(&self, hyperparameters: &Hyperparameters) -> f64 {
+        let beyond =
+            (hyperparameters.field.sigma_mm / self.rms_mm().max(f64::MIN_POSITIVE)).ln().max(0.0) / STRONGER.ln();
         (-0.5 * beyond * beyond).exp()
     }
 
     /// Parameters that may be, with their probabilities: of each node at its most probable strength. The most probable ones come first.
     /// Only those of some kinds, beside each other.
-    pub(super) fn likely(&self, is_of: impl Fn(Smoothness) -> bool) -> Vec<(Hyper, f64)> {
+    pub(super) fn weighted_hyperparameters(&self, is_of: impl Fn(Smoothness) -> bool) -> Vec<(Hyperparameters, f64)> {
         let of = |(node, densities): (usize, &Vec<f64>)| {
-            if !is_of(self.fields.nodes[node].smoothness) {
+            if !is_of(self.fields.hypotheses[node].smoothness) {
                 return None;
             }
-            let taus: Vec<f64> = strengths().collect();
+            let taus: Vec<f64> = variance_ratios().collect();
             let best = (0..densities.len()).max_by(|a, b| densities[*a].total_cmp(&densities[*b]))?;
-            let hyper = self.hyper(node, taus[best]);
+            let hyperparameters = self.hyperparameters(node, taus[best]);
             let sum: f64 = densities.iter().map(|of| (of - densities[best]).exp()).sum();
-            Some((hyper, densities[best] + sum.ln() + self.doubt(&hyper).max(f64::MIN_POSITIVE).ln()))
+            Some((
+                hyperparameters,
+                densities[best] + sum.ln() + self.doubt(&hyperparameters).max(f64::MIN_POSITIVE).ln(),
+            ))
         };
-        let mut all: Vec<(Hyper, f64)> = self.densities.iter().enumerate().filter_map(of).collect();
+        let mut all: Vec<(Hyperparameters, f64)> = self.densities.iter().enumerate().filter_map(of).collect();
         all.sort_by(|a, b| b.1.total_cmp(&a.1));
         let top = all.first().map_or(0.0, |(_, of)| *of);
-        all.into_iter().map(|(hyper, of)| (hyper, (of - top).exp())).collect()
+        all.into_iter().map(|(hyperparameters, of)| (hyperparameters, (of - top).exp())).collect()
     }
 
     /// The parameters as one number each: the means of their logarithms over the nodes that are as smooth as the most probable one. Of a field that is
     /// nowhere smooth nobody could say how much of it is scatter: it is none of these.
-    pub(super) fn middle(&self) -> Hyper {
-        let likely = self.likely(|smoothness| smoothness != Smoothness::Never);
+    pub(super) fn mean_hyperparameters(&self) -> Hyperparameters {
+        let likely = self.weighted_hyperparameters(|smoothness| smoothness != Smoothness::Never);
         let Some((first, _)) = likely.first().copied() else {
             let scatter_mm = self.rms_mm().max(f64::MIN_POSITIVE.sqrt());
-            return Hyper { field: Field::new(scatter_mm, 1.0), scatter_mm, drift: self.fields.kind.drift };
+            return Hyperparameters {
+                field: Field::new(scatter_mm, 1.0),
+                noise_sigma_mm: scatter_mm,
+                noise_autocorrelation: self.fields.kind.autocorrelation,
+            };
         };
         let alike: Vec<_> = likely.iter().filter(|(of, _)| of.field.smoothness == first.field.smoothness).collect();
         let whole: f64 = alike.iter().map(|(_, weight)| weight).sum();
-        let mean = |of: fn(&Hyper) -> f64| {
-            (alike.iter().map(|(hyper, weight)| weight * of(hyper).ln()).sum::<f64>() / whole).exp()
+        let mean = |of: fn(&Hyperparameters) -> f64| {
+            (alike.iter().map(|(hyperparameters, weight)| weight * of(hyperparameters).ln()).sum::<f64>() / whole).exp()
         };
         let field =
             Field { sigma_mm: mean(|of| of.field.sigma_mm), range_mm: mean(|of| of.field.range_mm), ..first.field };
-        Hyper { field, scatter_mm: mean(|of| of.scatter_mm), ..first }
+        Hyperparameters { field, noise_sigma_mm: mean(|of| of.noise_sigma_mm), ..first }
     }
 
     /// Draws so many fields of some kinds; the same seed gives the same ones.
-    pub(super) fn draws(&self, which: Which, count: usize, seed: u64) -> Draws {
+    pub(super) fn samples(&self, which: HypothesisSet, count: usize, seed: u64) -> PosteriorSamples {
         let probabilities = self.probabilities(which);
         // Equal steps through all of them: each as often as it is probable, to one.
         let mut chosen: Vec<(usize, f64, usize)> = Vec::with_capacity(count);
@@ -280,12 +301,13 @@ impl<'f> Posterior<'f> {
         }
         let nodes: Vec<&[(usize, f64, usize)]> =
             chosen.chunk_by(|a, b| a.0 == b.0).flat_map(|of| of.chunks(64)).collect();
-        let made: Vec<Draws> = nodes.par_iter().map(|of| self.drawn(of[0].0, of, (which, seed))).collect();
-        let mut draws = Draws {
-            waves: [0, 1].map(|_| Mat::zeros(self.fields.waves.len(), chosen.len())),
+        let made: Vec<PosteriorSamples> =
+            nodes.par_iter().map(|of| self.samples_of(of[0].0, of, (which, seed))).collect();
+        let mut draws = PosteriorSamples {
+            waves: [0, 1].map(|_| Mat::zeros(self.fields.basis.len(), chosen.len())),
             scatter_mm: Vec::new(),
             narrow_mm: [Vec::new(), Vec::new()],
-            stated: DMatrix::zeros(self.observed.stated.ncols(), chosen.len()),
+            stated: DMatrix::zeros(self.observed.random_effects.ncols(), chosen.len()),
         };
         for of in made {
             let first = draws.scatter_mm.len();
@@ -302,16 +324,21 @@ impl<'f> Posterior<'f> {
     }
 
     /// Draws of one node: z = sigma z0 + D R' U (w - sigma V'z0) / sqrt l.
-    fn drawn(&self, number: usize, chosen: &[(usize, f64, usize)], (which, seed): (Which, u64)) -> Draws {
-        let (node, Seen { v, .. }) = (&self.fields.nodes[number], &self.seen[number]);
-        let (waves, seen, count) = (node.strengths.len(), node.values.len(), chosen.len());
+    fn samples_of(
+        &self,
+        number: usize,
+        chosen: &[(usize, f64, usize)],
+        (which, seed): (HypothesisSet, u64),
+    ) -> PosteriorSamples {
+        let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.seen[number]);
+        let (waves, seen, count) = (node.standard_deviations.len(), node.eigenvalues.len(), chosen.len());
         let mut streams: Vec<Normals> = chosen.iter().map(|(.., k)| Normals::new(seed, *k as u64)).collect();
         let told: Vec<(f64, DVector<f64>)> = chosen
             .iter()
             .zip(&mut streams)
             .map(|((_, tau, _), normals)| {
-                let scale = self.scale(number, *tau);
-                let scatter_mm = scale.drawn_mm(normals);
+                let scale = self.noise_likelihood(number, *tau);
+                let scatter_mm = scale.sample_mm(normals);
                 (scatter_mm, scale.stated(scatter_mm, normals))
             })
             .collect();
@@ -321,32 +348,32 @@ impl<'f> Posterior<'f> {
             before.col_as_slice_mut(c).iter_mut().for_each(|value| *value = normals.next());
             by_points.col_as_slice_mut(c).iter_mut().for_each(|value| *value = normals.next());
         }
-        let of_before = node.vectors.transpose() * self.fields.by_points(node, &before);
+        let of_before = node.eigenvectors.transpose() * self.fields.coordinates_from(node, &before);
         let strength2 = |c: usize, under: f64| under * chosen[c].1 * node.scale * told[c].0.powi(2);
         let of = |under: f64| {
             let left = Mat::from_fn(seen, count, |k, c| {
-                let (scatter2, field2, l) = (told[c].0.powi(2), strength2(c, under), node.values[k]);
+                let (scatter2, field2, l) = (told[c].0.powi(2), strength2(c, under), node.eigenvalues[k]);
                 let found = v[(k, 0)] - (0..told[c].1.len()).map(|e| told[c].1[e] * v[(k, 1 + e)]).sum::<f64>();
-                let all = field2 * (l + node.narrow) + scatter2;
+                let all = field2 * (l + node.truncated_variance) + scatter2;
                 // l^(1/2) w: its mean and its spread.
                 let mean = field2 * l / all * found;
-                let spread = (field2 * l * (field2 * node.narrow + scatter2) / all).sqrt();
+                let spread = (field2 * l * (field2 * node.truncated_variance + scatter2) / all).sqrt();
                 (mean + spread * by_points[(k, c)] - field2.sqrt() * of_before[(k, c)]) / l
             });
-            let mut coefficients = self.fields.by_waves(node, &(&node.vectors * left));
+            let mut coefficients = self.fields.coefficients_from(node, &(&node.eigenvectors * left));
             for c in 0..count {
                 let sigma_mm = strength2(c, under).sqrt();
                 let column = coefficients.col_as_slice_mut(c).iter_mut().zip(before.col_as_slice(c));
-                column.zip(&node.strengths).for_each(|((value, z), d)| *value = d * (*value + sigma_mm * z));
+                column.zip(&node.standard_deviations).for_each(|((value, z), d)| *value = d * (*value + sigma_mm * z));
             }
             coefficients
         };
         let narrow_mm = which
             .variances(node.smoothness)
-            .map(|under| (0..count).map(|c| (strength2(c, under) * node.narrow).sqrt()).collect());
-        Draws {
+            .map(|under| (0..count).map(|c| (strength2(c, under) * node.truncated_variance).sqrt()).collect());
+        PosteriorSamples {
             waves: which.variances(node.smoothness).map(of),
-            stated: DMatrix::from_fn(self.observed.stated.ncols(), count, |e, c| told[c].1[e]),
+            stated: DMatrix::from_fn(self.observed.random_effects.ncols(), count, |e, c| told[c].1[e]),
             scatter_mm: told.into_iter().map(|(scatter_mm, _)| scatter_mm).collect(),
             narrow_mm,
         }
@@ -354,24 +381,24 @@ impl<'f> Posterior<'f> {
 
     /// The mean of the field by its most probable node and strength, in coefficients of the waves.
     pub(super) fn mean(&self) -> (Vec<f64>, DVector<f64>) {
-        let none = || (vec![0.0; self.fields.waves.len()], DVector::zeros(self.observed.stated.ncols()));
-        let best = self.probabilities(Which::All).into_iter().max_by(|a, b| a.2.total_cmp(&b.2));
+        let none = || (vec![0.0; self.fields.basis.len()], DVector::zeros(self.observed.random_effects.ncols()));
+        let best = self.probabilities(HypothesisSet::All).into_iter().max_by(|a, b| a.2.total_cmp(&b.2));
         let Some((number, tau, _)) = best else { return none() };
-        let (node, Seen { v, .. }) = (&self.fields.nodes[number], &self.seen[number]);
-        let scale = self.scale(number, tau);
-        let scatter_mm = scale.best_mm();
+        let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.seen[number]);
+        let scale = self.noise_likelihood(number, tau);
+        let scatter_mm = scale.mode_mm();
         let stated = scale.stated_mean(scatter_mm);
         let field2 = tau * node.scale;
-        let left = Mat::from_fn(node.values.len(), 1, |k, _| {
+        let left = Mat::from_fn(node.eigenvalues.len(), 1, |k, _| {
             let found = v[(k, 0)] - (0..stated.len()).map(|e| stated[e] * v[(k, 1 + e)]).sum::<f64>();
-            field2 / (field2 * (node.values[k] + node.narrow) + 1.0) * found
+            field2 / (field2 * (node.eigenvalues[k] + node.truncated_variance) + 1.0) * found
         });
-        let coefficients = self.fields.by_waves(node, &(&node.vectors * left));
+        let coefficients = self.fields.coefficients_from(node, &(&node.eigenvectors * left));
         let mut waves = none().0;
         coefficients
             .col_as_slice(0)
             .iter()
-            .zip(&node.strengths)
+            .zip(&node.standard_deviations)
             .zip(&mut waves)
             .for_each(|((of, d), into)| *into = of * d);
         (waves, stated)
@@ -379,25 +406,25 @@ impl<'f> Posterior<'f> {
 
     /// The mean over all fields of A K A' with K the covariance of the field by its cosines, of what takes the waves to some sums: a row a sum, a column a wave. Fields
     /// beyond what is seen count less. Also that of the square of the scatter, a touch's share of shorter waves in it.
-    pub(super) fn covered(&self, sums: &DMatrix<f64>) -> (DMatrix<f64>, f64) {
+    pub(super) fn mean_covariance(&self, sums: &DMatrix<f64>) -> (DMatrix<f64>, f64) {
         let p = sums.nrows();
         let (mut covered, mut scatter2, mut whole) = (DMatrix::zeros(p, p), 0.0, 0.0);
-        for (number, tau, weight) in self.probabilities(Which::All) {
-            let node = &self.fields.nodes[number];
-            let weight = weight * self.doubt(&self.hyper(number, tau));
+        for (number, tau, weight) in self.probabilities(HypothesisSet::All) {
+            let node = &self.fields.hypotheses[number];
+            let weight = weight * self.doubt(&self.hyperparameters(number, tau));
             if weight < 1e-6 {
                 continue;
             }
-            let own2 = self.scale(number, tau).best_mm().powi(2);
+            let own2 = self.noise_likelihood(number, tau).mode_mm().powi(2);
             let strength2 = own2 * tau * node.scale;
             // Polynomials are let be as large as corners need. As forms of a part they would hide its place more than its forms do.
-            let cosines = self.fields.waves.count_of_polynomials()..node.strengths.len();
+            let cosines = self.fields.basis.count_of_polynomials()..node.standard_deviations.len();
             let strong = DMatrix::from_fn(p, cosines.len(), |r, k| {
                 let wave = cosines.start + k;
-                sums[(r, wave)] * node.strengths[wave]
+                sums[(r, wave)] * node.standard_deviations[wave]
             });
             covered += &strong * strong.transpose() * (weight * strength2);
-            scatter2 += weight * (own2 + strength2 * node.narrow);
+            scatter2 += weight * (own2 + strength2 * node.truncated_variance);
             whole += weight;
         }
         if whole > 0.0 { (covered / whole, scatter2 / whole) } else { (covered, self.rms_mm().powi(2)) }
@@ -406,17 +433,17 @@ impl<'f> Posterior<'f> {
 
 /// What tells the scatter s: -2 ln p(s) = 2 m ln s + logs + sum ln(1 + u / s^2) + (S - sum b^2 / (s^2 + u)) / s^2, with u the eigenvalues of E'K0^-1 E
 /// and b of E'K0^-1 d beside them.
-struct Scale {
+struct NoiseLikelihood {
     free: f64,
     logs: f64,
     squares: f64,
     by_stated: Vec<[f64; 2]>,
     axes: DMatrix<f64>,
-    probe: Probe,
+    probe: NoisePrior,
 }
 
-impl Scale {
-    fn of(products: &DMatrix<f64>, logs: f64, free: f64, probe: Probe) -> Self {
+impl NoiseLikelihood {
+    fn of(products: &DMatrix<f64>, logs: f64, free: f64, probe: NoisePrior) -> Self {
         let stated = products.nrows() - 1;
         let (by_stated, axes) = if stated == 0 {
             (Vec::new(), DMatrix::zeros(0, 0))
@@ -483,7 +510,7 @@ impl Scale {
     }
 
     /// The logarithm of the likelihood with s integrated out, but for what is the same of every field.
-    fn integral(&self) -> f64 {
+    fn log_marginal(&self) -> f64 {
         if self.is_plain() {
             return -0.5 * (self.logs + self.free * self.squares.ln());
         }
@@ -493,7 +520,7 @@ impl Scale {
     }
 
     /// The most probable s.
-    fn best_mm(&self) -> f64 {
+    fn mode_mm(&self) -> f64 {
         if self.is_plain() {
             return (self.squares / self.free).sqrt();
         }
@@ -502,7 +529,7 @@ impl Scale {
         (first + step * best as f64).exp()
     }
 
-    fn drawn_mm(&self, normals: &mut Normals) -> f64 {
+    fn sample_mm(&self, normals: &mut Normals) -> f64 {
         if self.is_plain() {
             // Chi-squared by its degrees of freedom: exact by normal numbers where they are few, else by its cube root (Wilson and Hilferty 1931).
             const MANY: f64 = 60.0;
@@ -550,36 +577,41 @@ mod tests {
     }
 
     /// A field of known parameters, moved and tilted by what nobody knows.
-    fn drawn(hyper: Hyper, places: Vec<[f64; 2]>, path: Vec<f64>, seed: u64) -> Observed {
+    fn drawn(hyperparameters: Hyperparameters, places: Vec<[f64; 2]>, path: Vec<f64>, seed: u64) -> Observed {
         let n = places.len();
         let covariance = DMatrix::from_fn(n, n, |r, c| {
-            hyper.field.covariance_mm2(places[r], places[c]) + if r == c { 1e-14 } else { 0.0 }
+            hyperparameters.field.covariance_mm2(places[r], places[c]) + if r == c { 1e-14 } else { 0.0 }
         });
         let mut normals = Normals::new(seed, 0);
         let field = covariance.cholesky().unwrap().l() * DVector::from_fn(n, |_, _| normals.next());
         let mut last = normals.next();
         let mut of = |k: usize| {
-            last = hyper.drift * last + (1.0 - hyper.drift * hyper.drift).sqrt() * normals.next();
-            field[k] + hyper.scatter_mm * last + 0.3 - 0.01 * places[k][0]
+            last = hyperparameters.noise_autocorrelation * last
+                + (1.0 - hyperparameters.noise_autocorrelation * hyperparameters.noise_autocorrelation).sqrt()
+                    * normals.next();
+            field[k] + hyperparameters.noise_sigma_mm * last + 0.3 - 0.01 * places[k][0]
         };
         let deviations_mm = (0..n).map(&mut of).collect();
         let effects = DMatrix::from_fn(n, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
-        Observed { effects, path, ..Observed::without_effects(places, deviations_mm) }
+        Observed { fixed_effects: effects, path, ..Observed::without_effects(places, deviations_mm) }
     }
 
-    const PLANTED: Hyper = Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift: 0.0 };
+    const PLANTED: Hyperparameters =
+        Hyperparameters { field: Field::new(5e-3, 30.0), noise_sigma_mm: 3e-4, noise_autocorrelation: 0.0 };
 
     #[test]
     fn planted_parameters_are_found_again() {
         let (mut sigma, mut range, mut scatter) = (0.0, 0.0, 0.0);
         const PARTS: u32 = 6;
         for seed in 0..PARTS {
-            let found =
-                Hyper::of(&drawn(PLANTED, places(300), Vec::new(), u64::from(seed)), Some(&Priors::of_size(102.0)))
-                    .unwrap();
+            let found = Hyperparameters::estimate(
+                &drawn(PLANTED, places(300), Vec::new(), u64::from(seed)),
+                Some(&Prior::for_size(102.0)),
+            )
+            .unwrap();
             sigma += (found.field.sigma_mm / PLANTED.field.sigma_mm).ln() / f64::from(PARTS);
             range += (found.field.range_mm / PLANTED.field.range_mm).ln() / f64::from(PARTS);
-            scatter += (found.scatter_mm / PLANTED.scatter_mm).ln() / f64::from(PARTS);
+            scatter += (found.noise_sigma_mm / PLANTED.noise_sigma_mm).ln() / f64::from(PARTS);
         }
         let off = [sigma, range, scatter].map(f64::exp);
         println!("sigma, range, scatter: {off:.3?} of what was planted");
@@ -592,44 +624,55 @@ mod tests {
             [if (k / 30).is_multiple_of(2) { k % 30 } else { 29 - k % 30 }, k / 30].map(|at| 3.5 * at as f64)
         };
         for drift in [0.0, 0.7, 0.9] {
-            let planted = Hyper { drift, ..PLANTED };
+            let planted = Hyperparameters { noise_autocorrelation: drift, ..PLANTED };
             // Of a strong drift few independent touches are left, and how much it is spoken for is chance.
             const PARTS: u64 = 5;
             let path: Vec<f64> = (0..540).map(f64::from).collect();
             let told = |seed| {
-                Hyper::of(
+                Hyperparameters::estimate(
                     &drawn(planted, (0..540).map(at).collect(), path.clone(), seed),
-                    Some(&Priors::of_size(102.0)),
+                    Some(&Prior::for_size(102.0)),
                 )
                 .unwrap()
             };
-            let all: Vec<Hyper> = (1..=PARTS).map(told).collect();
-            let median = |of: &dyn Fn(&Hyper) -> f64| {
+            let all: Vec<Hyperparameters> = (1..=PARTS).map(told).collect();
+            let median = |of: &dyn Fn(&Hyperparameters) -> f64| {
                 let mut values: Vec<f64> = all.iter().map(of).collect();
                 values.sort_unstable_by(f64::total_cmp);
                 values[values.len() / 2]
             };
-            let off = [median(&|h| h.drift) - drift, median(&|h| (h.scatter_mm / planted.scatter_mm).ln())];
-            println!("drift {drift}: off by {off:.3?}, {:.3?}", all.iter().map(|h| h.drift).collect::<Vec<_>>());
+            let off = [
+                median(&|h| h.noise_autocorrelation) - drift,
+                median(&|h| (h.noise_sigma_mm / planted.noise_sigma_mm).ln()),
+            ];
+            println!(
+                "drift {drift}: off by {off:.3?}, {:.3?}",
+                all.iter().map(|h| h.noise_autocorrelation).collect::<Vec<_>>()
+            );
             assert!(off[0].abs() < 0.2 && off[1].abs() < 0.3, "{off:?} {all:?}");
-            assert!(drift > 0.0 || all.iter().all(|h| h.drift == 0.0), "{all:?}");
+            assert!(drift > 0.0 || all.iter().all(|h| h.noise_autocorrelation == 0.0), "{all:?}");
         }
     }
 
     /// Beside a form a strong drift looks like one: where it is not found again it must be form, and never scatter that counts for nothing.
     #[test]
     fn a_strong_drift_is_told_or_is_form() {
-        let planted = Hyper { drift: 0.9, ..PLANTED };
+        let planted = Hyperparameters { noise_autocorrelation: 0.9, ..PLANTED };
         for seed in 1..=5 {
             let path: Vec<f64> = (0..540).map(f64::from).collect();
             let at = |k: usize| {
                 [if (k / 30).is_multiple_of(2) { k % 30 } else { 29 - k % 30 }, k / 30].map(|at| 3.5 * at as f64)
             };
-            let told =
-                Hyper::of(&drawn(planted, (0..540).map(at).collect(), path, seed), Some(&Priors::of_size(102.0)));
+            let told = Hyperparameters::estimate(
+                &drawn(planted, (0..540).map(at).collect(), path, seed),
+                Some(&Prior::for_size(102.0)),
+            );
             let told = told.unwrap();
-            println!("seed {seed}: drift {:.2}, scatter {:.2e} mm", told.drift, told.scatter_mm);
-            assert!((told.drift - 0.9).abs() < 0.2 || told.scatter_mm < 0.7 * planted.scatter_mm, "{seed}: {told:?}");
+            println!("seed {seed}: drift {:.2}, scatter {:.2e} mm", told.noise_autocorrelation, told.noise_sigma_mm);
+            assert!(
+                (told.noise_autocorrelation - 0.9).abs() < 0.2 || told.noise_sigma_mm < 0.7 * planted.noise_sigma_mm,
+                "{seed}: {told:?}"
+            );
         }
     }
 
@@ -638,7 +681,7 @@ mod tests {
         let observed = drawn(PLANTED, places(120), Vec::new(), 1);
         let tenfold =
             Observed { deviations_mm: observed.deviations_mm.iter().map(|d| 10.0 * d).collect(), ..observed.clone() };
-        let [a, b] = [observed, tenfold].map(|observed| Hyper::of(&observed, None).unwrap());
+        let [a, b] = [observed, tenfold].map(|observed| Hyperparameters::estimate(&observed, None).unwrap());
         assert!((b.field.sigma_mm / a.field.sigma_mm - 10.0).abs() < 1e-6);
         assert!((b.field.range_mm / a.field.range_mm - 1.0).abs() < 1e-9);
     }
@@ -649,13 +692,14 @@ mod tests {
         for (count, near) in [(60, 1e-6), (500, 0.2)] {
             let observed = drawn(PLANTED, places(count), Vec::new(), 3);
             let n = observed.places.len();
-            let fields = Fields::of_nodes(&observed, Kind::PLAIN, &[(Smoothness::Once, 30.0)]).unwrap();
+            let fields = FieldHypotheses::of_nodes(&observed, NoiseKind::PLAIN, &[(Smoothness::Once, 30.0)]).unwrap();
             let posterior = Posterior::of(&fields, &observed, None, None);
-            let node = &fields.nodes[0];
-            let waves = fields.waves.at(&observed.places);
-            let rows = DMatrix::from_fn(n, node.strengths.len(), |r, c| waves[(r, c)] * node.strengths[c]);
-            let field = &rows * rows.transpose() + DMatrix::identity(n, n) * node.narrow;
-            let (h, d) = (&observed.effects, DVector::from_column_slice(&observed.deviations_mm));
+            let node = &fields.hypotheses[0];
+            let waves = fields.basis.at(&observed.places);
+            let rows =
+                DMatrix::from_fn(n, node.standard_deviations.len(), |r, c| waves[(r, c)] * node.standard_deviations[c]);
+            let field = &rows * rows.transpose() + DMatrix::identity(n, n) * node.truncated_variance;
+            let (h, d) = (&observed.fixed_effects, DVector::from_column_slice(&observed.deviations_mm));
             let by_hand = |tau: f64| {
                 let k = (&field * (tau * node.scale) + DMatrix::identity(n, n)).cholesky().unwrap();
                 let log_det = |of: nalgebra::Cholesky<f64, nalgebra::Dyn>| 2.0 * of.l().diagonal().map(f64::ln).sum();
@@ -663,10 +707,10 @@ mod tests {
                 let b = gram.clone().cholesky().unwrap().solve(&h.tr_mul(&k.solve(&d)));
                 let squares = d.dot(&k.solve(&(&d - h * b)));
                 let logs = log_det(k) + log_det(gram.cholesky().unwrap()) - log_det(h.tr_mul(h).cholesky().unwrap());
-                -0.5 * (logs + fields.free * squares.ln())
+                -0.5 * (logs + fields.degrees_of_freedom * squares.ln())
             };
             for tau in [0.0, 0.3, 30.0, 1000.0] {
-                let [told, exact] = [posterior.scale(0, tau).integral(), by_hand(tau)];
+                let [told, exact] = [posterior.noise_likelihood(0, tau).log_marginal(), by_hand(tau)];
                 assert!((told - exact).abs() < near, "{count} {tau}: {told} {exact}");
             }
         }

@@ -5,26 +5,26 @@ use super::ModelError;
 /// What is known of a field before anything is measured: the median of each, and by what factor it may be off (one standard deviation of
 /// its logarithm).
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Priors {
+pub struct Prior {
     /// Of the range.
     pub range_mm: [f64; 2],
     /// Of the ratio of the scatter to the field.
-    pub scatter_ratio: [f64; 2],
+    pub noise_ratio: [f64; 2],
 }
 
 /// By what factors the range and the ratio of a part are off of which nothing is known, and how many parts are like none before.
 const EVERY: [f64; 2] = [6.0, 20.0];
 const LIKE_NONE: f64 = 0.2;
 
-impl Priors {
+impl Prior {
     /// What every part is like: the range some third of its size, the scatter a twentieth of the field, each by a factor of its own.
-    pub fn of_size(size_mm: f64) -> Self {
-        Self { range_mm: [size_mm / 3.0, EVERY[0]], scatter_ratio: [0.05, EVERY[1]] }
+    pub fn for_size(size_mm: f64) -> Self {
+        Self { range_mm: [size_mm / 3.0, EVERY[0]], noise_ratio: [0.05, EVERY[1]] }
     }
 
     /// Says what makes these no expectations.
     pub(super) fn check(&self) -> Result<(), ModelError> {
-        for (what, [median, factor]) in [("range", self.range_mm), ("ratio of scatter to field", self.scatter_ratio)] {
+        for (what, [median, factor]) in [("range", self.range_mm), ("ratio of scatter to field", self.noise_ratio)] {
             if !(median.is_finite() && median > 0.0 && factor.is_finite() && factor > 1.0) {
                 return Err(ModelError::Expected { what, median, factor });
             }
@@ -40,9 +40,9 @@ impl Priors {
             (if off <= 1.0 { -0.5 * off * off } else { 0.5 - off }) - factor.ln().ln()
         };
         let by = |[of_range, of_ratio]: [f64; 2]| {
-            of(range_mm, self.range_mm[0], of_range) + of(ratio, self.scatter_ratio[0], of_ratio)
+            of(range_mm, self.range_mm[0], of_range) + of(ratio, self.noise_ratio[0], of_ratio)
         };
-        let factors = [self.range_mm[1], self.scatter_ratio[1]];
+        let factors = [self.range_mm[1], self.noise_ratio[1]];
         let like = by(factors) + (1.0 - LIKE_NONE).ln();
         let unlike = by([factors[0].max(EVERY[0]), factors[1].max(EVERY[1])]) + LIKE_NONE.ln();
         let higher = like.max(unlike);
@@ -56,7 +56,7 @@ mod tests {
 
     #[test]
     fn what_was_taught_counts_for_no_more_than_that_one_part_of_five_is_like_none_before() {
-        let taught = Priors { range_mm: [8.0, 2.0], scatter_ratio: [0.1, 2.0] };
+        let taught = Prior { range_mm: [8.0, 2.0], noise_ratio: [0.1, 2.0] };
         let [at, off] = [8.0, 8.0 * 25.0].map(|range_mm| taught.log_density(range_mm, 0.1));
         // By hand: ln(0.8 / ln^2 2 + 0.2 / (ln 6 ln 20)), and of what is 25 times as wide all but nothing but the second, (0.5 - ln 25 / ln 6) lower.
         let (like, unlike) = (0.8 / 2f64.ln().powi(2), 0.2 / (6f64.ln() * 20f64.ln()));
@@ -67,12 +67,12 @@ mod tests {
 
     #[test]
     fn what_cannot_be_expected_is_refused_in_words() {
-        let good = Priors::of_size(102.0);
+        let good = Prior::for_size(102.0);
         for (bad, words) in [
-            (Priors { range_mm: [8.0, 1.0], ..good }, "the range is expected to be 8 by a factor of 1;"),
-            (Priors { range_mm: [0.0, 2.0], ..good }, "the range is expected to be 0 by a factor of 2;"),
-            (Priors { scatter_ratio: [f64::NAN, 2.0], ..good }, "the ratio of scatter to field is expected to be NaN"),
-            (Priors { scatter_ratio: [0.1, f64::INFINITY], ..good }, "by a factor of inf;"),
+            (Prior { range_mm: [8.0, 1.0], ..good }, "the range is expected to be 8 by a factor of 1;"),
+            (Prior { range_mm: [0.0, 2.0], ..good }, "the range is expected to be 0 by a factor of 2;"),
+            (Prior { noise_ratio: [f64::NAN, 2.0], ..good }, "the ratio of scatter to field is expected to be NaN"),
+            (Prior { noise_ratio: [0.1, f64::INFINITY], ..good }, "by a factor of inf;"),
         ] {
             let error = bad.check().unwrap_err().to_string();
             assert!(error.contains(words), "{error}");

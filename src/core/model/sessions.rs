@@ -16,8 +16,8 @@ use faer::Mat;
 use nalgebra::DMatrix;
 
 use super::form::Motions;
-use super::hill::climb;
-use super::{Dense, Field, Hyper, ModelError, Observed, Priors};
+use super::nelder_mead::maximize;
+use super::{DensePosterior, Field, Hyperparameters, ModelError, Observed, Prior};
 use crate::registration::{Deviation, PointStatus, Registration};
 
 /// Points, and the session of each.
@@ -29,26 +29,26 @@ pub struct Sessions {
 
 /// What comes back in every session, and what is of each alone.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Between {
+pub struct BetweenSessionVariance {
     /// The field that comes back, and the scatter of a point.
-    pub hyper: Hyper,
+    pub hyperparameters: Hyperparameters,
     /// The field of a session.
-    pub own: Field,
+    pub session_field: Field,
     /// Standard uncertainty of the logarithm of its strength.
-    pub own_u: f64,
+    pub session_log_sigma_u: f64,
     /// In how many sessions it was seen.
     pub sessions: usize,
 }
 
 /// What a session that was not seen will find at a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Foretold {
+pub struct PredictionInterval {
     /// The most probable deviation, after the best fit of that session.
     pub mean_mm: f64,
     /// Standard uncertainty of the deviation that will be found, its field and its scatter in it.
     pub sigma_mm: f64,
     /// How many degrees of freedom that uncertainty is known by.
-    pub degrees: f64,
+    pub degrees_of_freedom: f64,
 }
 
 /// Of so many points every pair is looked at while parameters are searched, and at the end.
@@ -88,7 +88,7 @@ impl Sessions {
     ///
     /// # Errors
     /// Those of [`Sessions::new`].
-    pub fn of(registrations: &[(&Registration, &[u32])]) -> Result<Self, ModelError> {
+    pub fn from_registrations(registrations: &[(&Registration, &[u32])]) -> Result<Self, ModelError> {
         let (mut parts, mut of) = (Vec::new(), Vec::new());
         for (registration, sessions) in registrations {
             let deviations = &registration.deviations;
@@ -115,7 +115,7 @@ impl Sessions {
     ///
     /// # Errors
     /// Fewer than two sessions, and those of [`Dense::fit`].
-    pub fn between(&self, priors: &Priors) -> Result<Between, ModelError> {
+    pub fn between_session_variance(&self, priors: &Prior) -> Result<BetweenSessionVariance, ModelError> {
         priors.check()?;
         let mut numbers = self.of.clone();
         numbers.sort_unstable();
@@ -125,7 +125,7 @@ impl Sessions {
         }
         let few = self.thinned(MOST_SEARCHED);
         let (found, top) = few.searched(priors);
-        let (hyper, own, _) = few.scaled(found, priors)?;
+        let (hyperparameters, own, _) = few.scaled(found, priors)?;
         // By the curvature of the hill along the strength, whose scale moves with it.
         let beside = |step: f64| {
             let [common, [share, range]] = found;
@@ -134,11 +134,16 @@ impl Sessions {
         let (below, above) = (beside(-STEP)?, beside(STEP)?);
         let falls = (2.0 * top - below.1 - above.1).max(f64::MIN_POSITIVE);
         let own_u = (0.5 * (above.0 - below.0) / falls.sqrt()).abs().min(1.0);
-        Ok(Between { hyper, own, own_u, sessions: numbers.len() })
+        Ok(BetweenSessionVariance {
+            hyperparameters,
+            session_field: own,
+            session_log_sigma_u: own_u,
+            sessions: numbers.len(),
+        })
     }
 
     /// Climbs from the best of some beginnings: the common field, then that of the session, and again.
-    fn searched(&self, priors: &Priors) -> ([[f64; 2]; 2], f64) {
+    fn searched(&self, priors: &Prior) -> ([[f64; 2]; 2], f64) {
         let height = |at| self.scaled(at, priors).map_or(f64::NEG_INFINITY, |(_, _, value)| value);
         let [median_mm, _] = priors.range_mm;
         let mut best = ([[median_mm.ln(), 0.5_f64.ln()]; 2], f64::NEG_INFINITY);
@@ -156,8 +161,8 @@ impl Sessions {
         }
         for _ in 0..ROUNDS {
             let own = best.0[1];
-            let (common, _) = climb(best.0[0], [0.4, 0.4], 0.02, |common| height([common, own]));
-            let (own, value) = climb(own, [0.4, 0.4], 0.02, |own| height([common, own]));
+            let (common, _) = maximize(best.0[0], [0.4, 0.4], 0.02, |common| height([common, own]));
+            let (own, value) = maximize(own, [0.4, 0.4], 0.02, |own| height([common, own]));
             best = ([common, own], value);
         }
         best
@@ -168,14 +173,15 @@ impl Sessions {
     fn scaled(
         &self,
         [[range, ratio], [share, own_range]]: [[f64; 2]; 2],
-        priors: &Priors,
-    ) -> Result<(Hyper, Field, f64), ModelError> {
+        priors: &Prior,
+    ) -> Result<(Hyperparameters, Field, f64), ModelError> {
         let [range_mm, ratio, share, own_mm] = [range, ratio, share, own_range].map(f64::exp);
-        let unit = Hyper { field: Field::new(1.0, range_mm), scatter_mm: ratio, drift: 0.0 };
+        let unit =
+            Hyperparameters { field: Field::new(1.0, range_mm), noise_sigma_mm: ratio, noise_autocorrelation: 0.0 };
         let own = Field::new(share, own_mm);
         let model = self.fit(unit, own)?;
         let squares = model.whitened_squares(&self.observed);
-        let free = (self.of.len() - self.observed.effects.ncols()) as f64;
+        let free = (self.of.len() - self.observed.fixed_effects.ncols()) as f64;
         // No deviation at all is a field of no strength.
         let scale = (squares / free).sqrt().max(f64::MIN_POSITIVE.sqrt());
         let log_of = |value: f64, [median, factor]: [f64; 2]| -0.5 * ((value / median).ln() / factor.ln()).powi(2);
@@ -184,13 +190,17 @@ impl Sessions {
             + log_of(share, OWN_SHARE)
             + log_of(own_mm / priors.range_mm[0], OWN_RANGE);
         let scaled = |field: Field| Field { sigma_mm: field.sigma_mm * scale, ..field };
-        Ok((Hyper { field: scaled(unit.field), scatter_mm: ratio * scale, drift: 0.0 }, scaled(own), value))
+        Ok((
+            Hyperparameters { field: scaled(unit.field), noise_sigma_mm: ratio * scale, noise_autocorrelation: 0.0 },
+            scaled(own),
+            value,
+        ))
     }
 
-    fn fit(&self, hyper: Hyper, own: Field) -> Result<Dense, ModelError> {
+    fn fit(&self, hyperparameters: Hyperparameters, own: Field) -> Result<DensePosterior, ModelError> {
         let places = &self.observed.places;
         let own = own.pairs();
-        Dense::with(&self.observed, hyper, |a, b| match self.of[a] == self.of[b] {
+        DensePosterior::with(&self.observed, hyperparameters, |a, b| match self.of[a] == self.of[b] {
             true => own.covariance_mm2(places[a], places[b]),
             false => 0.0,
         })
@@ -200,25 +210,25 @@ impl Sessions {
     fn thinned(&self, most: usize) -> Self {
         let n = self.of.len();
         let chosen: Vec<usize> = (0..n.min(most)).map(|k| k * n / n.min(most)).collect();
-        Self { observed: self.observed.only(&chosen), of: chosen.iter().map(|&k| self.of[k]).collect() }
+        Self { observed: self.observed.subset(&chosen), of: chosen.iter().map(|&k| self.of[k]).collect() }
     }
 }
 
 /// Points one after another, each part with effects of its own.
 fn joined(parts: &[Observed]) -> Observed {
     let rows = parts.iter().map(|part| part.places.len()).sum();
-    let mut effects = DMatrix::zeros(rows, parts.iter().map(|part| part.effects.ncols()).sum());
+    let mut effects = DMatrix::zeros(rows, parts.iter().map(|part| part.fixed_effects.ncols()).sum());
     let (mut places, mut deviations_mm, mut column) = (Vec::new(), Vec::new(), 0);
     for part in parts {
-        effects.view_mut((places.len(), column), part.effects.shape()).copy_from(&part.effects);
-        column += part.effects.ncols();
+        effects.view_mut((places.len(), column), part.fixed_effects.shape()).copy_from(&part.fixed_effects);
+        column += part.fixed_effects.ncols();
         places.extend(&part.places);
         deviations_mm.extend(&part.deviations_mm);
     }
-    Observed { effects, ..Observed::without_effects(places, deviations_mm) }
+    Observed { fixed_effects: effects, ..Observed::without_effects(places, deviations_mm) }
 }
 
-impl Between {
+impl BetweenSessionVariance {
     /// Tells what sessions that were not seen will find: at the places of `unseen`, in its sessions, after its own best fit. What was found there, and
     /// whether its numbers are those of known sessions, does not matter.
     ///
@@ -226,36 +236,36 @@ impl Between {
     ///
     /// # Errors
     /// Those of [`Dense::fit`].
-    pub fn foretell(&self, known: &Sessions, unseen: &Sessions) -> Result<Vec<Foretold>, ModelError> {
-        let model = known.thinned(MOST_KNOWN).fit(self.hyper, self.own)?;
-        let Observed { places, effects, .. } = &unseen.observed;
+    pub fn predict(&self, known: &Sessions, unseen: &Sessions) -> Result<Vec<PredictionInterval>, ModelError> {
+        let model = known.thinned(MOST_KNOWN).fit(self.hyperparameters, self.session_field)?;
+        let Observed { places, fixed_effects: effects, .. } = &unseen.observed;
         let (means_mm, common) = model.predict_together(places);
-        let pairs = self.own.pairs();
+        let pairs = self.session_field.pairs();
         let own = Mat::from_fn(places.len(), places.len(), |r, c| match unseen.of[r] == unseen.of[c] {
             true => pairs.covariance_mm2(places[r], places[c]),
             false => 0.0,
         });
-        let base = Base::of(effects);
+        let base = BestFitBasis::of(effects);
         let fitted_mm = base.after_best_fit(&means_mm);
         let [common, own] = [common, own].map(|covariance| base.variances_after(&covariance));
-        let scatter_mm2 = self.hyper.scatter_mm.powi(2);
+        let scatter_mm2 = self.hyperparameters.noise_sigma_mm.powi(2);
         let of = |k: usize| {
             let steady_mm2 = common[k] + scatter_mm2 * base.free(k);
             let variance_mm2 = (steady_mm2 + own[k]).max(f64::MIN_POSITIVE);
             // Of a variance whose logarithm is uncertain by 2 u, and a part of the whole (Satterthwaite 1946).
-            let relative = 2.0 * self.own_u * own[k] / variance_mm2;
+            let relative = 2.0 * self.session_log_sigma_u * own[k] / variance_mm2;
             let degrees = (2.0 / relative.powi(2).max(f64::MIN_POSITIVE)).max(LEAST_DEGREES);
-            Foretold { mean_mm: fitted_mm[k], sigma_mm: variance_mm2.sqrt(), degrees }
+            PredictionInterval { mean_mm: fitted_mm[k], sigma_mm: variance_mm2.sqrt(), degrees_of_freedom: degrees }
         };
         Ok((0..places.len()).map(of).collect())
     }
 }
 
-impl Foretold {
+impl PredictionInterval {
     /// Returns by how much what will be found lies off the mean at most, with a probability of 95 %: Student's t, for an uncertainty that few
     /// sessions tell is uncertain itself.
     pub fn half_width_mm(&self) -> f64 {
-        self.sigma_mm * student(self.degrees)
+        self.sigma_mm * student(self.degrees_of_freedom)
     }
 }
 
@@ -277,11 +287,11 @@ fn student(degrees: f64) -> f64 {
 }
 
 /// An orthonormal base Q of what a best fit takes off.
-struct Base {
+struct BestFitBasis {
     q: DMatrix<f64>,
 }
 
-impl Base {
+impl BestFitBasis {
     fn of(effects: &DMatrix<f64>) -> Self {
         let q = if effects.ncols() > 0 { effects.clone().qr().q() } else { effects.clone() };
         Self { q }

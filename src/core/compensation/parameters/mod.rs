@@ -37,7 +37,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::geometry::{Point, Vector};
-use crate::model::{Effects, ModelError, Observed, Priors};
+use crate::model::{EffectEstimates, ModelError, Observed, Prior};
 pub use columns::Extent;
 use columns::{Basis, Column, candidates, dot, motions, rms, slides};
 pub use set::{Set, Smooth, smooth_of};
@@ -383,7 +383,12 @@ impl Columns {
     }
 
     /// The effects of motions and of chosen columns, in units of these.
-    fn effects(&self, contacts: &[Contact], unseen: &Basis, chosen: &[&Vec<f64>]) -> Result<Effects, ModelError> {
+    fn effects(
+        &self,
+        contacts: &[Contact],
+        unseen: &Basis,
+        chosen: &[&Vec<f64>],
+    ) -> Result<EffectEstimates, ModelError> {
         let n = contacts.len();
         // Columns of one size: they have units of their own. What motions make of them changes no value.
         let sizes: Vec<f64> = chosen.iter().map(|column| rms(column)).collect();
@@ -396,8 +401,8 @@ impl Columns {
         let places: Vec<[f64; 2]> = contacts.iter().map(|c| [c.point.x, c.point.y]).collect();
         let size_mm = Extent::of(places.iter().copied()).size_mm();
         let deviations_mm = contacts.iter().map(|c| c.deviation_mm).collect();
-        let observed = Observed { effects, ..Observed::without_effects(places, deviations_mm) };
-        let mut found = Effects::of(&observed, &Priors::of_size(size_mm))?;
+        let observed = Observed { fixed_effects: effects, ..Observed::without_effects(places, deviations_mm) };
+        let mut found = EffectEstimates::estimate(&observed, &Prior::for_size(size_mm))?;
         for (c, size) in (of..).zip(&sizes) {
             found.values[c] /= size;
             found.covariance.row_mut(c).scale_mut(size.recip());

@@ -3,7 +3,8 @@ use nalgebra::{DMatrix, DVector};
 use super::super::normals::Normals;
 use super::*;
 
-const COMMON: Hyper = Hyper { field: Field::new(5e-3, 40.0), scatter_mm: 1e-3, drift: 0.0 };
+const COMMON: Hyperparameters =
+    Hyperparameters { field: Field::new(5e-3, 40.0), noise_sigma_mm: 1e-3, noise_autocorrelation: 0.0 };
 const OWN: Field = Field::new(4e-3, 150.0);
 const A_SESSION: usize = 40;
 
@@ -22,7 +23,7 @@ fn planted(own_mm: f64, known: u32, unseen: u32, seed: u64) -> [Sessions; 2] {
     });
     let mut normals = Normals::new(seed, 0);
     let field = covariance.cholesky().unwrap().l() * DVector::from_fn(n, |_, _| normals.next());
-    let found: Vec<f64> = field.iter().map(|f| f + COMMON.scatter_mm * normals.next()).collect();
+    let found: Vec<f64> = field.iter().map(|f| f + COMMON.noise_sigma_mm * normals.next()).collect();
     let of = |sessions: std::ops::Range<u32>| {
         let parts: Vec<Observed> = sessions.clone().map(|s| fitted(&places, &found, s as usize)).collect();
         let numbers = sessions.flat_map(|s| [s; A_SESSION]).collect();
@@ -36,13 +37,13 @@ fn fitted(places: &[[f64; 2]], found: &[f64], session: usize) -> Observed {
     let rows = session * A_SESSION..(session + 1) * A_SESSION;
     let (places, found) = (&places[rows.clone()], &found[rows]);
     let effects = DMatrix::from_fn(A_SESSION, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
-    let left = Base::of(&effects).after_best_fit(found);
-    Observed { effects, ..Observed::without_effects(places.to_vec(), left) }
+    let left = BestFitBasis::of(&effects).after_best_fit(found);
+    Observed { fixed_effects: effects, ..Observed::without_effects(places.to_vec(), left) }
 }
 
 /// The share of what the unseen sessions found that lies within 95 %.
-fn within(between: &Between, [known, unseen]: &[Sessions; 2]) -> f64 {
-    let told = between.foretell(known, unseen).unwrap();
+fn within(between: &BetweenSessionVariance, [known, unseen]: &[Sessions; 2]) -> f64 {
+    let told = between.predict(known, unseen).unwrap();
     let hit = told.iter().zip(unseen.deviations_mm());
     hit.filter(|(told, found)| (*found - told.mean_mm).abs() <= told.half_width_mm()).count() as f64 / told.len() as f64
 }
@@ -53,11 +54,11 @@ fn what_differs_between_sessions_is_found_again_and_an_unseen_one_is_covered() {
     let (mut strength, mut scatter, mut covered) = (0.0, 0.0, 0.0);
     for seed in 0..PARTS {
         let sessions = planted(OWN.sigma_mm, 6, 2, u64::from(seed));
-        let between = sessions[0].between(&Priors::of_size(102.0)).unwrap();
+        let between = sessions[0].between_session_variance(&Prior::for_size(102.0)).unwrap();
         // A session is fitted: what is left of its field is told by strength and range together.
         let bent = |field: Field| field.sigma_mm / field.range_mm.powi(2);
-        strength += (bent(between.own) / bent(OWN)).ln() / f64::from(PARTS);
-        scatter += (between.hyper.scatter_mm / COMMON.scatter_mm).ln() / f64::from(PARTS);
+        strength += (bent(between.session_field) / bent(OWN)).ln() / f64::from(PARTS);
+        scatter += (between.hyperparameters.noise_sigma_mm / COMMON.noise_sigma_mm).ln() / f64::from(PARTS);
         covered += within(&between, &sessions) / f64::from(PARTS);
     }
     assert!(strength.abs() < 0.4 && scatter.abs() < 0.2, "{strength} {scatter}");
@@ -67,11 +68,11 @@ fn what_differs_between_sessions_is_found_again_and_an_unseen_one_is_covered() {
 #[test]
 fn sessions_that_differ_by_nothing_are_told_so() {
     let sessions = planted(1e-12, 5, 1, 3);
-    let between = sessions[0].between(&Priors::of_size(102.0)).unwrap();
-    let own = between.foretell(&sessions[0], &sessions[1]).unwrap();
-    let sure = Between { own: Field { sigma_mm: 1e-12, ..between.own }, ..between };
-    let none = sure.foretell(&sessions[0], &sessions[1]).unwrap();
-    let mean = |of: &[Foretold]| of.iter().map(|f| f.sigma_mm).sum::<f64>() / of.len() as f64;
+    let between = sessions[0].between_session_variance(&Prior::for_size(102.0)).unwrap();
+    let own = between.predict(&sessions[0], &sessions[1]).unwrap();
+    let sure = BetweenSessionVariance { session_field: Field { sigma_mm: 1e-12, ..between.session_field }, ..between };
+    let none = sure.predict(&sessions[0], &sessions[1]).unwrap();
+    let mean = |of: &[PredictionInterval]| of.iter().map(|f| f.sigma_mm).sum::<f64>() / of.len() as f64;
     assert!(mean(&own) < 1.2 * mean(&none), "{} {}", mean(&own), mean(&none));
 }
 
@@ -82,19 +83,23 @@ fn of_one_point_each_it_is_what_is_worked_out_by_hand() {
         Sessions::new(Observed::without_effects(vec![[1.0, 2.0]; deviations.len()], deviations), of).unwrap()
     };
     let own_u = 0.25;
-    let between = Between {
-        hyper: Hyper { field: Field::new(2.0, 20.0), scatter_mm: 0.5, drift: 0.0 },
-        own: Field::new(1.0, 20.0),
-        own_u,
+    let between = BetweenSessionVariance {
+        hyperparameters: Hyperparameters {
+            field: Field::new(2.0, 20.0),
+            noise_sigma_mm: 0.5,
+            noise_autocorrelation: 0.0,
+        },
+        session_field: Field::new(1.0, 20.0),
+        session_log_sigma_u: own_u,
         sessions: 2,
     };
     let known = one(vec![3.0, 1.0], vec![0, 1]);
-    let told = between.foretell(&known, &one(vec![0.0], vec![0])).unwrap()[0];
+    let told = between.predict(&known, &one(vec![0.0], vec![0])).unwrap()[0];
     let variance = 4.0 - 2.0 * 16.0 / 9.25 + 1.0 + 0.25;
     assert!((told.mean_mm - 16.0 / 9.25).abs() < 1e-13 && (told.sigma_mm.powi(2) - variance).abs() < 1e-13, "{told:?}");
-    assert!((told.degrees - 2.0 * (variance / (2.0 * own_u)).powi(2)).abs() < 1e-9, "{told:?}");
+    assert!((told.degrees_of_freedom - 2.0 * (variance / (2.0 * own_u)).powi(2)).abs() < 1e-9, "{told:?}");
     // In one session the same two say less: K = 5 + 0.25 I.
-    let together = between.foretell(&one(vec![3.0, 1.0], vec![0, 0]), &one(vec![0.0], vec![0])).unwrap()[0];
+    let together = between.predict(&one(vec![3.0, 1.0], vec![0, 0]), &one(vec![0.0], vec![0])).unwrap()[0];
     assert!((together.mean_mm - 16.0 / 10.25).abs() < 1e-13, "{together:?}");
 }
 
@@ -111,6 +116,7 @@ fn what_are_no_sessions_is_refused_in_words() {
     let points = || Observed::without_effects(vec![[0.0; 2], [9.0, 1.0]], vec![1.0, 2.0]);
     let odd = Sessions::new(points(), vec![1]).err().unwrap().to_string();
     assert_eq!(odd, "2 points and 1 numbers of their sessions do not belong together");
-    let one = Sessions::new(points(), vec![4, 4]).unwrap().between(&Priors::of_size(10.0)).err().unwrap();
+    let one =
+        Sessions::new(points(), vec![4, 4]).unwrap().between_session_variance(&Prior::for_size(10.0)).err().unwrap();
     assert!(one.to_string().contains("1 session; what differs between sessions is told by 2 at least"), "{one}");
 }

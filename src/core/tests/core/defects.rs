@@ -7,7 +7,7 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::common::{RADIUS_MM, centres, placed, points};
 use regrind_core::geometry::Point;
-use regrind_core::model::{Form, Given};
+use regrind_core::model::{Form, ModelInputs};
 use regrind_core::registration::{Options, PointStatus, Registration, register};
 use regrind_core::surface::{Nominal, Projection};
 use regrind_sim::form::FormError;
@@ -135,7 +135,7 @@ fn the_form_is_as_high_as_what_was_touched() {
         ("bump", Box::new(bump([10.0, -5.3], 12.0, 0.02))),
     ] {
         let found = found(&touched([36, 18], NOISE_MM, planted));
-        let form = Form::of(&found, &Given::default()).unwrap();
+        let form = Form::estimate(&found, &ModelInputs::default()).unwrap();
         let (pv, rms) = (form.figures.pv, form.figures.rms);
         println!("{name}: PV {pv:.4?} of {:.4}, rms {rms:.4?} of {:.4}", found.verdict.pv_mm, found.verdict.rms_mm);
         assert_eq!(form.points.len(), found.verdict.used, "{name}");
@@ -175,7 +175,7 @@ fn of_a_strong_form_that_the_pose_is_not_fitted_to_everywhere_the_figures_are_tr
     let planted = |x: f64, y: f64| 0.03 * ((x.powi(4) + y.powi(4) - 6.0 * x * x * y * y) / 3400f64.powi(2));
     let found = found(&touched(FEW, NOISE_MM, planted));
     let beside = found.deviations.iter().filter(|d| d.status == PointStatus::Used && !d.in_fit).count();
-    let told = Form::of(&found, &Given::default()).unwrap().figures;
+    let told = Form::estimate(&found, &ModelInputs::default()).unwrap().figures;
     let [rms_mm, pv_mm] = true_figures_mm(FEW, planted);
     println!(
         "{beside} beside the fit; true RMS {rms_mm:.5} PV {pv_mm:.5}, told {:?}",
@@ -194,13 +194,13 @@ fn waves_across_the_path_are_form_and_no_drift() {
         // Five touches a wave, and so nearly the same height from one touch of a row to the next.
         let (c, s) = (degrees.to_radians().cos() * TAU / 20.0, degrees.to_radians().sin() * TAU / 20.0);
         let planted = move |x: f64, y: f64| 6e-4 * (c * x + s * y + 0.4).cos();
-        let told = Form::of(&found(&touched(FEW, NOISE_MM, planted)), &Given::default()).unwrap();
+        let told = Form::estimate(&found(&touched(FEW, NOISE_MM, planted)), &ModelInputs::default()).unwrap();
         let [rms_mm, _] = true_figures_mm(FEW, planted);
         println!(
             "{degrees}: true RMS {rms_mm:.6}, told {:.6} to {:.6}, {:?}",
-            told.figures.rms.low_mm, told.figures.rms.high_mm, told.hyper
+            told.figures.rms.low_mm, told.figures.rms.high_mm, told.hyperparameters
         );
-        assert_eq!(told.hyper.drift, 0.0, "{degrees}");
+        assert_eq!(told.hyperparameters.noise_autocorrelation, 0.0, "{degrees}");
         assert!(told.figures.rms.high_mm > rms_mm, "{degrees}: {rms_mm} {:?}", told.figures.rms);
     }
 }

@@ -8,7 +8,9 @@ use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose}
 use crate::sample::seeds;
 use regrind_core::form::{IsoFits, IsoOfForm, SlopesAt};
 use regrind_core::geometry::Pose;
-use regrind_core::model::{AngleInterval, Form, FormFigures, Given, Interval, Machine, Share, Source};
+use regrind_core::model::{
+    AngleInterval, BudgetEntry, Form, FormFigures, Interval, MachineUncertainty, ModelInputs, UncertaintySource,
+};
 use regrind_core::registration::{Coordinate, Deviation, Options, PointStatus, Registration, Start, register};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
@@ -52,7 +54,7 @@ fn drifting(seed: u64, rms_mm: f64, drift: f64) -> Part {
     let truth = pose(&placement);
     let options = Options { start: Start::Pose(truth), ..Options::new(RADIUS_MM) };
     let found = register(&free_form(409, 249), &points(&all), &options).unwrap();
-    let model = Form::of(&found, &Given::default()).unwrap();
+    let model = Form::estimate(&found, &ModelInputs::default()).unwrap();
     Part { form, truth, found, model }
 }
 
@@ -106,7 +108,11 @@ fn form_and_frame_are_said_with_intervals_that_hold_the_truth() {
         frame += part.pose_error(&part.model.frame_covariance) / parts() as f64;
         repeated += part.pose_error(&part.found.verdict.covariance) / parts() as f64;
         assert_eq!(part.model.points.len(), truth.len());
-        assert!((part.model.hyper.scatter_mm / SCATTER_MM - 1.0).abs() < 0.25, "seed {seed}: {:?}", part.model.hyper);
+        assert!(
+            (part.model.hyperparameters.noise_sigma_mm / SCATTER_MM - 1.0).abs() < 0.25,
+            "seed {seed}: {:?}",
+            part.model.hyperparameters
+        );
     }
     println!(
         "of {} parts RMS held in {rms}, PV in {pv}; pose: chi2/6 {frame:.2} by the model, {repeated:.0} by white residuals",
@@ -146,7 +152,7 @@ fn many_points_tell_the_corners_of_a_form_of_low_polynomials() {
         let options = Options { start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) };
         let found = register(&free_form(409, 249), &points(&touched), &options).unwrap();
         let [_, pv_mm] = figures(&after_best_fit(&found, |d| form(d.point.x, d.point.y)));
-        let pv = Form::of(&found, &Given::default()).unwrap().figures.pv;
+        let pv = Form::estimate(&found, &ModelInputs::default()).unwrap().figures.pv;
         width_mm += pv.high_mm - pv.low_mm;
         all_mm += pv_mm;
         held += u64::from(holds(pv, pv_mm));
@@ -165,13 +171,16 @@ fn a_probe_that_drifts_along_its_path_is_not_taken_for_form() {
         let [true_rms, true_pv] = figures(&part.form());
         rms += u64::from(holds(part.model.figures.rms, true_rms));
         pv += u64::from(holds(part.model.figures.pv, true_pv));
-        seen += u64::from(part.model.hyper.drift > 0.4);
+        seen += u64::from(part.model.hyperparameters.noise_autocorrelation > 0.4);
         // Points that come in no order tell nothing of a path.
         if seed == 100 {
             let mut shuffled = part.found.clone();
             let n = shuffled.deviations.len();
             shuffled.deviations = (0..n).map(|k| part.found.deviations[(k * 271) % n]).collect();
-            assert_eq!(Form::of(&shuffled, &Given::default()).unwrap().hyper.drift, 0.0);
+            assert_eq!(
+                Form::estimate(&shuffled, &ModelInputs::default()).unwrap().hyperparameters.noise_autocorrelation,
+                0.0
+            );
         }
     }
     println!("of {} parts RMS held in {rms}, PV in {pv}; a drift was seen in {seen}", parts());
@@ -199,7 +208,7 @@ fn a_form_as_small_as_the_scatter_is_told_without_it() {
 }
 
 /// A part that was measured by a machine with errors of its scales and its angles, in units of what is stated of it, and with a wrong radius.
-fn by_a_machine(seed: u64, machine: &Machine, radius_sigma_mm: f64) -> (FormError, Registration) {
+fn by_a_machine(seed: u64, machine: &MachineUncertainty, radius_sigma_mm: f64) -> (FormError, Registration) {
     let mut rng = StdRng::seed_from_u64(seed);
     let form = FormError::with_rms(&mut regrind_sim::rng(seed), 30.0, 2e-3);
     let mut all = centres(&FreeForm::default(), &form, [[-48.0, -28.0], [48.0, 28.0]], [26, 16]);
@@ -218,24 +227,26 @@ fn by_a_machine(seed: u64, machine: &Machine, radius_sigma_mm: f64) -> (FormErro
 #[test]
 fn what_a_machine_does_to_all_points_is_allowed_for_where_it_is_stated() {
     const MACHINES: u64 = 8;
-    let machine = Machine { scale: [2e-5; 3], squareness_rad: [2e-5; 3], ..Machine::default() };
+    let machine = MachineUncertainty { scale: [2e-5; 3], squareness_rad: [2e-5; 3], ..MachineUncertainty::default() };
     let radius_sigma_mm = 3e-4;
-    let given = Given { machine, radius_sigma_mm, ..Given::default() };
+    let given = ModelInputs { machine, radius_sigma_mm, ..ModelInputs::default() };
     let (mut with, mut without, mut wider) = (0, 0, 0.0);
     for seed in 0..MACHINES {
         let (form, found) = by_a_machine(seed, &machine, radius_sigma_mm);
-        let model = Form::of(&found, &given).unwrap();
-        let blind = Form::of(&found, &Given::default()).unwrap();
+        let model = Form::estimate(&found, &given).unwrap();
+        let blind = Form::estimate(&found, &ModelInputs::default()).unwrap();
         let part = Part { form, truth: Pose::identity(), found, model };
         let [true_rms, _] = figures(&part.form());
         with += u32::from(holds(part.model.figures.rms, true_rms));
         without += u32::from(holds(blind.figures.rms, true_rms));
         let width = |form: &Form| form.figures.rms.high_mm - form.figures.rms.low_mm;
         wider += width(&part.model) / width(&blind) / MACHINES as f64;
-        let squares = |of: fn(&Share) -> f64| part.model.budget.iter().map(|s| of(s).powi(2)).sum::<f64>().sqrt();
+        let squares = |of: fn(&BudgetEntry) -> f64| part.model.budget.iter().map(|s| of(s).powi(2)).sum::<f64>().sqrt();
         assert!((squares(|s| s.rms_mm) / part.model.figures.rms.standard_mm() - 1.0).abs() < 1e-9);
         let stated = |source| part.model.budget.iter().find(|s| s.source == source).unwrap().is_stated;
-        assert!(stated(Source::Scales) && stated(Source::Radius) && !stated(Source::Probe));
+        assert!(
+            stated(UncertaintySource::Scales) && stated(UncertaintySource::Radius) && !stated(UncertaintySource::Probe)
+        );
     }
     println!(
         "of {MACHINES} RMS held in {with} where it is stated, in {without} where it is not; {wider:.1} times as wide"
@@ -263,7 +274,7 @@ fn held_elsewhere(seed: u64, datum: [f64; 6]) -> (FormError, Registration) {
 fn where_a_fixture_holds_a_part_is_in_what_is_said_of_it() {
     let drawn = seeds(5);
     let datum = [5e-3, 5e-3, 0.0, 0.0, 0.0, 1e-4];
-    let given = Given { datum: Some(datum), ..Given::default() };
+    let given = ModelInputs { datum: Some(datum), ..ModelInputs::default() };
     let (mut with, mut without, mut wider) = ([0; 2], [0; 2], 0.0);
     for seed in 0..drawn {
         let (form, found) = held_elsewhere(seed, datum);
@@ -276,14 +287,15 @@ fn where_a_fixture_holds_a_part_is_in_what_is_said_of_it() {
         });
         let base = motions.qr().q();
         let truth = figures((&form - &base * base.tr_mul(&form)).as_slice());
-        let [sure, blind] = [given, Given { datum: Some([0.0; 6]), ..given }].map(|of| Form::of(&found, &of).unwrap());
+        let [sure, blind] =
+            [given, ModelInputs { datum: Some([0.0; 6]), ..given }].map(|of| Form::estimate(&found, &of).unwrap());
         for (held, told) in [(&mut with, &sure), (&mut without, &blind)] {
             held[0] += u32::from(holds(told.figures.rms, truth[0]));
             held[1] += u32::from(holds(told.figures.pv, truth[1]));
         }
         let width = |form: &Form| form.figures.rms.high_mm - form.figures.rms.low_mm;
         wider += width(&sure) / width(&blind) / drawn as f64;
-        let share = |form: &Form| *form.budget.iter().find(|s| s.source == Source::Datum).unwrap();
+        let share = |form: &Form| *form.budget.iter().find(|s| s.source == UncertaintySource::Datum).unwrap();
         assert!(share(&sure).is_stated && share(&sure).rms_mm > 0.0);
         assert!(!share(&blind).is_stated && share(&blind).rms_mm == 0.0);
     }
@@ -297,7 +309,7 @@ fn where_a_fixture_holds_a_part_is_in_what_is_said_of_it() {
 }
 
 /// A part that was corrected by a machine with errors until it looks good on it, as this measures it, and as it is.
-fn ground_by(seed: u64, machine: &Machine, datum: [f64; 6]) -> (Registration, Registration) {
+fn ground_by(seed: u64, machine: &MachineUncertainty, datum: [f64; 6]) -> (Registration, Registration) {
     let mut rng = StdRng::seed_from_u64(seed);
     let seen = FormError::with_rms(&mut regrind_sim::rng(seed), 30.0, 1e-3);
     let looks = centres(&FreeForm::default(), &seen, [[-48.0, -28.0], [48.0, 28.0]], [26, 16]);
@@ -323,19 +335,20 @@ fn ground_by(seed: u64, machine: &Machine, datum: [f64; 6]) -> (Registration, Re
 #[ignore = "worlds are drawn, for .ci/long"]
 fn what_a_machine_has_had_ground_into_a_part_is_in_what_is_said_of_it() {
     let drawn = seeds(4);
-    let scaled = Machine { scale: [5e-5; 3], ..Machine::default() };
-    for (machine, datum) in [(scaled, [0.0; 6]), (Machine::default(), [5e-3, 5e-3, 0.0, 0.0, 0.0, 1e-4])] {
+    let scaled = MachineUncertainty { scale: [5e-5; 3], ..MachineUncertainty::default() };
+    for (machine, datum) in [(scaled, [0.0; 6]), (MachineUncertainty::default(), [5e-3, 5e-3, 0.0, 0.0, 0.0, 1e-4])] {
         let (mut with, mut without) = ([0; 2], [0; 2]);
         for seed in 0..drawn {
             let (looks, is) = ground_by(seed, &machine, datum);
             let truth = figures(&is.deviations.iter().map(|d| d.deviation_mm).collect::<Vec<_>>());
-            let first = Given { machine, datum: Some(datum), ..Given::default() };
-            let [sure, blind] = [Given { is_corrected: true, ..first }, first].map(|of| Form::of(&looks, &of).unwrap());
+            let first = ModelInputs { machine, datum: Some(datum), ..ModelInputs::default() };
+            let [sure, blind] =
+                [ModelInputs { is_corrected: true, ..first }, first].map(|of| Form::estimate(&looks, &of).unwrap());
             for (held, told) in [(&mut with, &sure), (&mut without, &blind)] {
                 held[0] += u32::from(holds(told.figures.rms, truth[0]));
                 held[1] += u32::from(holds(told.figures.pv, truth[1]));
             }
-            let squares = |of: fn(&Share) -> f64| sure.budget.iter().map(|s| of(s).powi(2)).sum::<f64>().sqrt();
+            let squares = |of: fn(&BudgetEntry) -> f64| sure.budget.iter().map(|s| of(s).powi(2)).sum::<f64>().sqrt();
             assert!((squares(|s| s.rms_mm) / sure.figures.rms.standard_mm() - 1.0).abs() < 1e-9);
         }
         println!(
@@ -351,8 +364,8 @@ fn what_a_machine_has_had_ground_into_a_part_is_in_what_is_said_of_it() {
 #[test]
 fn who_held_nothing_is_told_of_no_fixture() {
     let part = part(3, 5e-3);
-    assert!(part.model.budget.iter().all(|share| share.source != Source::Datum));
-    assert_eq!(part.model.budget.len(), Source::ALL.len() - 1);
+    assert!(part.model.budget.iter().all(|share| share.source != UncertaintySource::Datum));
+    assert_eq!(part.model.budget.len(), UncertaintySource::ALL.len() - 1);
 }
 
 #[test]
@@ -360,14 +373,16 @@ fn what_no_uncertainty_can_be_is_refused_in_words() {
     let part = part(3, 5e-3);
     for wrong in [-1e-3, f64::NAN, 1e9] {
         for machine in [
-            Machine { probe_mm: wrong, ..Machine::default() },
-            Machine { squareness_rad: [0.0, wrong, 0.0], ..Machine::default() },
+            MachineUncertainty { probe_mm: wrong, ..MachineUncertainty::default() },
+            MachineUncertainty { squareness_rad: [0.0, wrong, 0.0], ..MachineUncertainty::default() },
         ] {
-            let error = Form::of(&part.found, &Given { machine, ..Given::default() }).unwrap_err().to_string();
+            let error = Form::estimate(&part.found, &ModelInputs { machine, ..ModelInputs::default() })
+                .unwrap_err()
+                .to_string();
             assert!(error.contains("standard uncertainty") && error.contains(&wrong.to_string()), "{error}");
         }
-        let given = Given { datum: Some([0.0, wrong, 0.0, 0.0, 0.0, 0.0]), ..Given::default() };
-        let error = Form::of(&part.found, &given).unwrap_err().to_string();
+        let given = ModelInputs { datum: Some([0.0, wrong, 0.0, 0.0, 0.0, 0.0]), ..ModelInputs::default() };
+        let error = Form::estimate(&part.found, &given).unwrap_err().to_string();
         assert!(error.contains("place where the part is held") && error.contains(&wrong.to_string()), "{error}");
     }
 }
@@ -375,13 +390,13 @@ fn what_no_uncertainty_can_be_is_refused_in_words() {
 #[test]
 fn what_is_known_of_the_radius_of_the_probe_is_in_what_is_said() {
     let (part, with_form) = (part(3, 1e-9), part(3, 5e-3));
-    let given = Given { radius_sigma_mm: 2e-2, ..Given::default() };
-    let doubted = Form::of(&part.found, &given).unwrap();
+    let given = ModelInputs { radius_sigma_mm: 2e-2, ..ModelInputs::default() };
+    let doubted = Form::estimate(&part.found, &given).unwrap();
     let [z, z_doubted] = [&part.model, &doubted].map(|form| form.frame_covariance[(2, 2)].sqrt());
     assert!((z_doubted / 2e-2 - 1.0).abs() < 0.2 && z < 3e-4, "{z} {z_doubted}");
     // A wrong radius would show in points that have no form; in a form it may hide.
     let [sure, doubted] =
-        [Given::default(), given].map(|given| Form::of(&with_form.found, &given).unwrap().figures.rms);
+        [ModelInputs::default(), given].map(|given| Form::estimate(&with_form.found, &given).unwrap().figures.rms);
     let width = |of: Interval| of.high_mm - of.low_mm;
     println!("RMS {:.2} times as wide beside an unknown radius", width(doubted) / width(sure));
     assert!(width(doubted) > 2.0 * width(sure), "{sure:?} {doubted:?}");
@@ -460,23 +475,23 @@ fn of_too_few_points_no_figure_of_an_area_is_invented() {
             deviation.status = PointStatus::Outlier;
         }
     }
-    let told = Form::of(&part.found, &Given::default()).unwrap();
+    let told = Form::estimate(&part.found, &ModelInputs::default()).unwrap();
     assert_eq!(told.points.len(), 14);
     assert!(told.slope.is_none() && told.iso.is_some());
     for (k, deviation) in part.found.deviations.iter_mut().enumerate() {
         deviation.status = if k % 60 == 7 { PointStatus::Used } else { PointStatus::Outlier };
     }
-    let told = Form::of(&part.found, &Given::default()).unwrap();
+    let told = Form::estimate(&part.found, &ModelInputs::default()).unwrap();
     assert!(told.slope.is_none() && told.iso.is_none());
 }
 
 /// A probe that scatters less than the touches do: the rest is form, and between the touches no more than at them.
 #[test]
 fn between_the_touches_there_is_no_more_form_than_at_them() {
-    let given = Given { probe_scatter_mm: [0.5 * SCATTER_MM, 0.1], ..Given::default() };
+    let given = ModelInputs { probe_noise_mm: [0.5 * SCATTER_MM, 0.1], ..ModelInputs::default() };
     for seed in 0..2 {
         let part = part(seed, 5e-3);
-        let FormFigures { pv, pv_most_points, .. } = Form::of(&part.found, &given).unwrap().figures;
+        let FormFigures { pv, pv_most_points, .. } = Form::estimate(&part.found, &given).unwrap().figures;
         println!("seed {seed}: touched up to {:.2e}, the aperture up to {:.2e} mm", pv.high_mm, pv_most_points.high_mm);
         assert!(pv_most_points.high_mm < 1.2 * pv.high_mm && pv_most_points.low_mm >= pv.low_mm, "{pv_most_points:?}");
     }
@@ -486,8 +501,8 @@ fn between_the_touches_there_is_no_more_form_than_at_them() {
 #[test]
 fn a_scatter_that_the_sphere_may_have_missed_is_not_told_as_form() {
     let low_mm = |part: &Part, share: f64| {
-        let given = Given { probe_scatter_mm: [share * SCATTER_MM, 0.15], ..Given::default() };
-        Form::of(&part.found, &given).unwrap().figures.rms.low_mm
+        let given = ModelInputs { probe_noise_mm: [share * SCATTER_MM, 0.15], ..ModelInputs::default() };
+        Form::estimate(&part.found, &given).unwrap().figures.rms.low_mm
     };
     let (parts, mut told) = (seeds(3), 0.0);
     for seed in 0..parts {
@@ -511,10 +526,10 @@ fn too_few_points_have_the_upper_ends_of_a_form_that_is_all_of_what_was_found() 
         for (k, deviation) in part.found.deviations.iter_mut().enumerate() {
             deviation.status = if k % 38 == 17 { PointStatus::Used } else { PointStatus::Outlier };
         }
-        let few = Form::of(&part.found, &Given::default()).unwrap();
+        let few = Form::estimate(&part.found, &ModelInputs::default()).unwrap();
         assert!(few.is_of_few && few.degrees_of_freedom == 10.0, "{}", few.degrees_of_freedom);
-        let sphere = Given { probe_scatter_mm: [SCATTER_MM, 0.15], ..Given::default() };
-        let by_sphere = Form::of(&part.found, &sphere).unwrap();
+        let sphere = ModelInputs { probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() };
+        let by_sphere = Form::estimate(&part.found, &sphere).unwrap();
         assert!(!by_sphere.is_of_few && by_sphere.figures.rms.high_mm < few.figures.rms.high_mm);
         println!("seed {seed}: {:.2e} mm, in truth {true_mm:.2e} over the part", few.figures.rms.high_mm);
         held += u64::from(few.figures.rms.high_mm >= true_mm);

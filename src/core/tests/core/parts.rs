@@ -166,7 +166,7 @@ fn polar_cap(radius: f64, count: usize, polar_deg: f64, phase: f64) -> Vec<Point
         .collect()
 }
 
-/// A bumpy hyper-hemisphere: radius and normal in closed form over the direction.
+/// A bumpy hyperparameters-hemisphere: radius and normal in closed form over the direction.
 fn bumpy(direction: &Vector) -> (Point, Vector) {
     // The level set F(p) = |p| - r(p/|p|), r = 20 + 0.8 (u.x^2 - 0.7 u.y u.z + 0.5 u.x u.z + 0.4 u.y), u on the unit sphere.
     let u = direction.normalize();

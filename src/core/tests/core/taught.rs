@@ -7,7 +7,9 @@ use rand::rngs::StdRng;
 use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
 use crate::sample::seeds;
 use regrind_core::geometry::{Point, Vector};
-use regrind_core::model::{Field, Form, Given, Hyper, Interval, Lesson, Observed, Priors, Taught, spread};
+use regrind_core::model::{
+    Field, Form, Hyperparameters, Interval, ModelInputs, Observed, PartFit, PartPriors, Prior, farthest_points,
+};
 use regrind_core::registration::{Options, Registration, Start, register};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
@@ -40,14 +42,14 @@ impl Part {
             let c = at + (RADIUS_MM + form.height(at.x, at.y)) * n;
             [c.x, c.y, c.z].map(|v| v + SCATTER_MM * normal(&mut rng))
         };
-        let touched: Vec<[f64; 3]> = spread(&targets, TOUCHES).into_iter().map(&mut centre).collect();
+        let touched: Vec<[f64; 3]> = farthest_points(&targets, TOUCHES).into_iter().map(&mut centre).collect();
         let options = Options { start: Start::Pose(pose(&placement)), ..Options::new(RADIUS_MM) };
         let found = register(&free_form(205, 125), &points(&placed(&placement, &touched)), &options).unwrap();
         Self { targets, form, found }
     }
 
-    fn told(&self, lesson: Option<Lesson>) -> Form {
-        Form::over(&self.found, &given(lesson), &self.targets).unwrap()
+    fn told(&self, lesson: Option<PartFit>) -> Form {
+        Form::estimate_at(&self.found, &given(lesson), &self.targets).unwrap()
     }
 
     /// The true form at all targets after its own best fit: RMS and PV.
@@ -67,9 +69,9 @@ impl Part {
     }
 }
 
-fn given(lesson: Option<Lesson>) -> Given {
+fn given(lesson: Option<PartFit>) -> ModelInputs {
     let priors = lesson.map(|lesson| lesson.priors());
-    Given { priors, probe_scatter_mm: [SCATTER_MM, 0.15], ..Given::default() }
+    ModelInputs { priors, probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() }
 }
 
 fn parts() -> u64 {
@@ -77,7 +79,7 @@ fn parts() -> u64 {
 }
 
 /// Of some parts: how many RMS and PV were held, and the mean width of both in the true ones.
-fn told(length_mm: f64, rms_mm: f64, lesson: Option<Lesson>) -> ([u64; 2], [f64; 2]) {
+fn told(length_mm: f64, rms_mm: f64, lesson: Option<PartFit>) -> ([u64; 2], [f64; 2]) {
     let (mut held, mut wide) = ([0; 2], [0.0; 2]);
     for seed in 0..parts() {
         let part = Part::new(1000 + seed, length_mm, rms_mm);
@@ -97,37 +99,41 @@ fn told(length_mm: f64, rms_mm: f64, lesson: Option<Lesson>) -> ([u64; 2], [f64;
     (held, wide)
 }
 
-fn hyper(range_mm: f64, ratio: f64) -> Hyper {
-    Hyper { field: Field::new(2e-3, range_mm), scatter_mm: 2e-3 * ratio, drift: 0.0 }
+fn hyperparameters(range_mm: f64, ratio: f64) -> Hyperparameters {
+    Hyperparameters { field: Field::new(2e-3, range_mm), noise_sigma_mm: 2e-3 * ratio, noise_autocorrelation: 0.0 }
 }
 
 /// A field at 50 places of a part of 102 x 62 mm, moved and tilted by what nobody knows.
-fn drawn(hyper: &Hyper, seed: u64) -> Observed {
+fn drawn(hyperparameters: &Hyperparameters, seed: u64) -> Observed {
     let places: Vec<[f64; 2]> = (0..50)
         .map(|k| f64::from(k) + 0.5)
         .map(|k| [(0.754_877_666 * k).fract() * 102.0, (0.569_840_291 * k).fract() * 62.0])
         .collect();
     let n = places.len();
     let covariance = DMatrix::from_fn(n, n, |r, c| {
-        hyper.field.covariance_mm2(places[r], places[c]) + if r == c { hyper.scatter_mm.powi(2) } else { 0.0 }
+        hyperparameters.field.covariance_mm2(places[r], places[c])
+            + if r == c { hyperparameters.noise_sigma_mm.powi(2) } else { 0.0 }
     });
     let mut rng = StdRng::seed_from_u64(seed);
     let deviations = covariance.cholesky().unwrap().l() * DVector::from_fn(n, |_, _| normal(&mut rng));
     let effects = DMatrix::from_fn(n, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
-    Observed { effects, ..Observed::without_effects(places, deviations.iter().copied().collect()) }
+    Observed { fixed_effects: effects, ..Observed::without_effects(places, deviations.iter().copied().collect()) }
 }
 
 #[test]
 fn by_what_six_parts_taught_the_parameters_of_few_points_are_nearer() {
-    for planted in [hyper(30.0, 0.1), hyper(20.0, 0.3)] {
-        let every = Priors::of_size(102.0 / 3.0);
-        let mut taught = Taught::default();
-        (0..6).for_each(|seed| taught.take(true, &Hyper::of(&drawn(&planted, seed), Some(&every)).unwrap()));
-        let lesson = taught.of(true).unwrap();
-        let off = |priors: &Priors| {
+    for planted in [hyperparameters(30.0, 0.1), hyperparameters(20.0, 0.3)] {
+        let every = Prior::for_size(102.0 / 3.0);
+        let mut taught = PartPriors::default();
+        (0..6).for_each(|seed| {
+            taught.update(true, &Hyperparameters::estimate(&drawn(&planted, seed), Some(&every)).unwrap())
+        });
+        let lesson = taught.fit(true).unwrap();
+        let off = |priors: &Prior| {
             let of = |seed: u64| {
-                let found = Hyper::of(&drawn(&planted, 100 + seed), Some(priors)).unwrap();
-                let ratio = |hyper: &Hyper| hyper.scatter_mm / hyper.field.sigma_mm;
+                let found = Hyperparameters::estimate(&drawn(&planted, 100 + seed), Some(priors)).unwrap();
+                let ratio =
+                    |hyperparameters: &Hyperparameters| hyperparameters.noise_sigma_mm / hyperparameters.field.sigma_mm;
                 let off = [found.field.range_mm / planted.field.range_mm, ratio(&found) / ratio(&planted)];
                 off.map(|off| off.ln().powi(2))
             };
@@ -145,14 +151,14 @@ fn by_what_six_parts_taught_the_parameters_of_few_points_are_nearer() {
 #[ignore = "worlds are drawn, for .ci/long"]
 fn what_parts_taught_is_believed_as_far_as_it_is_true() {
     // Four parts of a recipe teach; those that follow are like them.
-    let mut taught = Taught::default();
+    let mut taught = PartPriors::default();
     for seed in 0..4 {
         let part = Part::new(seed, 15.0, 2e-3);
-        if let Some(field) = Form::of(&part.found, &given(None)).unwrap().alone {
-            taught.take(true, &field);
+        if let Some(field) = Form::estimate(&part.found, &given(None)).unwrap().hyperparameters_without_prior {
+            taught.update(true, &field);
         }
     }
-    let lesson = taught.of(true);
+    let lesson = taught.fit(true);
     let ((plain, wide), (held, narrow)) = (told(15.0, 2e-3, None), told(15.0, 2e-3, lesson));
     println!("{lesson:?}: held {held:?} of {}, {narrow:.3?} wide; untaught {plain:?}, {wide:.3?}", parts());
     assert!(held.iter().zip(plain).all(|(held, plain)| held + 1 >= plain.min(parts() - 1)), "{held:?} {plain:?}");
@@ -164,7 +170,7 @@ fn what_parts_taught_is_believed_as_far_as_it_is_true() {
 fn a_part_that_is_like_none_before_is_told_by_its_own_points() {
     // Twenty parts have taught that a form is narrow and next to the scatter; this one is wide and strong, and the other way round.
     let many = |range_mm: f64, ratio: f64| {
-        (0..20).fold(None, |lesson, _| Some(Lesson::after(lesson, &hyper(range_mm, ratio))))
+        (0..20).fold(None, |lesson, _| Some(PartFit::updated(lesson, &hyperparameters(range_mm, ratio))))
     };
     for (length_mm, rms_mm, lesson) in [(30.0, 5e-3, many(8.0, 1.0)), (15.0, 1e-3, many(200.0, 0.01))] {
         let ((plain, wide), (held, narrow)) = (told(length_mm, rms_mm, None), told(length_mm, rms_mm, lesson));

@@ -7,7 +7,8 @@ use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
 use crate::sample::seeds;
 use regrind_core::geometry::{Point, Vector};
 use regrind_core::model::{
-    FEWEST, FIRST, Form, FormFigures, Given, Interval, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread,
+    FIRST_BATCH, Form, FormFigures, Interval, MAX_BATCHES, MIN_TOUCHES, ModelInputs, PartialMeasurement, Reason,
+    StoppingCriteria, StoppingDecision, decide, farthest_points, short_tour,
 };
 use regrind_core::registration::{Options, Registration, Start, register};
 use regrind_sim::form::FormError;
@@ -15,9 +16,14 @@ use regrind_sim::probe::Placement;
 use regrind_sim::shape::{FreeForm, Shape};
 
 const SCATTER_MM: f64 = 3e-4;
-const STRICT: Purpose =
-    Purpose { pv_mm: f64::INFINITY, pv_most_points_mm: 1e-4, rms_mm: 1e-4, correction_mm: 5e-4, may_grind: true };
-const LOOSE: Purpose = Purpose { pv_most_points_mm: 1.0, rms_mm: 1.0, ..STRICT };
+const STRICT: StoppingCriteria = StoppingCriteria {
+    pv_mm: f64::INFINITY,
+    pv_most_points_mm: 1e-4,
+    rms_mm: 1e-4,
+    correction_mm: 5e-4,
+    may_grind: true,
+};
+const LOOSE: StoppingCriteria = StoppingCriteria { pv_most_points_mm: 1.0, rms_mm: 1.0, ..STRICT };
 
 /// A part with something on it that is no smooth form, and its pattern of 36 by 22 targets.
 struct Part {
@@ -63,17 +69,17 @@ impl Part {
     }
 
     /// Touches in two batches, and looks.
-    fn look(&self, first: &[usize], last: &[usize], purpose: &Purpose) -> Look {
+    fn look(&self, first: &[usize], last: &[usize], purpose: &StoppingCriteria) -> StoppingDecision {
         let touched = [first, last].concat();
         let mut tried = vec![None; self.targets.len()];
         first.iter().for_each(|&k| tried[k] = Some(0));
         last.iter().for_each(|&k| tried[k] = Some(1));
-        let so_far = SoFar { targets: &self.targets, tried: &tried, touched: &touched };
-        look(&self.measured(&touched), &given(), &so_far, purpose, 1).unwrap()
+        let so_far = PartialMeasurement { targets: &self.targets, tried: &tried, touched: &touched };
+        decide(&self.measured(&touched), &given(), &so_far, purpose, 1).unwrap()
     }
 
     fn form(&self, touched: &[usize]) -> Form {
-        Form::over(&self.measured(touched), &given(), &self.targets).unwrap()
+        Form::estimate_at(&self.measured(touched), &given(), &self.targets).unwrap()
     }
 
     /// The true form at all targets after its own best fit: RMS and PV.
@@ -90,13 +96,13 @@ impl Part {
     }
 }
 
-fn given() -> Given {
-    Given { probe_scatter_mm: [SCATTER_MM, 0.15], ..Given::default() }
+fn given() -> ModelInputs {
+    ModelInputs { probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() }
 }
 
 /// Some targets, far apart, in two batches.
 fn apart(part: &Part, count: usize) -> (Vec<usize>, Vec<usize>) {
-    let mut all = spread(&part.targets, count);
+    let mut all = farthest_points(&part.targets, count);
     let last = all.split_off(count / 2);
     (all, last)
 }
@@ -138,7 +144,7 @@ fn what_is_narrower_than_the_touches_are_apart_is_in_the_figures() {
     // PV 99.8 % leaves out the outermost one at either end of a thousand places that were not touched.
     let many = rough.targets.repeat(1500_usize.div_ceil(rough.targets.len()));
     let FormFigures { pv, pv_most_points, .. } =
-        Form::over(&rough.measured(&[first.clone(), last.clone()].concat()), &given(), &many).unwrap().figures;
+        Form::estimate_at(&rough.measured(&[first.clone(), last.clone()].concat()), &given(), &many).unwrap().figures;
     assert!(
         pv_most_points.median_mm < pv.median_mm && pv_most_points.high_mm < pv.high_mm,
         "{pv_most_points:?} {pv:?}"
@@ -149,7 +155,7 @@ fn what_is_narrower_than_the_touches_are_apart_is_in_the_figures() {
     // Also where every target is touched, and what is narrow is left of the touches themselves.
     let all: Vec<usize> = (0..rough.targets.len()).collect();
     let whole = rough.measured(&all);
-    let of_whole = Form::of(&whole, &given()).unwrap().figures.rms;
+    let of_whole = Form::estimate(&whole, &given()).unwrap().figures.rms;
     assert!(holds(of_whole, rms), "{of_whole:?} {rms}");
     let smooth = Part::smooth(3, 1e-9);
     let of_smooth = smooth.form(&[first, last].concat()).figures;
@@ -161,26 +167,26 @@ fn it_ends_where_enough_is_known_and_goes_on_where_not() {
     let part = Part::smooth(5, 5e-3);
     let (first, last) = apart(&part, 30);
     let few = part.look(&first, &last, &LOOSE);
-    assert_eq!((few.why, few.next.len()), (Why::Few, FEWEST - 30));
+    assert_eq!((few.reason, few.next.len()), (Reason::Few, MIN_TOUCHES - 30));
     let (first, last) = apart(&part, 60);
     let within = part.look(&first, &last, &LOOSE);
-    assert!(within.why == Why::Within && within.next.is_empty(), "{:?}", within.why);
-    let known = part.look(&first, &last, &Purpose { correction_mm: 0.1, ..STRICT });
-    assert!(known.why == Why::Known && known.next.is_empty(), "{:?}", known.why);
-    let unknown = part.look(&first, &last, &Purpose { correction_mm: 1e-7, ..STRICT });
-    assert_eq!((unknown.why, unknown.next.len()), (Why::Unknown, 30));
-    let between = Purpose { rms_mm: unknown.form.figures.rms.median_mm, pv_most_points_mm: 1.0, ..STRICT };
-    assert_eq!(part.look(&first, &last, &between).why, Why::Undecided);
+    assert!(within.reason == Reason::Within && within.next.is_empty(), "{:?}", within.reason);
+    let known = part.look(&first, &last, &StoppingCriteria { correction_mm: 0.1, ..STRICT });
+    assert!(known.reason == Reason::Known && known.next.is_empty(), "{:?}", known.reason);
+    let unknown = part.look(&first, &last, &StoppingCriteria { correction_mm: 1e-7, ..STRICT });
+    assert_eq!((unknown.reason, unknown.next.len()), (Reason::Unknown, 30));
+    let between = StoppingCriteria { rms_mm: unknown.form.figures.rms.median_mm, pv_most_points_mm: 1.0, ..STRICT };
+    assert_eq!(part.look(&first, &last, &between).reason, Reason::Undecided);
     let all: Vec<usize> = (0..part.targets.len()).collect();
-    assert_eq!(part.look(&all[..400], &all[400..], &STRICT).why, Why::All);
+    assert_eq!(part.look(&all[..400], &all[400..], &STRICT).reason, Reason::All);
 }
 
 #[test]
 fn what_is_beyond_for_certain_is_not_touched_for_a_correction_that_no_pass_is_left_for() {
     let part = Part::smooth(5, 5e-3);
     let (first, last) = apart(&part, 60);
-    let over = part.look(&first, &last, &Purpose { correction_mm: 1e-7, may_grind: false, ..STRICT });
-    assert!(over.why == Why::Beyond && over.next.is_empty(), "{:?}", over.why);
+    let over = part.look(&first, &last, &StoppingCriteria { correction_mm: 1e-7, may_grind: false, ..STRICT });
+    assert!(over.reason == Reason::Beyond && over.next.is_empty(), "{:?}", over.reason);
 }
 
 #[test]
@@ -188,40 +194,41 @@ fn touching_is_not_given_up_where_one_look_would_accept_and_the_risk_of_many_doe
     let part = Part::smooth(5, 5e-3);
     let (first, last) = apart(&part, 150);
     let rms = part.look(&first, &last, &LOOSE).form.figures.rms;
-    let between = |rms_mm| Purpose { rms_mm, correction_mm: 0.1, ..LOOSE };
+    let between = |rms_mm| StoppingCriteria { rms_mm, correction_mm: 0.1, ..LOOSE };
     // Within with 97.5 %, by which a run judges, and not with 99.5 %, by which it looks.
-    assert_eq!(part.look(&first, &last, &between(0.5 * (rms.high_mm + rms.most_mm))).why, Why::Undecided);
-    assert_eq!(part.look(&first, &last, &between(0.5 * (rms.median_mm + rms.high_mm))).why, Why::Known);
-    assert_eq!(part.look(&first, &last, &between(1.001 * rms.most_mm)).why, Why::Within);
+    assert_eq!(part.look(&first, &last, &between(0.5 * (rms.high_mm + rms.most_mm))).reason, Reason::Undecided);
+    assert_eq!(part.look(&first, &last, &between(0.5 * (rms.median_mm + rms.high_mm))).reason, Reason::Known);
+    assert_eq!(part.look(&first, &last, &between(1.001 * rms.most_mm)).reason, Reason::Within);
 }
 
 #[test]
 fn another_pass_mends_more_than_touches_beyond_a_sixth_of_the_pattern() {
     let part = Part::smooth(5, 5e-3);
-    let never = Purpose { correction_mm: 1e-7, ..STRICT };
-    let why = |count, purpose: &Purpose| {
+    let never = StoppingCriteria { correction_mm: 1e-7, ..STRICT };
+    let why = |count, purpose: &StoppingCriteria| {
         let (first, last) = apart(&part, count);
-        part.look(&first, &last, purpose).why
+        part.look(&first, &last, purpose).reason
     };
-    assert_eq!(why(part.targets.len() / 6 - 2, &never), Why::Unknown);
-    assert_eq!(why(part.targets.len() / 6, &never), Why::Enough);
-    assert_eq!(why(part.targets.len() / 6, &Purpose { may_grind: false, ..never }), Why::Beyond);
+    assert_eq!(why(part.targets.len() / 6 - 2, &never), Reason::Unknown);
+    assert_eq!(why(part.targets.len() / 6, &never), Reason::Enough);
+    assert_eq!(why(part.targets.len() / 6, &StoppingCriteria { may_grind: false, ..never }), Reason::Beyond);
 }
 
 #[test]
 fn batches_have_an_end() {
     let part = Part::smooth(6, 5e-3);
-    let touched = spread(&part.targets, 60);
+    let touched = farthest_points(&part.targets, 60);
     let looked = |last: u32| {
         let mut tried = vec![None; part.targets.len()];
         touched.iter().for_each(|&k| tried[k] = Some(0));
         tried[touched[0]] = Some(last);
-        let so_far = SoFar { targets: &part.targets, tried: &tried, touched: &touched };
-        look(&part.measured(&touched), &given(), &so_far, &Purpose { correction_mm: 1e-7, ..STRICT }, 1).unwrap()
+        let so_far = PartialMeasurement { targets: &part.targets, tried: &tried, touched: &touched };
+        decide(&part.measured(&touched), &given(), &so_far, &StoppingCriteria { correction_mm: 1e-7, ..STRICT }, 1)
+            .unwrap()
     };
-    assert_ne!(looked(MOST_BATCHES - 2).why, Why::Late);
-    let late = looked(MOST_BATCHES - 1);
-    assert_eq!((late.why, late.next.len()), (Why::Late, part.targets.len() - 60));
+    assert_ne!(looked(MAX_BATCHES - 2).reason, Reason::Late);
+    let late = looked(MAX_BATCHES - 1);
+    assert_eq!((late.reason, late.next.len()), (Reason::Late, part.targets.len() - 60));
 }
 
 #[test]
@@ -230,19 +237,19 @@ fn the_next_touches_are_new_where_least_is_known_and_say_more_than_as_many_anywh
     // All touches in one half.
     let half: Vec<usize> = (0..part.targets.len()).filter(|k| part.targets[*k].0.x < 0.0).collect();
     let left: Vec<(Point, Vector)> = half.iter().map(|&k| part.targets[k]).collect();
-    let touched: Vec<usize> = spread(&left, 60).into_iter().map(|k| half[k]).collect();
-    let look = part.look(&touched[..30], &touched[30..], &STRICT);
-    assert!(look.next.iter().all(|k| !touched.contains(k)), "{:?}", look.next);
-    let right = look.next.iter().filter(|&&k| part.targets[k].0.x > 0.0).count();
-    assert!(5 * right > 4 * look.next.len(), "{right} of {}", look.next.len());
+    let touched: Vec<usize> = farthest_points(&left, 60).into_iter().map(|k| half[k]).collect();
+    let decision = part.look(&touched[..30], &touched[30..], &STRICT);
+    assert!(decision.next.iter().all(|k| !touched.contains(k)), "{:?}", decision.next);
+    let right = decision.next.iter().filter(|&&k| part.targets[k].0.x > 0.0).count();
+    assert!(5 * right > 4 * decision.next.len(), "{right} of {}", decision.next.len());
     let known = |next: &[usize]| part.form(&[&touched, next].concat()).known_mm;
     let anywhere: Vec<usize> =
-        (0..part.targets.len()).filter(|k| !touched.contains(k)).step_by(25).take(look.next.len()).collect();
-    let [chosen_mm, anywhere_mm] = [known(&look.next), known(&anywhere)];
+        (0..part.targets.len()).filter(|k| !touched.contains(k)).step_by(25).take(decision.next.len()).collect();
+    let [chosen_mm, anywhere_mm] = [known(&decision.next), known(&anywhere)];
     println!("known to {:.2} um, and to {:.2} um by as many anywhere", 1e3 * chosen_mm, 1e3 * anywhere_mm);
     assert!(chosen_mm < anywhere_mm, "{chosen_mm} {anywhere_mm}");
     // The same is asked for again.
-    assert_eq!(part.look(&touched[..30], &touched[30..], &STRICT).next, look.next);
+    assert_eq!(part.look(&touched[..30], &touched[30..], &STRICT).next, decision.next);
 }
 
 #[test]
@@ -252,12 +259,12 @@ fn dust_has_its_neighbours_touched_and_is_left_out_then() {
     let (mut first, last) = apart(&part, 80);
     first.push(300);
     let seen = part.look(&first, &last, &LOOSE);
-    assert_eq!(seen.why, Why::Around);
+    assert_eq!(seen.reason, Reason::Around);
     let near = |k: &&usize| (part.targets[**k].0 - at).norm() < 6.0;
     let around: Vec<usize> = seen.next.iter().filter(near).copied().collect();
     assert!(around.len() >= 4, "{around:?}");
     let again = part.look(&[&first[..], &last].concat(), &seen.next, &LOOSE);
-    assert_eq!(again.why, Why::Within, "alone among its neighbours it is dust");
+    assert_eq!(again.reason, Reason::Within, "alone among its neighbours it is dust");
 }
 
 #[test]
@@ -267,17 +274,17 @@ fn a_chip_at_the_edge_is_no_dust() {
     // The corner is among those that lie farthest apart; its neighbours come next.
     let (first, last) = apart(&part, 80);
     let seen = part.look(&first, &last, &LOOSE);
-    assert_eq!(seen.why, Why::Around);
+    assert_eq!(seen.reason, Reason::Around);
     let again = part.look(&[&first[..], &last].concat(), &seen.next, &LOOSE);
     let told = again.form.figures.pv;
-    println!("{:?}: {told:?}", again.why);
+    println!("{:?}: {told:?}", again.reason);
     // Touches that agree with each other are form, however deep; those that do not are a feature of which nobody knows the edge.
     assert!(
-        again.why == Why::Feature && again.next.len() + 80 + seen.next.len() == part.targets.len()
+        again.reason == Reason::Feature && again.next.len() + 80 + seen.next.len() == part.targets.len()
             || told.low_mm > 0.03
     );
-    let deep = Purpose { pv_most_points_mm: 0.02, rms_mm: 1.0, ..STRICT };
-    assert_ne!(part.look(&[&first[..], &last].concat(), &seen.next, &deep).why, Why::Within);
+    let deep = StoppingCriteria { pv_most_points_mm: 0.02, rms_mm: 1.0, ..STRICT };
+    assert_ne!(part.look(&[&first[..], &last].concat(), &seen.next, &deep).reason, Reason::Within);
 }
 
 #[test]
@@ -287,27 +294,27 @@ fn a_batch_that_was_not_expected_is_followed_by_another() {
     let [left, right]: [Vec<usize>; 2] = [false, true]
         .map(|on_right| (0..part.targets.len()).filter(|&k| (part.targets[k].0.x > 10.0) == on_right).collect());
     let some = |of: &[usize], count: usize| -> Vec<usize> { of.iter().step_by(of.len() / count).copied().collect() };
-    let look = part.look(&some(&left, 100), &some(&right, 30), &LOOSE);
-    assert!(matches!(look.why, Why::Surprised | Why::Around | Why::Feature), "{:?}", look.why);
-    assert!(!look.next.is_empty());
+    let decision = part.look(&some(&left, 100), &some(&right, 30), &LOOSE);
+    assert!(matches!(decision.reason, Reason::Surprised | Reason::Around | Reason::Feature), "{:?}", decision.reason);
+    assert!(!decision.next.is_empty());
 }
 
 #[test]
 fn the_first_touches_lie_far_apart_and_the_way_is_short() {
     let part = Part::smooth(1, 1e-3);
-    let chosen = spread(&part.targets, FIRST);
+    let chosen = farthest_points(&part.targets, FIRST_BATCH);
     let least = |of: &[usize]| {
         let pairs = of.iter().flat_map(|a| of.iter().map(move |b| (*a, *b))).filter(|(a, b)| a < b);
         pairs.map(|(a, b)| (part.targets[a].0 - part.targets[b].0).norm()).fold(f64::INFINITY, f64::min)
     };
     assert!(least(&chosen) > 20.0, "{}", least(&chosen));
-    let many = spread(&part.targets, 60);
-    let way = short_way(&part.targets, many.clone());
+    let many = farthest_points(&part.targets, 60);
+    let way = short_tour(&part.targets, many.clone());
     let long = |of: &[usize]| of.windows(2).map(|p| (part.targets[p[0]].0 - part.targets[p[1]].0).norm()).sum::<f64>();
     let [mut sorted, mut wanted] = [way.clone(), many.clone()];
     sorted.sort_unstable();
     wanted.sort_unstable();
     assert!(sorted == wanted && long(&way) < 0.4 * long(&many), "{} of {}", long(&way), long(&many));
-    assert!(short_way(&part.targets, Vec::new()).is_empty() && spread(&[], 4).is_empty());
-    assert_eq!((short_way(&part.targets, vec![7]), spread(&part.targets[..3], 10).len()), (vec![7], 3));
+    assert!(short_tour(&part.targets, Vec::new()).is_empty() && farthest_points(&[], 4).is_empty());
+    assert_eq!((short_tour(&part.targets, vec![7]), farthest_points(&part.targets[..3], 10).len()), (vec![7], 3));
 }

@@ -20,8 +20,8 @@ use faer::{Accum, Mat, Par, Side};
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
-use super::waves::Waves;
-use super::{Lay, ModelError, Observed, Smoothness, spacing_mm};
+use super::basis::Basis;
+use super::{Anisotropy, ModelError, Observed, Smoothness, spacing_mm};
 
 /// Kinds of field, from rough to smooth.
 pub(super) const KINDS: [Smoothness; 3] = [Smoothness::Never, Smoothness::Once, Smoothness::Endless];
@@ -51,32 +51,32 @@ const ROWS: usize = 1024;
 
 /// How the scatter goes on from a point to the next one, and along what lay fields are wider.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Kind {
-    pub(super) lay: Lay,
-    pub(super) drift: f64,
+pub(super) struct NoiseKind {
+    pub(super) lay: Anisotropy,
+    pub(super) autocorrelation: f64,
 }
 
-impl Kind {
-    pub(super) const PLAIN: Self = Self { lay: Lay::NONE, drift: 0.0 };
+impl NoiseKind {
+    pub(super) const PLAIN: Self = Self { lay: Anisotropy::NONE, autocorrelation: 0.0 };
 }
 
 /// Fields over the points of a measurement.
-pub(super) struct Fields {
-    pub(super) kind: Kind,
-    pub(super) waves: Waves,
+pub(super) struct FieldHypotheses {
+    pub(super) kind: NoiseKind,
+    pub(super) basis: Basis,
     places: Vec<[f64; 2]>,
     /// The shares of a point's row and of that of the point before that make its row beside a scatter that is independent.
     whitening: Vec<[f64; 2]>,
     /// Q.
     base: DMatrix<f64>,
     /// n - p.
-    pub(super) free: f64,
+    pub(super) degrees_of_freedom: f64,
     /// ln |W| - 1/2 ln |H'W'W H|: what makes likelihoods with a drift and without one those of the same points.
     pub(super) log_whitened: f64,
     reduced: Reduced,
     /// Q'W phi: what the best fit takes of the waves.
     taken: Mat<f64>,
-    pub(super) nodes: Vec<Node>,
+    pub(super) hypotheses: Vec<FieldHypothesis>,
 }
 
 /// What the waves are at the points, in as few coordinates as tell them apart.
@@ -88,34 +88,34 @@ struct Reduced {
 }
 
 /// A smoothness and a range.
-pub(super) struct Node {
+pub(super) struct FieldHypothesis {
     pub(super) smoothness: Smoothness,
     pub(super) range_mm: f64,
     /// Standard deviations of the first waves, in a field of strength 1.
-    pub(super) strengths: Vec<f64>,
+    pub(super) standard_deviations: Vec<f64>,
     /// The variance of a point that is in shorter waves.
-    pub(super) narrow: f64,
+    pub(super) truncated_variance: f64,
     /// What makes tau s^2 the variance of the field.
     pub(super) scale: f64,
     /// Eigenvalues of the waves, unscaled, and U in the coordinates.
-    pub(super) values: Vec<f64>,
-    pub(super) vectors: Mat<f64>,
+    pub(super) eigenvalues: Vec<f64>,
+    pub(super) eigenvectors: Mat<f64>,
     /// The logarithm of what is known of each strength beforehand.
     pub(super) prior: Vec<f64>,
 }
 
 /// All strengths.
-pub(super) fn strengths() -> impl Iterator<Item = f64> {
+pub(super) fn variance_ratios() -> impl Iterator<Item = f64> {
     let [least, most] = STRENGTH.map(f64::ln);
     (0..STRENGTHS).map(move |k| (least + (most - least) * k as f64 / (STRENGTHS - 1) as f64).exp())
 }
 
-impl Fields {
+impl FieldHypotheses {
     /// Lays the fields of every node over the points.
     ///
     /// # Errors
     /// Rows that do not belong together, too few points, effects that cannot be told apart.
-    pub(super) fn over(observed: &Observed, kind: Kind) -> Result<Self, ModelError> {
+    pub(super) fn over(observed: &Observed, kind: NoiseKind) -> Result<Self, ModelError> {
         let mut fields = Self::bare(observed, kind)?;
         let ranges_mm = fields.ranges_mm(RANGES);
         // Rough fields hardly differ from one range to the next, and take longest.
@@ -123,16 +123,17 @@ impl Fields {
         let all = ranges_mm.enumerate().flat_map(|(k, range_mm)| KINDS.map(|smoothness| (k, smoothness, range_mm)));
         let all: Vec<_> =
             all.filter(|of| is_laid(of.0, of.1)).map(|(_, smoothness, range_mm)| (smoothness, range_mm)).collect();
-        fields.nodes = fields.laid(&all);
+        fields.hypotheses = fields.laid(&all);
         // One of two stands for both.
-        let rough = fields.nodes.iter_mut().filter(|node| node.smoothness == Smoothness::Never);
+        let rough = fields.hypotheses.iter_mut().filter(|node| node.smoothness == Smoothness::Never);
         rough.for_each(|node| node.prior.iter_mut().for_each(|of| *of += LN_2));
         Ok(fields)
     }
 
     /// So many ranges, in equal steps of their logarithm: from what the points and the waves tell apart to more than the part.
     fn ranges_mm(&self, count: usize) -> impl Iterator<Item = f64> + use<> {
-        let least_mm = (LEAST_RANGE * spacing_mm(&self.places)).max(WAVES_A_RANGE * self.waves.shortest_mm());
+        let least_mm =
+            (LEAST_RANGE * spacing_mm(&self.places)).max(WAVES_A_RANGE * self.basis.min_half_wavelength_mm());
         let most_mm = (MOST_RANGE * size_mm(&self.places)).max(1.5 * least_mm);
         let ratio = (most_mm / least_mm).ln() / (count - 1) as f64;
         (0..count).map(move |k| least_mm * (ratio * k as f64).exp())
@@ -140,26 +141,30 @@ impl Fields {
 
     /// Lays the fields of some nodes only.
     #[cfg(test)]
-    pub(super) fn of_nodes(observed: &Observed, kind: Kind, nodes: &[(Smoothness, f64)]) -> Result<Self, ModelError> {
+    pub(super) fn of_nodes(
+        observed: &Observed,
+        kind: NoiseKind,
+        nodes: &[(Smoothness, f64)],
+    ) -> Result<Self, ModelError> {
         let mut fields = Self::bare(observed, kind)?;
-        fields.nodes = fields.laid(nodes);
+        fields.hypotheses = fields.laid(nodes);
         Ok(fields)
     }
 
-    fn laid(&self, nodes: &[(Smoothness, f64)]) -> Vec<Node> {
+    fn laid(&self, nodes: &[(Smoothness, f64)]) -> Vec<FieldHypothesis> {
         let node = |&(smoothness, range_mm): &(Smoothness, f64)| self.node(smoothness, range_mm);
         nodes.par_iter().filter_map(node).collect()
     }
 
-    fn bare(observed: &Observed, kind: Kind) -> Result<Self, ModelError> {
+    fn bare(observed: &Observed, kind: NoiseKind) -> Result<Self, ModelError> {
         observed.check()?;
         let places = observed.places.clone();
         let n = places.len();
         let count = ((WAVES_A_POINT * n as f64) as usize).clamp(FEWEST_WAVES, MOST_WAVES[usize::from(n > MOST_WHOLE)]);
-        let waves = Waves::over(&places, kind.lay, count, if n > MOST_WHOLE { DEGREE } else { 0 });
-        let whitening = whitening(&observed.path, n, kind.drift);
-        let effects = whitened(&whitening, &observed.effects);
-        let factor = super::dense::told_apart(effects.tr_mul(&effects))?;
+        let waves = Basis::over(&places, kind.lay, count, if n > MOST_WHOLE { DEGREE } else { 0 });
+        let whitening = whitening(&observed.path, n, kind.autocorrelation);
+        let effects = whitened(&whitening, &observed.fixed_effects);
+        let factor = super::dense::checked_cholesky(effects.tr_mul(&effects))?;
         let log_whitened =
             whitening.iter().map(|[own, _]| own.ln()).sum::<f64>() - factor.l().diagonal().map(f64::ln).sum();
         let base = if effects.ncols() > 0 { effects.qr().q() } else { effects };
@@ -167,17 +172,17 @@ impl Fields {
         let reduced = Reduced { rows: Mat::new(), pivots: None };
         let mut fields = Self {
             kind,
-            waves,
+            basis: waves,
             places,
             whitening,
             base,
-            free,
+            degrees_of_freedom: free,
             log_whitened,
             reduced,
             taken: Mat::new(),
-            nodes: Vec::new(),
+            hypotheses: Vec::new(),
         };
-        (fields.reduced, fields.taken) = if n <= MOST_WHOLE { fields.whole() } else { fields.told_apart() };
+        (fields.reduced, fields.taken) = if n <= MOST_WHOLE { fields.whole() } else { fields.reduced_by_products() };
         Ok(fields)
     }
 
@@ -192,8 +197,8 @@ impl Fields {
     }
 
     /// The products of the waves over all points, in a factor that ends where nothing more is told apart.
-    fn told_apart(&self) -> (Reduced, Mat<f64>) {
-        let (n, p, count) = (self.places.len(), self.base.ncols(), self.waves.len());
+    fn reduced_by_products(&self) -> (Reduced, Mat<f64>) {
+        let (n, p, count) = (self.places.len(), self.base.ncols(), self.basis.len());
         let of = |first: &usize| {
             let rows = self.rows_of(*first, (first + ROWS).min(n));
             let base = Mat::from_fn(rows.nrows(), p, |r, c| self.base[(first + r, c)]);
@@ -206,15 +211,15 @@ impl Fields {
         let both = |(a, b): (Mat<f64>, Mat<f64>), (c, d): (Mat<f64>, Mat<f64>)| (a + c, b + d);
         let (mut products, taken) = firsts.par_iter().map(of).reduce(zero, both);
         products -= taken.transpose() * &taken;
-        (pivoted(&products), taken)
+        (pivoted_cholesky(&products), taken)
     }
 
     /// W phi of some of the points.
     fn rows_of(&self, first: usize, until: usize) -> Mat<f64> {
         let before = first.saturating_sub(1);
-        let waves = self.waves.at(&self.places[before..until]);
-        let mut rows = Mat::zeros(until - first, self.waves.len());
-        for c in 0..self.waves.len() {
+        let waves = self.basis.at(&self.places[before..until]);
+        let mut rows = Mat::zeros(until - first, self.basis.len());
+        for c in 0..self.basis.len() {
             let (from, into) = (waves.col_as_slice(c), rows.col_as_slice_mut(c));
             for (r, value) in into.iter_mut().enumerate() {
                 let [own, last] = self.whitening[first + r];
@@ -240,7 +245,7 @@ impl Fields {
             rows.transpose() * Mat::from_fn(rows.nrows(), count, |r, c| columns[(first + r, c)])
         };
         let firsts: Vec<usize> = (0..n).step_by(ROWS).collect();
-        let zero = || Mat::zeros(self.waves.len(), count);
+        let zero = || Mat::zeros(self.basis.len(), count);
         let by_waves = firsts.par_iter().map(of).reduce(zero, |a, b| a + b);
         let mut coordinates = Mat::from_fn(pivots.len(), count, |r, c| by_waves[(pivots[r], c)]);
         let factor = Mat::from_fn(pivots.len(), pivots.len(), |r, c| self.reduced.rows[(c, pivots[r])]);
@@ -249,8 +254,8 @@ impl Fields {
     }
 
     /// The eigenproblem of a node; none where it has no field that the fit leaves.
-    fn node(&self, smoothness: Smoothness, range_mm: f64) -> Option<Node> {
-        let (mut strengths, narrow) = self.waves.strengths(smoothness, range_mm);
+    fn node(&self, smoothness: Smoothness, range_mm: f64) -> Option<FieldHypothesis> {
+        let (mut strengths, narrow) = self.basis.standard_deviations(smoothness, range_mm);
         let least = NOTHING * strengths.iter().copied().fold(0.0, f64::max);
         let last = strengths.iter().rposition(|strength| *strength > least);
         strengths.truncate(last.map_or(0, |last| last + 1));
@@ -281,35 +286,39 @@ impl Fields {
             false => found.to_owned(),
         };
         let n = self.places.len() as f64;
-        let whole = values.iter().sum::<f64>() + narrow * self.free;
+        let whole = values.iter().sum::<f64>() + narrow * self.degrees_of_freedom;
         let scale = n / whole;
-        let prior = strengths_prior(&values, narrow, scale, self.free);
-        (whole.is_finite() && whole > 0.0).then_some(Node {
+        let prior = log_prior(&values, narrow, scale, self.degrees_of_freedom);
+        (whole.is_finite() && whole > 0.0).then_some(FieldHypothesis {
             smoothness,
             range_mm,
-            strengths,
-            narrow,
+            standard_deviations: strengths,
+            truncated_variance: narrow,
             scale,
-            values,
-            vectors,
+            eigenvalues: values,
+            eigenvectors: vectors,
             prior,
         })
     }
 
     /// The coefficients of waves that coordinates make by a node: D R'.
-    pub(super) fn by_waves(&self, node: &Node, coordinates: &Mat<f64>) -> Mat<f64> {
-        let c = node.strengths.len();
+    pub(super) fn coefficients_from(&self, node: &FieldHypothesis, coordinates: &Mat<f64>) -> Mat<f64> {
+        let c = node.standard_deviations.len();
         let mut coefficients = self.reduced.rows.subcols(0, c).transpose() * coordinates;
         for k in 0..coefficients.ncols() {
-            coefficients.col_as_slice_mut(k).iter_mut().zip(&node.strengths).for_each(|(value, d)| *value *= d);
+            coefficients
+                .col_as_slice_mut(k)
+                .iter_mut()
+                .zip(&node.standard_deviations)
+                .for_each(|(value, d)| *value *= d);
         }
         coefficients
     }
 
     /// The coordinates that coefficients of waves make by a node: R D.
-    pub(super) fn by_points(&self, node: &Node, coefficients: &Mat<f64>) -> Mat<f64> {
-        let c = node.strengths.len();
-        let strong = Mat::from_fn(c, coefficients.ncols(), |r, k| node.strengths[r] * coefficients[(r, k)]);
+    pub(super) fn coordinates_from(&self, node: &FieldHypothesis, coefficients: &Mat<f64>) -> Mat<f64> {
+        let c = node.standard_deviations.len();
+        let strong = Mat::from_fn(c, coefficients.ncols(), |r, k| node.standard_deviations[r] * coefficients[(r, k)]);
         self.reduced.rows.subcols(0, c) * &strong
     }
 
@@ -324,11 +333,11 @@ impl Fields {
     }
 
     /// The coordinates of a node's coefficients, R D, and behind them what the best fit takes of them, Q'W phi D.
-    pub(super) fn with_effects(&self, node: &Node) -> Mat<f64> {
+    pub(super) fn with_effects(&self, node: &FieldHypothesis) -> Mat<f64> {
         let (r, p) = (self.reduced.rows.nrows(), self.taken.nrows());
-        Mat::from_fn(r + p, node.strengths.len(), |k, wave| {
+        Mat::from_fn(r + p, node.standard_deviations.len(), |k, wave| {
             let of = if k < r { self.reduced.rows[(k, wave)] } else { self.taken[(k - r, wave)] };
-            of * node.strengths[wave]
+            of * node.standard_deviations[wave]
         })
     }
 
@@ -338,10 +347,10 @@ impl Fields {
         let of = |first: &usize| {
             let until = (first + ROWS).min(n);
             let weights = Mat::from_fn(weights.ncols(), until - first, |r, c| weights[(first + c, r)]);
-            weights * self.waves.at(&self.places[*first..until])
+            weights * self.basis.at(&self.places[*first..until])
         };
         let firsts: Vec<usize> = (0..n).step_by(ROWS).collect();
-        let zero = || Mat::zeros(weights.ncols(), self.waves.len());
+        let zero = || Mat::zeros(weights.ncols(), self.basis.len());
         let sums = firsts.par_iter().map(of).reduce(zero, |a, b| a + b);
         DMatrix::from_fn(sums.nrows(), sums.ncols(), |r, c| sums[(r, c)])
     }
@@ -349,14 +358,14 @@ impl Fields {
     /// A field at the points, by the coefficients of its waves.
     pub(super) fn at_points(&self, coefficients: &[f64]) -> Vec<f64> {
         let column = Mat::from_fn(coefficients.len(), 1, |r, _| coefficients[r]);
-        let of = |places: &[[f64; 2]]| (self.waves.at(places) * &column).col_as_slice(0).to_vec();
+        let of = |places: &[[f64; 2]]| (self.basis.at(places) * &column).col_as_slice(0).to_vec();
         self.places.par_chunks(ROWS).flat_map_iter(of).collect()
     }
 }
 
 /// The logarithm of J / (1 + J) of every strength: J^2 is Fisher's information on ln tau with the scatter unknown,
 /// (sum q^2 - (sum q)^2 / (n - p)) / 2 with q = l tau / (1 + l tau). What cannot be told from scatter has none, and it saturates at one wave seen.
-fn strengths_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
+fn log_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
     let of = |tau: f64| {
         let share = |l: f64| l * tau / (1.0 + l * tau);
         let rest = free - values.len() as f64;
@@ -370,7 +379,7 @@ fn strengths_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f6
         let told = (0.5 * (squares - sum * sum / free)).max(0.0).sqrt();
         (told / (1.0 + told)).max(f64::MIN_POSITIVE).ln()
     };
-    strengths().map(of).collect()
+    variance_ratios().map(of).collect()
 }
 
 /// Adds the lower triangle of rows' rows.
@@ -389,7 +398,7 @@ fn lower_product(products: &mut Mat<f64>, rows: &Mat<f64>) {
 }
 
 /// A Cholesky factor with pivots of what has its lower triangle given.
-fn pivoted(products: &Mat<f64>) -> Reduced {
+fn pivoted_cholesky(products: &Mat<f64>) -> Reduced {
     let count = products.nrows();
     let at = |a: usize, b: usize| if a >= b { products[(a, b)] } else { products[(b, a)] };
     let mut left: Vec<f64> = (0..count).map(|k| products[(k, k)]).collect();

@@ -12,13 +12,13 @@
 
 use super::form::Motions;
 use super::normals::Normals;
-use super::{Form, Given, Growing, ModelError, Observed, Predicted};
+use super::{Form, IncrementalPosterior, ModelError, ModelInputs, Observed, Prediction};
 use crate::geometry::{Point, Vector};
 use crate::registration::{Deviation, PointStatus, Registration};
 
 /// What a measurement is to tell.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Purpose {
+pub struct StoppingCriteria {
     /// The largest peak to valley that is accepted; infinite where it is not limited.
     pub pv_mm: f64,
     /// The same without the outermost 0.1 % at either end.
@@ -33,7 +33,7 @@ pub struct Purpose {
 
 /// A measurement that is going on.
 #[derive(Clone, Copy, Debug)]
-pub struct SoFar<'a> {
+pub struct PartialMeasurement<'a> {
     /// All targets, touched or not: points of the nominal surface and their normals, in the model frame.
     pub targets: &'a [(Point, Vector)],
     /// Which of them was tried in which batch; none where it was not.
@@ -44,18 +44,18 @@ pub struct SoFar<'a> {
 
 /// What is known, and what follows.
 #[derive(Clone, Debug)]
-pub struct Look {
+pub struct StoppingDecision {
     /// The form over all targets; without slopes, ISO figures and its budget where touches follow.
     pub form: Form,
     /// The targets to touch next, in the order of a short way; none where enough is known.
     pub next: Vec<usize>,
     /// Why.
-    pub why: Why,
+    pub reason: Reason,
 }
 
 /// Why to touch on, or not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Why {
+pub enum Reason {
     /// The figures are within their limits, as surely as is asked of one look among many.
     Within,
     /// The part has to be corrected, and the form is known well enough for that.
@@ -83,11 +83,11 @@ pub enum Why {
 }
 
 /// Touches that tell whether it is the right part, and where it is.
-pub const FIRST: usize = 10;
+pub const FIRST_BATCH: usize = 10;
 /// Fewer touches decide nothing.
-pub const FEWEST: usize = 40;
+pub const MIN_TOUCHES: usize = 40;
 /// Batches of a measurement, but for a last one of all that is left: who counts them on a wire has few bits for it.
-pub const MOST_BATCHES: u32 = 60;
+pub const MAX_BATCHES: u32 = 60;
 /// Touches of a batch, at least and at most.
 const BATCH: [usize; 2] = [20, 100];
 /// One in so many goes anywhere.
@@ -103,7 +103,7 @@ const BY_CHANCE: f64 = 3.09;
 const GIVEN_UP: (f64, usize) = (1.0 / 6.0, 120);
 
 /// Returns so many targets that lie as far apart as they can: each is the one farthest from those before it.
-pub fn spread(targets: &[(Point, Vector)], most: usize) -> Vec<usize> {
+pub fn farthest_points(targets: &[(Point, Vector)], most: usize) -> Vec<usize> {
     let mut chosen: Vec<usize> = Vec::new();
     let mut apart_mm = vec![f64::INFINITY; targets.len()];
     while chosen.len() < most.min(targets.len()) {
@@ -121,53 +121,53 @@ pub fn spread(targets: &[(Point, Vector)], most: usize) -> Vec<usize> {
 ///
 /// # Errors
 /// Those of [`Form::over`].
-pub fn look(
+pub fn decide(
     registration: &Registration,
-    given: &Given,
-    so_far: &SoFar,
-    purpose: &Purpose,
+    inputs: &ModelInputs,
+    so_far: &PartialMeasurement,
+    purpose: &StoppingCriteria,
     seed: u64,
-) -> Result<Look, ModelError> {
-    let form = Form::told_over(registration, given, so_far.targets, false)?;
-    let mut growing = Expected::of(registration, given, &form, so_far)?;
+) -> Result<StoppingDecision, ModelError> {
+    let form = Form::estimate_with(registration, inputs, so_far.targets, false)?;
+    let mut growing = ExpectedTouches::of(registration, inputs, &form, so_far)?;
     let count = so_far.touched.len();
     let left = so_far.tried.iter().filter(|tried| tried.is_none()).count();
     let around = growing.around(so_far);
     let why = match () {
-        () if left == 0 => Why::All,
-        () if count < FEWEST => Why::Few,
-        () if growing.feature(so_far) => Why::Feature,
-        () if growing.is_surprised() => Why::Surprised,
-        () if !around.is_empty() => Why::Around,
+        () if left == 0 => Reason::All,
+        () if count < MIN_TOUCHES => Reason::Few,
+        () if growing.feature(so_far) => Reason::Feature,
+        () if growing.is_surprised() => Reason::Surprised,
+        () if !around.is_empty() => Reason::Around,
         () => settled(&form, purpose, (count, so_far.targets.len())),
     };
-    let is_over = matches!(why, Why::Within | Why::Known | Why::Enough | Why::Beyond | Why::All);
+    let is_over = matches!(why, Reason::Within | Reason::Known | Reason::Enough | Reason::Beyond | Reason::All);
     let batches = so_far.tried.iter().flatten().max().map_or(0, |last| last + 1);
-    let why = if batches >= MOST_BATCHES && !is_over { Why::Late } else { why };
+    let why = if batches >= MAX_BATCHES && !is_over { Reason::Late } else { why };
     let next = match why {
         _ if is_over => Vec::new(),
-        Why::Feature | Why::Late => (0..so_far.tried.len()).filter(|&k| so_far.tried[k].is_none()).collect(),
+        Reason::Feature | Reason::Late => (0..so_far.tried.len()).filter(|&k| so_far.tried[k].is_none()).collect(),
         _ => {
-            let wanted = if count < FEWEST { FEWEST - count } else { (count / 2).clamp(BATCH[0], BATCH[1]) };
+            let wanted = if count < MIN_TOUCHES { MIN_TOUCHES - count } else { (count / 2).clamp(BATCH[0], BATCH[1]) };
             growing.next(so_far, &around, wanted.max(around.len()).min(left), seed)?
         }
     };
-    let is_all = matches!(why, Why::Feature | Why::Late);
-    let next = if is_all { next } else { short_way(so_far.targets, next) };
+    let is_all = matches!(why, Reason::Feature | Reason::Late);
+    let next = if is_all { next } else { short_tour(so_far.targets, next) };
     // More is said of the last look alone.
-    let form = if next.is_empty() { Form::over(registration, given, so_far.targets)? } else { form };
-    Ok(Look { form, next, why })
+    let form = if next.is_empty() { Form::estimate_at(registration, inputs, so_far.targets)? } else { form };
+    Ok(StoppingDecision { form, next, reason: why })
 }
 
 /// What the figures and the map say.
-fn settled(form: &Form, purpose: &Purpose, (count, pattern): (usize, usize)) -> Why {
+fn settled(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, usize)) -> Reason {
     let figures = [
         (form.figures.pv, purpose.pv_mm),
         (form.figures.pv_most_points, purpose.pv_most_points_mm),
         (form.figures.rms, purpose.rms_mm),
     ];
     if figures.iter().all(|(figure, limit)| figure.most_mm <= *limit) {
-        return Why::Within;
+        return Reason::Within;
     }
     let is_known = form.known_mm <= purpose.correction_mm;
     let is_beyond = figures.iter().any(|(figure, limit)| figure.least_mm > *limit);
@@ -176,49 +176,54 @@ fn settled(form: &Form, purpose: &Purpose, (count, pattern): (usize, usize)) -> 
     // Who judges looks once, and may accept what a look among many may not: then more is touched, not ground.
     let is_accepted = figures.iter().all(|(figure, limit)| figure.accepted_mm <= *limit);
     match () {
-        () if is_beyond && !purpose.may_grind => Why::Beyond,
-        () if is_known && (is_beyond || gives_up && purpose.may_grind && !is_accepted) => Why::Known,
-        () if gives_up && purpose.may_grind && !is_accepted => Why::Enough,
-        () if is_beyond => Why::Unknown,
-        () => Why::Undecided,
+        () if is_beyond && !purpose.may_grind => Reason::Beyond,
+        () if is_known && (is_beyond || gives_up && purpose.may_grind && !is_accepted) => Reason::Known,
+        () if gives_up && purpose.may_grind && !is_accepted => Reason::Enough,
+        () if is_beyond => Reason::Unknown,
+        () => Reason::Undecided,
     }
 }
 
 /// What was expected, held against what was found.
-struct Expected {
-    growing: Growing,
+struct ExpectedTouches {
+    growing: IncrementalPosterior,
     /// By how many standard deviations each touch of the last batch is off, with its target.
     last: Vec<(usize, f64)>,
     outliers: Vec<usize>,
 }
 
-impl Expected {
+impl ExpectedTouches {
     /// Tells the model all that was found before the last batch, looks what it expects of that, and tells it the rest.
-    fn of(registration: &Registration, given: &Given, form: &Form, so_far: &SoFar) -> Result<Self, ModelError> {
-        let SoFar { targets, tried, touched } = so_far;
+    fn of(
+        registration: &Registration,
+        inputs: &ModelInputs,
+        form: &Form,
+        so_far: &PartialMeasurement,
+    ) -> Result<Self, ModelError> {
+        let PartialMeasurement { targets, tried, touched } = so_far;
         let all: Vec<_> = registration.deviations.iter().zip(touched.iter().copied()).collect();
         let used = || all.iter().filter(|(d, _)| d.status == PointStatus::Used && d.in_fit);
         let motions = Motions::of(registration, used().map(|(d, _)| d.point));
-        let stated = motions.stated(registration, given)?;
+        let stated = motions.stated(registration, inputs)?;
         let last = tried.iter().flatten().max().copied().unwrap_or(0);
         let of = |is_last: bool| -> (Observed, Vec<usize>) {
             let chosen: Vec<_> = used().filter(|(_, target)| (tried[*target] == Some(last)) == is_last).collect();
             let rows: Vec<_> = chosen.iter().map(|(d, _)| *d).collect();
             let columns = stated.columns(rows.iter().map(|d| (d.point, d.normal)));
             (
-                Observed { stated: columns, ..motions.observed(&rows) },
+                Observed { random_effects: columns, ..motions.observed(&rows) },
                 chosen.iter().map(|(_, target)| *target).collect(),
             )
         };
         let ((before, _), (found, of_targets)) = (of(false), of(true));
         let places = targets.iter().map(|(point, _)| [point.x, point.y]).collect();
         let (rows, columns) = (motions.rows(targets.iter().copied()), stated.columns(targets.iter().copied()));
-        let mut growing = Growing::beside(places, rows, &columns, form.hyper)?;
-        growing.tell(&before)?;
+        let mut growing = IncrementalPosterior::with_random_effects(places, rows, &columns, form.hyperparameters)?;
+        growing.update(&before)?;
         // Before the motions are held nothing is expected.
-        let is_held = before.places.len() > before.effects.ncols();
-        let off = if is_held { growing.surprise(&found) } else { vec![0.0; found.places.len()] };
-        growing.tell(&found)?;
+        let is_held = before.places.len() > before.fixed_effects.ncols();
+        let off = if is_held { growing.standardized_innovations(&found) } else { vec![0.0; found.places.len()] };
+        growing.update(&found)?;
         let is_far = |d: &Deviation| d.status != PointStatus::OffPart && !d.in_fit;
         let outliers = all.iter().filter(|(d, _)| is_far(d)).map(|(_, target)| *target).collect();
         Ok(Self { growing, last: of_targets.into_iter().zip(off).collect(), outliers })
@@ -239,7 +244,7 @@ impl Expected {
     }
 
     /// Targets around touches that stand out, where few of their neighbours were tried.
-    fn around(&self, so_far: &SoFar) -> Vec<usize> {
+    fn around(&self, so_far: &PartialMeasurement) -> Vec<usize> {
         let mut around = Vec::new();
         for target in self.standing_out() {
             let near = neighbours(so_far.targets, target);
@@ -253,13 +258,19 @@ impl Expected {
     }
 
     /// Whether two neighbours were both taken for outliers: dust is alone.
-    fn feature(&self, so_far: &SoFar) -> bool {
+    fn feature(&self, so_far: &PartialMeasurement) -> bool {
         let is_beside = |&a: &usize| neighbours(so_far.targets, a).iter().any(|k| self.outliers.contains(k));
         self.outliers.iter().any(is_beside)
     }
 
     /// Chooses what to touch next.
-    fn next(&mut self, so_far: &SoFar, around: &[usize], wanted: usize, seed: u64) -> Result<Vec<usize>, ModelError> {
+    fn next(
+        &mut self,
+        so_far: &PartialMeasurement,
+        around: &[usize],
+        wanted: usize,
+        seed: u64,
+    ) -> Result<Vec<usize>, ModelError> {
         let mut open: Vec<bool> = so_far.tried.iter().map(Option::is_none).collect();
         let mut chosen: Vec<usize> = around.iter().copied().filter(|&k| open[k]).collect();
         chosen.iter().for_each(|&k| open[k] = false);
@@ -273,11 +284,11 @@ impl Expected {
             chosen.push(anywhere);
         }
         for &place in &chosen {
-            self.growing.imagine(place)?;
+            self.growing.update_with_expected(place)?;
         }
         while chosen.len() < wanted {
             let Some(best) = self.least_known(&open) else { break };
-            self.growing.imagine(best)?;
+            self.growing.update_with_expected(best)?;
             open[best] = false;
             chosen.push(best);
         }
@@ -286,11 +297,11 @@ impl Expected {
 
     /// The open place of which least is known; what may be the highest or the lowest counts twice.
     fn least_known(&self, open: &[bool]) -> Option<usize> {
-        let known: Vec<Predicted> = self.growing.known().collect();
+        let known: Vec<Prediction> = self.growing.predictions().collect();
         let surely =
             |sign: f64| known.iter().map(|p| sign * p.mean_mm - 2.0 * p.sigma_mm).fold(f64::NEG_INFINITY, f64::max);
         let [highest, lowest] = [surely(1.0), surely(-1.0)];
-        let weight = |p: &Predicted| {
+        let weight = |p: &Prediction| {
             let may_be = p.mean_mm + 2.0 * p.sigma_mm > highest || 2.0 * p.sigma_mm - p.mean_mm > lowest;
             if may_be { 2.0 } else { 1.0 }
         };
@@ -314,7 +325,7 @@ fn neighbours(targets: &[(Point, Vector)], of: usize) -> Vec<usize> {
 }
 
 /// Puts targets in the order of a short way: always to the nearest, and crossings taken out (2-opt).
-pub fn short_way(targets: &[(Point, Vector)], chosen: Vec<usize>) -> Vec<usize> {
+pub fn short_tour(targets: &[(Point, Vector)], chosen: Vec<usize>) -> Vec<usize> {
     let apart = |a: usize, b: usize| (targets[a].0 - targets[b].0).norm();
     let mut open = chosen;
     let Some(first) = (0..open.len()).min_by(|&a, &b| targets[open[a]].0.x.total_cmp(&targets[open[b]].0.x)) else {

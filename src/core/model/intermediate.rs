@@ -4,8 +4,8 @@
 
 use nalgebra::DMatrix;
 
+use super::basis::{Basis, BasisGrid};
 use super::spacing_mm;
-use super::waves::{Grid, Waves};
 use crate::geometry::{Nearest, Point};
 
 /// Places at most, and at least so many along the distance of two points.
@@ -17,8 +17,8 @@ const MOST_DEGREE: usize = 9;
 const FARTHEST: f64 = 2.5;
 
 /// Nodes of a grid, each between touched places.
-pub(super) struct Between {
-    pub(super) grid: Grid,
+pub(super) struct IntermediateNodes {
+    pub(super) grid: BasisGrid,
     /// The number of each on the grid, column by column.
     pub(super) nodes: Vec<usize>,
     /// Touched places beside each, and how much it has of each.
@@ -27,10 +27,10 @@ pub(super) struct Between {
     terms: [DMatrix<f64>; 2],
 }
 
-impl Between {
+impl IntermediateNodes {
     /// Lays a grid along the axes of some waves; none where it would hold no place.
-    pub(super) fn of(places: &[[f64; 2]], waves: &Waves) -> Option<Self> {
-        let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.turned(place)).collect();
+    pub(super) fn of(places: &[[f64; 2]], waves: &Basis) -> Option<Self> {
+        let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.rotated(place)).collect();
         let distance_mm = spacing_mm(&places);
         let spans = [0, 1].map(|axis| {
             let of = places.iter().map(|place| place[axis]);
@@ -44,7 +44,7 @@ impl Between {
         let counts = spans.map(|[low, high]| ((high - low) / spacing_mm) as usize + 1);
         let corner_mm =
             [0, 1].map(|axis: usize| 0.5 * (spans[axis][0] + spans[axis][1] - spacing_mm * (counts[axis] - 1) as f64));
-        let grid = Grid { corner_mm, spacing_mm, counts };
+        let grid = BasisGrid { corner_mm, spacing_mm, counts };
         let at = |node: &usize| {
             let [i, j] = [node % counts[0], node / counts[0]];
             [(i, 0), (j, 1)].map(|(k, axis): (usize, usize)| corner_mm[axis] + spacing_mm * k as f64)
@@ -118,11 +118,11 @@ fn polynomials(places: &[[f64; 2]], spans: [[f64; 2]; 2], degree: usize) -> DMat
 
 #[cfg(test)]
 mod tests {
-    use super::super::Lay;
+    use super::super::Anisotropy;
     use super::*;
 
-    fn over(places: &[[f64; 2]]) -> Option<Between> {
-        Between::of(places, &Waves::over(places, Lay::NONE, 100, 0))
+    fn over(places: &[[f64; 2]]) -> Option<IntermediateNodes> {
+        IntermediateNodes::of(places, &Basis::over(places, Anisotropy::NONE, 100, 0))
     }
 
     #[test]

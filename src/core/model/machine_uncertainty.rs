@@ -12,7 +12,7 @@ use crate::geometry::{Point, Vector};
 ///
 /// Frame: the axes are those of the machine {W}.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Machine {
+pub struct MachineUncertainty {
     /// Of the length of each axis, as a share of it.
     pub scale: [f64; 3],
     /// Of the angles xy, xz and yz between the axes beside a right one.
@@ -26,7 +26,7 @@ pub struct Machine {
 /// What a part of an uncertainty comes from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Source {
+pub enum UncertaintySource {
     /// Each touch by itself.
     Scatter,
     /// The form between the touches, and below their scatter.
@@ -47,7 +47,7 @@ pub enum Source {
     Datum,
 }
 
-impl Source {
+impl UncertaintySource {
     /// All of them, as they are told.
     pub const ALL: [Self; 9] = [
         Self::Scatter,
@@ -64,8 +64,8 @@ impl Source {
 
 /// What is stated of all points together, as far as it is above 0.
 #[derive(Clone, Debug)]
-pub(super) struct Effects {
-    machine: Machine,
+pub(super) struct MachineEffects {
+    machine: MachineUncertainty,
     radius_mm: f64,
     temperature: f64,
     datum: [f64; 6],
@@ -73,10 +73,10 @@ pub(super) struct Effects {
     model_from_machine: Matrix3<f64>,
 }
 
-impl Effects {
+impl MachineEffects {
     /// `radius_mm` is the standard uncertainty of the radius of the probe as it was found, `temperature` that of all lengths as a share of them.
     pub(super) fn new(
-        machine: Machine,
+        machine: MachineUncertainty,
         [radius_mm, temperature]: [f64; 2],
         centre: Point,
         model_from_machine: Matrix3<f64>,
@@ -91,7 +91,7 @@ impl Effects {
     }
 
     /// Which columns there are.
-    pub(super) fn sources(&self) -> Vec<Source> {
+    pub(super) fn sources(&self) -> Vec<UncertaintySource> {
         self.all().into_iter().map(|(source, _)| source).collect()
     }
 
@@ -104,18 +104,21 @@ impl Effects {
         DMatrix::from_fn(placed.len(), all.len(), |r, c| all[c].1.on(placed[r].0, placed[r].1))
     }
 
-    fn all(&self) -> Vec<(Source, Effect)> {
-        let Machine { scale, squareness_rad, probe_mm, .. } = self.machine;
-        let scales = scale.into_iter().enumerate().map(|(k, share)| (Source::Scales, Effect::Stretch([k, k], share)));
+    fn all(&self) -> Vec<(UncertaintySource, Effect)> {
+        let MachineUncertainty { scale, squareness_rad, probe_mm, .. } = self.machine;
+        let scales =
+            scale.into_iter().enumerate().map(|(k, share)| (UncertaintySource::Scales, Effect::Stretch([k, k], share)));
         let angles = [[0, 1], [0, 2], [1, 2]].into_iter().zip(squareness_rad);
-        let angles = angles.map(|(axes, angle)| (Source::Squareness, Effect::Stretch(axes, angle)));
-        let probe = (0..5).map(|k| (Source::Probe, Effect::Direction(k, probe_mm)));
-        let alike =
-            [(Source::Radius, Effect::Radius(self.radius_mm)), (Source::Temperature, Effect::Size(self.temperature))];
+        let angles = angles.map(|(axes, angle)| (UncertaintySource::Squareness, Effect::Stretch(axes, angle)));
+        let probe = (0..5).map(|k| (UncertaintySource::Probe, Effect::Direction(k, probe_mm)));
+        let alike = [
+            (UncertaintySource::Radius, Effect::Radius(self.radius_mm)),
+            (UncertaintySource::Temperature, Effect::Size(self.temperature)),
+        ];
         let axis = |k: usize| self.model_from_machine.row(k % 3).transpose();
         let held = self.datum.into_iter().enumerate().map(|(k, size)| {
             let effect = if k < 3 { Effect::Shift(axis(k), size) } else { Effect::Turn(axis(k), size) };
-            (Source::Datum, effect)
+            (UncertaintySource::Datum, effect)
         });
         let machine = scales.chain(angles).chain(probe);
         alike.into_iter().chain(machine).chain(held).filter(|(_, effect)| effect.size() > 0.0).collect()
@@ -173,7 +176,7 @@ impl Effect {
 
 /// Says what no standard uncertainty can be: what is negative, none, or beyond all sense.
 pub(super) fn unsound(
-    machine: &Machine,
+    machine: &MachineUncertainty,
     [radius_mm, temperature]: [f64; 2],
     datum: &[f64; 6],
 ) -> Option<(&'static str, f64)> {
@@ -199,13 +202,13 @@ pub(super) fn unsound(
 mod tests {
     use super::*;
 
-    fn effects(machine: Machine, of_others: [f64; 2]) -> Effects {
-        Effects::new(machine, of_others, Point::new(1.0, 2.0, 3.0), Matrix3::identity())
+    fn effects(machine: MachineUncertainty, of_others: [f64; 2]) -> MachineEffects {
+        MachineEffects::new(machine, of_others, Point::new(1.0, 2.0, 3.0), Matrix3::identity())
     }
 
     #[test]
     fn of_one_point_they_are_what_is_worked_out_by_hand() {
-        let machine = Machine {
+        let machine = MachineUncertainty {
             scale: [1e-6, 0.0, 3e-6],
             squareness_rad: [4e-6, 5e-6, 6e-6],
             probe_mm: 2e-4,
@@ -231,12 +234,20 @@ mod tests {
         ];
         assert_eq!(row.ncols(), by_hand.len());
         assert!(row.iter().zip(by_hand).all(|(found, hand)| (found - hand).abs() < 1e-15), "{row}");
-        assert_eq!(of.sources()[..4], [Source::Radius, Source::Temperature, Source::Scales, Source::Scales]);
+        assert_eq!(
+            of.sources()[..4],
+            [
+                UncertaintySource::Radius,
+                UncertaintySource::Temperature,
+                UncertaintySource::Scales,
+                UncertaintySource::Scales
+            ]
+        );
     }
 
     #[test]
     fn the_error_by_direction_has_the_same_variance_in_every_direction() {
-        let of = effects(Machine { probe_mm: 3e-4, ..Machine::default() }, [0.0; 2]);
+        let of = effects(MachineUncertainty { probe_mm: 3e-4, ..MachineUncertainty::default() }, [0.0; 2]);
         for k in 0..50_u32 {
             let (turn, rise) = (0.7 * f64::from(k), -0.98 + 0.04 * f64::from(k));
             let flat = (1.0 - rise * rise).sqrt();
@@ -250,8 +261,8 @@ mod tests {
     fn the_axes_are_those_of_the_machine() {
         // Its x axis is the model's y.
         let turned = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
-        let machine = Machine { scale: [1e-6, 0.0, 0.0], ..Machine::default() };
-        let of = Effects::new(machine, [0.0; 2], Point::origin(), turned);
+        let machine = MachineUncertainty { scale: [1e-6, 0.0, 0.0], ..MachineUncertainty::default() };
+        let of = MachineEffects::new(machine, [0.0; 2], Point::origin(), turned);
         let on = |normal| of.columns(std::iter::once((Point::new(10.0, 20.0, 0.0), normal)))[0];
         assert!((on(Vector::y()) - 2e-5).abs() < 1e-18 && on(Vector::x()).abs() < 1e-18);
     }
@@ -261,17 +272,18 @@ mod tests {
         // The machine's x axis is the model's y, its y axis the model's -x.
         let turned = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
         let centre = Point::new(1.0, 2.0, 3.0);
-        let of = Effects::new(Machine::default(), [0.0; 2], centre, turned).held([2e-3, 0.0, 0.0, 0.0, 3e-5, 4e-5]);
+        let of = MachineEffects::new(MachineUncertainty::default(), [0.0; 2], centre, turned)
+            .held([2e-3, 0.0, 0.0, 0.0, 3e-5, 4e-5]);
         let row = of.columns(std::iter::once((Point::new(11.0, 22.0, 33.0), Vector::new(0.6, 0.0, 0.8))));
         // e_y x (10, 20, 30) = (30, 0, -10), e_z x (10, 20, 30) = (-20, 10, 0).
         let by_hand = [2e-3 * 0.6, 3e-5 * (30.0 * 0.6 - 10.0 * 0.8), 4e-5 * (-20.0 * 0.6)];
-        assert_eq!(of.sources(), [Source::Datum; 3]);
+        assert_eq!(of.sources(), [UncertaintySource::Datum; 3]);
         assert!(row.iter().zip(by_hand).all(|(found, hand)| (found - hand).abs() < 1e-15), "{row}");
     }
 
     #[test]
     fn where_nothing_is_stated_there_is_no_column() {
-        let none = effects(Machine::default(), [0.0; 2]);
+        let none = effects(MachineUncertainty::default(), [0.0; 2]);
         assert!(none.sources().is_empty());
         assert_eq!(none.columns(std::iter::once((Point::origin(), Vector::z()))).shape(), (1, 0));
     }

@@ -7,9 +7,9 @@
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
-use super::fields::{Kind, size_mm};
-use super::hill::climb;
-use super::{Dense, Field, Hyper, Lay, Observed, Priors, spacing_mm};
+use super::hypotheses::{NoiseKind, size_mm};
+use super::nelder_mead::maximize;
+use super::{Anisotropy, DensePosterior, Field, Hyperparameters, Observed, Prior, spacing_mm};
 
 /// Blocks of so many neighbours at most, and so many blocks at most.
 const POINTS_A_BLOCK: usize = 48;
@@ -38,23 +38,26 @@ const STRONGER: f64 = 2.0;
 type Top = ([f64; 2], f64);
 
 /// Tells the kinds of field that the points may speak for: one without a drift, and one with a drift where neighbours speak for it.
-pub(super) fn kinds(observed: &Observed) -> (Kind, Option<Kind>) {
-    let blocks = Blocks::of(observed);
-    let plain = blocks.top(Kind::PLAIN, None);
-    let with_lay = |kind: Kind, top: Top| Kind { lay: blocks.lay(kind, top).unwrap_or(Lay::NONE), ..kind };
-    let drifting = if observed.path.is_empty() { None } else { blocks.drift(plain) };
-    (with_lay(Kind::PLAIN, plain), drifting.map(|(kind, top)| with_lay(kind, top)))
+pub(super) fn candidates(observed: &Observed) -> (NoiseKind, Option<NoiseKind>) {
+    let blocks = CompositeLikelihood::of(observed);
+    let plain = blocks.maximum(NoiseKind::PLAIN, None);
+    let with_lay = |kind: NoiseKind, top: Top| NoiseKind {
+        lay: blocks.most_likely_anisotropy(kind, top).unwrap_or(Anisotropy::NONE),
+        ..kind
+    };
+    let drifting = if observed.path.is_empty() { None } else { blocks.most_likely_autocorrelation(plain) };
+    (with_lay(NoiseKind::PLAIN, plain), drifting.map(|(kind, top)| with_lay(kind, top)))
 }
 
-struct Blocks {
+struct CompositeLikelihood {
     all: Vec<Observed>,
     distance_mm: f64,
     /// What every part of this size is like, and the root mean square of what was measured.
-    priors: Priors,
+    priors: Prior,
     rms_mm: f64,
 }
 
-impl Blocks {
+impl CompositeLikelihood {
     fn of(observed: &Observed) -> Self {
         let mut whole: Vec<Vec<usize>> = vec![(0..observed.places.len()).collect()];
         let mut done = Vec::new();
@@ -77,24 +80,24 @@ impl Blocks {
         let all = std::iter::once(spread(observed)).chain(blocks).collect();
         let squares: f64 = observed.deviations_mm.iter().map(|d| d * d).sum();
         let n = observed.places.len() as f64;
-        let priors = Priors::of_size(size_mm(&observed.places));
+        let priors = Prior::for_size(size_mm(&observed.places));
         Self { all, distance_mm: spacing_mm(&observed.places), priors, rms_mm: (squares / n).sqrt() }
     }
 
     /// The likelihood by a kind of field, its scale the best.
-    fn height(&self, kind: Kind, [range, ratio]: [f64; 2]) -> f64 {
+    fn log_likelihood(&self, kind: NoiseKind, [range, ratio]: [f64; 2]) -> f64 {
         if range < (LEAST_RANGE * self.distance_mm).ln() {
             return f64::NEG_INFINITY;
         }
         let field = Field { lay: kind.lay, ..Field::new(1.0, range.exp()) };
-        let unit = Hyper { field, scatter_mm: ratio.exp(), drift: kind.drift };
+        let unit = Hyperparameters { field, noise_sigma_mm: ratio.exp(), noise_autocorrelation: kind.autocorrelation };
         let fit = |block: &Observed| {
             // What tells nothing of its plane, such as points on a line, tells nothing here.
-            let model = Dense::fit(block, unit).ok()?;
+            let model = DensePosterior::fit(block, unit).ok()?;
             Some([
                 model.log_likelihood(),
                 model.whitened_squares(block),
-                (block.places.len() - block.effects.ncols()) as f64,
+                (block.places.len() - block.fixed_effects.ncols()) as f64,
             ])
         };
         let told: Vec<[f64; 3]> = self.all.par_iter().filter_map(fit).collect();
@@ -109,21 +112,21 @@ impl Blocks {
         known + likelihood + 0.5 * squares - 0.5 * free - free * sigma_mm.ln()
     }
 
-    fn top(&self, kind: Kind, near: Option<Top>) -> Top {
+    fn maximum(&self, kind: NoiseKind, near: Option<Top>) -> Top {
         let start = near.unwrap_or_else(|| {
             let starts =
                 RANGES.iter().flat_map(|range| RATIOS.map(|ratio| [(range * self.distance_mm).ln(), ratio.ln()]));
-            starts.map(|place| (place, self.height(kind, place))).fold(([0.0; 2], f64::NEG_INFINITY), higher)
+            starts.map(|place| (place, self.log_likelihood(kind, place))).fold(([0.0; 2], f64::NEG_INFINITY), higher)
         });
-        climb(start.0, [0.3, 0.6], 0.05, |place| self.height(kind, place))
+        maximize(start.0, [0.3, 0.6], 0.05, |place| self.log_likelihood(kind, place))
     }
 
     /// The drift that is spoken for most, where it is by enough more than none.
-    fn drift(&self, plain: Top) -> Option<(Kind, Top)> {
-        let of = |drift: f64| Kind { drift, ..Kind::PLAIN };
+    fn most_likely_autocorrelation(&self, plain: Top) -> Option<(NoiseKind, Top)> {
+        let of = |drift: f64| NoiseKind { autocorrelation: drift, ..NoiseKind::PLAIN };
         let mut best = (0.0, plain);
         for drift in DRIFTS {
-            let top = self.top(of(drift), None);
+            let top = self.maximum(of(drift), None);
             if top.1 > best.1.1 {
                 best = (drift, top);
             }
@@ -133,7 +136,7 @@ impl Blocks {
         }
         for step in DRIFT_STEPS {
             for drift in [best.0 - step, best.0 + step].map(|drift| drift.clamp(0.0, MOST_DRIFT)) {
-                let top = self.top(of(drift), Some(best.1));
+                let top = self.maximum(of(drift), Some(best.1));
                 if top.1 > best.1.1 {
                     best = (drift, top);
                 }
@@ -143,17 +146,17 @@ impl Blocks {
     }
 
     /// The lay of the field, where it is spoken for by enough more than none.
-    fn lay(&self, kind: Kind, without: Top) -> Option<Lay> {
+    fn most_likely_anisotropy(&self, kind: NoiseKind, without: Top) -> Option<Anisotropy> {
         // A lay turns, and none has none: twice its angle and the logarithm of its stretch are the polar coordinates of a plane.
-        let of = |[a, b]: [f64; 2]| Lay::at(0.5 * b.atan2(a), a.hypot(b).exp().min(MOST_STRETCHED));
-        let height = |place: [f64; 2]| self.height(Kind { lay: of(place), ..kind }, without.0);
+        let of = |[a, b]: [f64; 2]| Anisotropy::at(0.5 * b.atan2(a), a.hypot(b).exp().min(MOST_STRETCHED));
+        let height = |place: [f64; 2]| self.log_likelihood(NoiseKind { lay: of(place), ..kind }, without.0);
         let starts =
             [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]].map(|along: [f64; 2]| along.map(|v| v * FIRST_STRETCH));
         let start = starts.map(|start| (start, height(start))).into_iter().fold(([0.0; 2], without.1), higher);
         if start.0 == [0.0; 2] {
             return None;
         }
-        let (place, top) = climb(start.0, [0.3, 0.3], 0.05, height);
+        let (place, top) = maximize(start.0, [0.3, 0.3], 0.05, height);
         (top > without.1 + LAY_EVIDENCE).then(|| of(place))
     }
 }
@@ -170,16 +173,16 @@ fn spread(observed: &Observed) -> Observed {
     let mut chosen: Vec<usize> = if n <= SPREAD { (0..n).collect() } else { (0..SPREAD).map(golden).collect() };
     chosen.sort_unstable();
     chosen.dedup();
-    Observed { stated: DMatrix::zeros(chosen.len(), 0), ..observed.only(&chosen) }
+    Observed { random_effects: DMatrix::zeros(chosen.len(), 0), ..observed.subset(&chosen) }
 }
 
 fn with_plane(observed: &Observed, block: &[usize]) -> Observed {
-    let some = observed.only(block);
+    let some = observed.subset(block);
     let middle = [0, 1].map(|axis| some.places.iter().map(|place| place[axis]).sum::<f64>() / block.len() as f64);
     let effects = DMatrix::from_fn(block.len(), 3, |r, c| match c {
         0 => 1.0,
         c => some.places[r][c - 1] - middle[c - 1],
     });
     // What is stated is wide: beside neighbours it is a plane.
-    Observed { effects, stated: DMatrix::zeros(block.len(), 0), ..some }
+    Observed { fixed_effects: effects, random_effects: DMatrix::zeros(block.len(), 0), ..some }
 }

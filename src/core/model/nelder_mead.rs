@@ -3,7 +3,12 @@
 /// Climbs to the highest place of two dimensions by a simplex (Nelder and Mead 1965).
 ///
 /// It begins with a simplex of some steps, and ends with one that is smaller than `near`.
-pub(super) fn climb(start: [f64; 2], steps: [f64; 2], near: f64, height: impl Fn([f64; 2]) -> f64) -> ([f64; 2], f64) {
+pub(super) fn maximize(
+    start: [f64; 2],
+    steps: [f64; 2],
+    near: f64,
+    height: impl Fn([f64; 2]) -> f64,
+) -> ([f64; 2], f64) {
     const TURNS: usize = 120;
     let seen = |place: [f64; 2]| (place, height(place));
     let mut corners = [seen(start), seen([start[0] + steps[0], start[1]]), seen([start[0], start[1] + steps[1]])];
@@ -45,7 +50,7 @@ mod tests {
     #[test]
     fn a_hill_is_climbed() {
         let hill = |[x, y]: [f64; 2]| -(x - 1.0).powi(2) - 30.0 * (y + 2.0 - 0.3 * x).powi(2);
-        let (top, height) = climb([-3.0, 4.0], [0.7, 0.9], 1e-4, hill);
+        let (top, height) = maximize([-3.0, 4.0], [0.7, 0.9], 1e-4, hill);
         assert!((top[0] - 1.0).abs() < 1e-3 && (top[1] + 1.7).abs() < 1e-3 && height > -1e-6, "{top:?}");
     }
 }

@@ -13,7 +13,7 @@
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
-use super::{Hyper, ModelError, Observed, Predicted};
+use super::{Hyperparameters, ModelError, Observed, Prediction};
 
 /// Standard deviation of an effect that nobody knows, in units of the field: more would drown the field in rounding.
 const VAGUE: f64 = 1e3;
@@ -22,8 +22,8 @@ const BLOCK: usize = 256;
 
 /// A model that takes points in, and knows at every place of a set what it says there.
 #[derive(Clone)]
-pub struct Growing {
-    hyper: Hyper,
+pub struct IncrementalPosterior {
+    hyperparameters: Hyperparameters,
     places: Vec<[f64; 2]>,
     effects: DMatrix<f64>,
     /// Where points were told, what effects move them by, and L row by row.
@@ -36,11 +36,11 @@ pub struct Growing {
 }
 
 /// Effects that nobody knows, and beside them those that are stated: all have the same variance, so that these are as much smaller.
-fn joined(effects: &DMatrix<f64>, stated: &DMatrix<f64>, hyper: &Hyper) -> DMatrix<f64> {
+fn scaled_effects(effects: &DMatrix<f64>, stated: &DMatrix<f64>, hyperparameters: &Hyperparameters) -> DMatrix<f64> {
     if stated.ncols() == 0 {
         return effects.clone();
     }
-    let (p, smaller) = (effects.ncols(), 1.0 / (VAGUE * hyper.field.sigma_mm));
+    let (p, smaller) = (effects.ncols(), 1.0 / (VAGUE * hyperparameters.field.sigma_mm));
     // Rows that do not belong together are told of by who takes them.
     let rows = if stated.nrows() == effects.nrows() { effects.nrows() } else { 0 };
     DMatrix::from_fn(
@@ -60,27 +60,31 @@ struct Block {
     across: Vec<Vec<f64>>,
 }
 
-impl Growing {
+impl IncrementalPosterior {
     /// Asks for some places before anything is told of them.
     ///
     /// `effects` has a row a place: what a unit of each effect adds there.
     ///
     /// # Errors
     /// Rows that do not belong together, numbers that are none, parameters that are not above 0.
-    pub fn over(places: Vec<[f64; 2]>, effects: DMatrix<f64>, hyper: Hyper) -> Result<Self, ModelError> {
+    pub fn over(
+        places: Vec<[f64; 2]>,
+        effects: DMatrix<f64>,
+        hyperparameters: Hyperparameters,
+    ) -> Result<Self, ModelError> {
         let stated = DMatrix::zeros(places.len(), 0);
-        Self::beside(places, effects, &stated, hyper)
+        Self::with_random_effects(places, effects, &stated, hyperparameters)
     }
 
     /// The same with effects that are stated, of variance 1.
-    pub(super) fn beside(
+    pub(super) fn with_random_effects(
         places: Vec<[f64; 2]>,
         effects: DMatrix<f64>,
         stated: &DMatrix<f64>,
-        hyper: Hyper,
+        hyperparameters: Hyperparameters,
     ) -> Result<Self, ModelError> {
-        hyper.check()?;
-        let effects = joined(&effects, stated, &hyper);
+        hyperparameters.check()?;
+        let effects = scaled_effects(&effects, stated, &hyperparameters);
         if effects.nrows() != places.len() {
             return Err(ModelError::Shape { points: places.len(), deviations: places.len(), rows: effects.nrows() });
         }
@@ -89,7 +93,7 @@ impl Growing {
             return Err(ModelError::NotFinite { point });
         }
         let mut growing = Self {
-            hyper,
+            hyperparameters,
             blocks: Vec::new(),
             told: Vec::new(),
             moved: Vec::new(),
@@ -116,9 +120,9 @@ impl Growing {
     ///
     /// # Errors
     /// Rows that do not belong together, and numbers that are none; nothing is taken in then.
-    pub fn tell(&mut self, observed: &Observed) -> Result<(), ModelError> {
+    pub fn update(&mut self, observed: &Observed) -> Result<(), ModelError> {
         let Observed { places, deviations_mm, .. } = observed;
-        let effects = joined(&observed.effects, &observed.stated, &self.hyper);
+        let effects = scaled_effects(&observed.fixed_effects, &observed.random_effects, &self.hyperparameters);
         let (points, columns) = (places.len(), self.effects.ncols());
         if deviations_mm.len() != points || effects.shape() != (points, columns) {
             return Err(ModelError::Shape { points, deviations: deviations_mm.len(), rows: effects.nrows() });
@@ -142,7 +146,7 @@ impl Growing {
     ///
     /// # Errors
     /// Parameters by which nothing can be told apart.
-    pub fn imagine(&mut self, place: usize) -> Result<(), ModelError> {
+    pub fn update_with_expected(&mut self, place: usize) -> Result<(), ModelError> {
         let known = self.told.len();
         let row = self.row(place);
         let expected = self.expected(self.places[place], &row);
@@ -152,9 +156,9 @@ impl Growing {
     }
 
     /// Returns what is known at each place, the effects in it.
-    pub fn known(&self) -> impl Iterator<Item = Predicted> + '_ {
+    pub fn predictions(&self) -> impl Iterator<Item = Prediction> + '_ {
         let of =
-            |(mean_mm, variance): (&f64, &f64)| Predicted { mean_mm: *mean_mm, sigma_mm: variance.max(0.0).sqrt() };
+            |(mean_mm, variance): (&f64, &f64)| Prediction { mean_mm: *mean_mm, sigma_mm: variance.max(0.0).sqrt() };
         self.blocks.iter().flat_map(move |block| block.mean_mm.iter().zip(&block.variance_mm2).map(of))
     }
 
@@ -164,16 +168,16 @@ impl Growing {
     }
 
     /// Says by how many standard deviations of what was expected each of some points is off, the scatter of the probe among them.
-    pub fn surprise(&self, observed: &Observed) -> Vec<f64> {
+    pub fn standardized_innovations(&self, observed: &Observed) -> Vec<f64> {
         let Observed { places, deviations_mm, .. } = observed;
-        let effects = joined(&observed.effects, &observed.stated, &self.hyper);
+        let effects = scaled_effects(&observed.fixed_effects, &observed.random_effects, &self.hyperparameters);
         let of = |k: usize| {
             let row: Vec<f64> = effects.row(k).iter().copied().collect();
             let l = self.solved(places[k], &row);
             let mean: f64 = l.iter().zip(&self.whitened).map(|(l, w)| l * w).sum();
             let own = self.covariance_mm2((places[k], &row), (places[k], &row));
-            let variance = own + self.hyper.scatter_mm.powi(2) - l.iter().map(|l| l * l).sum::<f64>();
-            (deviations_mm[k] - mean) / variance.max(self.hyper.scatter_mm.powi(2)).sqrt()
+            let variance = own + self.hyperparameters.noise_sigma_mm.powi(2) - l.iter().map(|l| l * l).sum::<f64>();
+            (deviations_mm[k] - mean) / variance.max(self.hyperparameters.noise_sigma_mm.powi(2)).sqrt()
         };
         (0..places.len()).into_par_iter().map(of).collect()
     }
@@ -184,14 +188,15 @@ impl Growing {
 
     fn covariance_mm2(&self, (a, moved_a): ([f64; 2], &[f64]), (b, moved_b): ([f64; 2], &[f64])) -> f64 {
         let effects: f64 = moved_a.iter().zip(moved_b).map(|(a, b)| a * b).sum();
-        self.hyper.field.covariance_mm2(a, b) + (VAGUE * self.hyper.field.sigma_mm).powi(2) * effects
+        self.hyperparameters.field.covariance_mm2(a, b)
+            + (VAGUE * self.hyperparameters.field.sigma_mm).powi(2) * effects
     }
 
     /// L^-1 of the covariances of a place with all points.
     fn solved(&self, place: [f64; 2], row: &[f64]) -> Vec<f64> {
         let mut l: Vec<f64> = Vec::with_capacity(self.told.len());
-        let pairs = self.hyper.field.pairs();
-        let vague = (VAGUE * self.hyper.field.sigma_mm).powi(2);
+        let pairs = self.hyperparameters.field.pairs();
+        let vague = (VAGUE * self.hyperparameters.field.sigma_mm).powi(2);
         for (k, lower) in self.lower.iter().enumerate() {
             let by_effects: f64 = row.iter().zip(&self.moved[k]).map(|(a, b)| a * b).sum();
             let covariance = pairs.covariance_mm2(place, self.told[k]) + vague * by_effects;
@@ -208,10 +213,10 @@ impl Growing {
     /// Adds a row to the factor.
     fn border(&mut self, place: [f64; 2], row: Vec<f64>, deviation_mm: f64) -> Result<(), ModelError> {
         let mut l = self.solved(place, &row);
-        let own = self.covariance_mm2((place, &row), (place, &row)) + self.hyper.scatter_mm.powi(2);
+        let own = self.covariance_mm2((place, &row), (place, &row)) + self.hyperparameters.noise_sigma_mm.powi(2);
         let left = own - l.iter().map(|l| l * l).sum::<f64>();
         // Less than the scatter itself is rounding.
-        let d = left.max(self.hyper.scatter_mm.powi(2)).sqrt();
+        let d = left.max(self.hyperparameters.noise_sigma_mm.powi(2)).sqrt();
         if !(d.is_finite() && d > 0.0) {
             return Err(ModelError::NotDefinite);
         }
@@ -226,9 +231,9 @@ impl Growing {
 
     /// Carries the points from one on to all places.
     fn carry(&mut self, from: usize) {
-        let Self { hyper, places, effects, told, moved, lower, whitened, blocks } = self;
-        let vague = (VAGUE * hyper.field.sigma_mm).powi(2);
-        let pairs = hyper.field.pairs();
+        let Self { hyperparameters, places, effects, told, moved, lower, whitened, blocks } = self;
+        let vague = (VAGUE * hyperparameters.field.sigma_mm).powi(2);
+        let pairs = hyperparameters.field.pairs();
         blocks.par_iter_mut().for_each(|block| {
             for k in from..told.len() {
                 let mut row: Vec<f64> = (block.first..block.first + block.mean_mm.len())
@@ -254,17 +259,18 @@ impl Growing {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Dense, Field};
+    use super::super::{DensePosterior, Field};
     use super::*;
 
-    const HYPER: Hyper = Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift: 0.0 };
+    const HYPER: Hyperparameters =
+        Hyperparameters { field: Field::new(5e-3, 30.0), noise_sigma_mm: 3e-4, noise_autocorrelation: 0.0 };
 
     fn observed(count: u32, effects: usize) -> Observed {
         let places: Vec<[f64; 2]> = (0..count).map(f64::from).map(|k| [(7.31 * k) % 60.0, (13.7 * k) % 40.0]).collect();
         let deviations_mm = places.iter().map(|[x, y]| 5e-3 * ((0.1 * x).sin() + 0.5 * (0.13 * y).cos())).collect();
         let effects =
             DMatrix::from_fn(places.len(), effects, |r, c| [1.0, places[r][0] / 30.0, places[r][1] / 30.0][c]);
-        Observed { effects, ..Observed::without_effects(places, deviations_mm) }
+        Observed { fixed_effects: effects, ..Observed::without_effects(places, deviations_mm) }
     }
 
     fn asked(effects: usize) -> (Vec<[f64; 2]>, DMatrix<f64>) {
@@ -273,13 +279,13 @@ mod tests {
         (places, rows)
     }
 
-    fn grown(observed: &Observed, batches: &[usize]) -> Growing {
-        let (places, effects) = asked(observed.effects.ncols());
-        let mut growing = Growing::over(places, effects, HYPER).unwrap();
+    fn grown(observed: &Observed, batches: &[usize]) -> IncrementalPosterior {
+        let (places, effects) = asked(observed.fixed_effects.ncols());
+        let mut growing = IncrementalPosterior::over(places, effects, HYPER).unwrap();
         let mut first = 0;
         for count in batches {
             let chosen: Vec<usize> = (first..first + count).collect();
-            growing.tell(&observed.only(&chosen)).unwrap();
+            growing.update(&observed.subset(&chosen)).unwrap();
             first += count;
         }
         assert_eq!(first, observed.places.len());
@@ -290,8 +296,8 @@ mod tests {
     fn in_batches_it_tells_what_all_points_at_once_tell() {
         let observed = observed(120, 0);
         let growing = grown(&observed, &[10, 1, 49, 60]);
-        let exact = Dense::fit(&observed, HYPER).unwrap().predict(growing.places());
-        for (a, b) in exact.iter().zip(growing.known()) {
+        let exact = DensePosterior::fit(&observed, HYPER).unwrap().predict(growing.places());
+        for (a, b) in exact.iter().zip(growing.predictions()) {
             assert!((a.mean_mm - b.mean_mm).abs() < 1e-10 && (a.sigma_mm - b.sigma_mm).abs() < 1e-10, "{a:?} {b:?}");
         }
     }
@@ -300,11 +306,11 @@ mod tests {
     fn beside_effects_it_tells_field_and_effects_together() {
         let observed = observed(120, 3);
         let growing = grown(&observed, &[60, 60]);
-        let dense = Dense::fit(&observed, HYPER).unwrap();
-        let (found, _) = dense.effects();
+        let dense = DensePosterior::fit(&observed, HYPER).unwrap();
+        let (found, _) = dense.estimated_effects();
         let (places, effects) = asked(3);
         let moved = effects * found;
-        for (k, (a, b)) in dense.predict(&places).iter().zip(growing.known()).enumerate() {
+        for (k, (a, b)) in dense.predict(&places).iter().zip(growing.predictions()).enumerate() {
             assert!((a.mean_mm + moved[k] - b.mean_mm).abs() < 1e-7, "{k}: {a:?} {b:?}");
             assert!(b.sigma_mm < HYPER.field.sigma_mm && b.sigma_mm > 0.0, "{k}: {b:?}");
         }
@@ -314,17 +320,19 @@ mod tests {
     fn what_will_be_touched_is_known_better_whatever_will_be_found() {
         let observed = observed(60, 3);
         let mut growing = grown(&observed, &[60]);
-        let before: Vec<Predicted> = growing.known().collect();
+        let before: Vec<Prediction> = growing.predictions().collect();
         let place = growing.places()[77];
-        growing.imagine(77).unwrap();
-        let imagined: Vec<Predicted> = growing.known().collect();
+        growing.update_with_expected(77).unwrap();
+        let imagined: Vec<Prediction> = growing.predictions().collect();
         assert!(before.iter().zip(&imagined).all(|(a, b)| (a.mean_mm - b.mean_mm).abs() < 1e-12));
-        assert!(imagined[77].sigma_mm < HYPER.scatter_mm && imagined[77].sigma_mm < 0.9 * before[77].sigma_mm);
+        assert!(imagined[77].sigma_mm < HYPER.noise_sigma_mm && imagined[77].sigma_mm < 0.9 * before[77].sigma_mm);
         // Touched in truth, and found to be elsewhere.
         let mut touched = grown(&observed, &[60]);
         let effects = DMatrix::from_row_slice(1, 3, &[1.0, place[0] / 30.0, place[1] / 30.0]);
-        touched.tell(&Observed { effects, ..Observed::without_effects(vec![place], vec![0.1]) }).unwrap();
-        for (a, b) in touched.known().zip(&imagined) {
+        touched
+            .update(&Observed { fixed_effects: effects, ..Observed::without_effects(vec![place], vec![0.1]) })
+            .unwrap();
+        for (a, b) in touched.predictions().zip(&imagined) {
             assert!((a.sigma_mm - b.sigma_mm).abs() < 1e-12);
         }
     }
@@ -333,21 +341,24 @@ mod tests {
     fn a_point_off_by_ten_scatters_is_a_surprise_and_one_as_expected_is_none() {
         let observed = observed(121, 3);
         let first: Vec<usize> = (0..120).collect();
-        let growing = grown(&observed.only(&first), &[120]);
-        let mut last = observed.only(&[120]);
-        assert!(growing.surprise(&last)[0].abs() < 2.0);
-        last.deviations_mm[0] += 10.0 * HYPER.scatter_mm;
-        assert!(growing.surprise(&last)[0] > 5.0);
+        let growing = grown(&observed.subset(&first), &[120]);
+        let mut last = observed.subset(&[120]);
+        assert!(growing.standardized_innovations(&last)[0].abs() < 2.0);
+        last.deviations_mm[0] += 10.0 * HYPER.noise_sigma_mm;
+        assert!(growing.standardized_innovations(&last)[0] > 5.0);
     }
 
     #[test]
     fn what_is_stated_of_one_point_is_what_is_worked_out_by_hand() {
-        let hyper = Hyper { field: Field::new(2.0, 20.0), scatter_mm: 0.5, drift: 0.0 };
+        let hyperparameters =
+            Hyperparameters { field: Field::new(2.0, 20.0), noise_sigma_mm: 0.5, noise_autocorrelation: 0.0 };
         let (place, stated) = (vec![[1.0, 2.0]], DMatrix::from_element(1, 1, 1.5));
-        let mut growing = Growing::beside(place.clone(), DMatrix::zeros(1, 0), &stated, hyper).unwrap();
-        growing.tell(&Observed { stated, ..Observed::without_effects(place, vec![3.0]) }).unwrap();
+        let mut growing =
+            IncrementalPosterior::with_random_effects(place.clone(), DMatrix::zeros(1, 0), &stated, hyperparameters)
+                .unwrap();
+        growing.update(&Observed { random_effects: stated, ..Observed::without_effects(place, vec![3.0]) }).unwrap();
         // Field and effect together: 4 + 2.25, of which a point with a scatter of 0.25 was told.
-        let told = growing.known().next().unwrap();
+        let told = growing.predictions().next().unwrap();
         assert!((told.mean_mm - 6.25 / 6.5 * 3.0).abs() < 1e-12, "{told:?}");
         assert!((told.sigma_mm.powi(2) - (6.25 - 6.25 * 6.25 / 6.5)).abs() < 1e-12, "{told:?}");
     }
@@ -355,11 +366,11 @@ mod tests {
     #[test]
     fn what_does_not_belong_together_is_refused() {
         let (places, effects) = asked(3);
-        assert!(Growing::over(places.clone(), DMatrix::zeros(7, 3), HYPER).is_err());
-        let mut growing = Growing::over(places, effects, HYPER).unwrap();
-        assert!(growing.tell(&observed(5, 2)).is_err());
+        assert!(IncrementalPosterior::over(places.clone(), DMatrix::zeros(7, 3), HYPER).is_err());
+        let mut growing = IncrementalPosterior::over(places, effects, HYPER).unwrap();
+        assert!(growing.update(&observed(5, 2)).is_err());
         let mut wrong = observed(5, 3);
         wrong.deviations_mm[4] = f64::NAN;
-        assert!(growing.tell(&wrong).unwrap_err().to_string().contains("point 5 "));
+        assert!(growing.update(&wrong).unwrap_err().to_string().contains("point 5 "));
     }
 }

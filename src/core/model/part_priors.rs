@@ -15,7 +15,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Hyper, Priors};
+use super::{Hyperparameters, Prior};
 
 /// How different parts are before anything is known of them, and for how many parts that counts.
 const DIFFERENT: f64 = 2.5;
@@ -27,18 +27,18 @@ const MOST_PARTS: u32 = 20;
 
 /// What earlier parts taught of their fields.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Taught {
+pub struct PartPriors {
     /// After a pass that was ground without a correction.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub without_correction: Option<Lesson>,
+    pub without_correction: Option<PartFit>,
     /// After a pass that was ground with one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub with_correction: Option<Lesson>,
+    pub with_correction: Option<PartFit>,
 }
 
 /// What parts had in common.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Lesson {
+pub struct PartFit {
     /// Median of the range, in millimetres, and by what factor parts differ: one standard deviation of its logarithm.
     pub range_mm: [f64; 2],
     /// The same of the ratio of the scatter to the field.
@@ -47,39 +47,40 @@ pub struct Lesson {
     pub parts: u32,
 }
 
-impl Taught {
+impl PartPriors {
     /// Returns what was taught by passes of this kind.
-    pub fn of(&self, is_corrected: bool) -> Option<Lesson> {
+    pub fn fit(&self, is_corrected: bool) -> Option<PartFit> {
         if is_corrected { self.with_correction } else { self.without_correction }
     }
 
     /// Takes in what a further part told after a pass of this kind.
-    pub fn take(&mut self, is_corrected: bool, hyper: &Hyper) {
+    pub fn update(&mut self, is_corrected: bool, hyperparameters: &Hyperparameters) {
         let lesson = if is_corrected { &mut self.with_correction } else { &mut self.without_correction };
-        *lesson = Some(Lesson::after(*lesson, hyper));
+        *lesson = Some(PartFit::updated(*lesson, hyperparameters));
     }
 
     /// Returns what other machines taught together, each of which counts as one part: its own may differ as theirs do.
     #[must_use]
-    pub fn of_machines(machines: &[Self]) -> Self {
-        let of = |is_corrected| Lesson::of_machines(machines.iter().filter_map(|of| of.of(is_corrected)));
+    pub fn pooled(machines: &[Self]) -> Self {
+        let of = |is_corrected| PartFit::pooled(machines.iter().filter_map(|of| of.fit(is_corrected)));
         Self { without_correction: of(false), with_correction: of(true) }
     }
 
     /// Whether every number is one that can be, for what was read from a file.
-    pub fn is_sound(&self) -> bool {
+    pub fn is_valid(&self) -> bool {
         let number = |of: [f64; 2]| of[0].is_finite() && of[0] > 0.0 && of[1].is_finite() && of[1] >= 1.0;
-        let is_sound = |lesson: Lesson| {
+        let is_sound = |lesson: PartFit| {
             number(lesson.range_mm) && number(lesson.scatter_ratio) && (1..=MOST_PARTS).contains(&lesson.parts)
         };
         [self.without_correction, self.with_correction].into_iter().flatten().all(is_sound)
     }
 }
 
-impl Lesson {
+impl PartFit {
     /// What is known after a further part.
-    pub fn after(before: Option<Self>, hyper: &Hyper) -> Self {
-        let [range_mm, ratio] = [hyper.field.range_mm, hyper.scatter_mm / hyper.field.sigma_mm];
+    pub fn updated(before: Option<Self>, hyperparameters: &Hyperparameters) -> Self {
+        let [range_mm, ratio] =
+            [hyperparameters.field.range_mm, hyperparameters.noise_sigma_mm / hyperparameters.field.sigma_mm];
         let Some(before) = before else {
             return Self { range_mm: [range_mm, 1.0], scatter_ratio: [ratio, 1.0], parts: 1 };
         };
@@ -98,7 +99,7 @@ impl Lesson {
     }
 
     /// What a machine is expected to have in common with others.
-    fn of_machines(machines: impl Iterator<Item = Self>) -> Option<Self> {
+    fn pooled(machines: impl Iterator<Item = Self>) -> Option<Self> {
         let machines: Vec<Self> = machines.take(MOST_PARTS as usize).collect();
         let n = machines.len() as f64;
         let pooled = |of: fn(&Self) -> [f64; 2]| {
@@ -116,14 +117,14 @@ impl Lesson {
     }
 
     /// What is expected of the next part.
-    pub fn priors(&self) -> Priors {
+    pub fn priors(&self) -> Prior {
         let n = f64::from(self.parts.max(1));
         let expected = |[median, factor]: [f64; 2]| {
             let squares = COUNTS_FOR * DIFFERENT.ln().powi(2) + (n - 1.0) * factor.ln().powi(2);
             let variance = squares / (COUNTS_FOR + n - 1.0) * (1.0 + 1.0 / n);
             [median, variance.sqrt().exp().max(NARROWEST)]
         };
-        Priors { range_mm: expected(self.range_mm), scatter_ratio: expected(self.scatter_ratio) }
+        Prior { range_mm: expected(self.range_mm), noise_ratio: expected(self.scatter_ratio) }
     }
 }
 
@@ -132,28 +133,28 @@ mod tests {
     use super::super::Field;
     use super::*;
 
-    fn hyper(range_mm: f64, ratio: f64) -> Hyper {
-        Hyper { field: Field::new(2e-3, range_mm), scatter_mm: 2e-3 * ratio, drift: 0.0 }
+    fn hyperparameters(range_mm: f64, ratio: f64) -> Hyperparameters {
+        Hyperparameters { field: Field::new(2e-3, range_mm), noise_sigma_mm: 2e-3 * ratio, noise_autocorrelation: 0.0 }
     }
 
     #[test]
     fn of_two_parts_it_is_what_is_worked_out_by_hand() {
-        let mut taught = Taught::default();
-        assert!(taught.of(true).is_none());
-        taught.take(true, &hyper(10.0, 0.1));
-        let one = taught.of(true).unwrap().priors();
+        let mut taught = PartPriors::default();
+        assert!(taught.fit(true).is_none());
+        taught.update(true, &hyperparameters(10.0, 0.1));
+        let one = taught.fit(true).unwrap().priors();
         // One part: twice the variance of ln 2.5.
         assert!((one.range_mm[0] - 10.0).abs() < 1e-12, "{one:?}");
         assert!((one.range_mm[1].ln() - 2f64.sqrt() * 2.5f64.ln()).abs() < 1e-12, "{one:?}");
-        taught.take(true, &hyper(40.0, 0.1));
-        let lesson = taught.of(true).unwrap();
+        taught.update(true, &hyperparameters(40.0, 0.1));
+        let lesson = taught.fit(true).unwrap();
         // Mean of the logarithms: 20; they are off by ln 2 each, and the sample variance is 2 (ln 2)^2.
         assert!((lesson.range_mm[0] - 20.0).abs() < 1e-12 && lesson.parts == 2, "{lesson:?}");
         assert!((lesson.range_mm[1].ln() - 2f64.sqrt() * 2f64.ln()).abs() < 1e-12, "{lesson:?}");
         assert!((lesson.scatter_ratio[0] - 0.1).abs() < 1e-12 && (lesson.scatter_ratio[1] - 1.0).abs() < 1e-12);
         let variance = (2.0 * 2.5f64.ln().powi(2) + 2.0 * 2f64.ln().powi(2)) / 3.0 * 1.5;
         assert!((lesson.priors().range_mm[1].ln() - variance.sqrt()).abs() < 1e-12);
-        assert!(taught.of(false).is_none() && taught.is_sound());
+        assert!(taught.fit(false).is_none() && taught.is_valid());
     }
 
     #[test]
@@ -161,7 +162,7 @@ mod tests {
         let mut lesson = None;
         let mut factors = Vec::new();
         for _ in 0..200 {
-            let next = Lesson::after(lesson, &hyper(15.0, 0.3));
+            let next = PartFit::updated(lesson, &hyperparameters(15.0, 0.3));
             factors.push(next.priors().range_mm[1]);
             lesson = Some(next);
         }
@@ -169,7 +170,7 @@ mod tests {
         assert_eq!((factors[199], lesson.unwrap().parts), (2.0, 20));
         // A machine that has changed.
         for _ in 0..80 {
-            lesson = Some(Lesson::after(lesson, &hyper(60.0, 0.3)));
+            lesson = Some(PartFit::updated(lesson, &hyperparameters(60.0, 0.3)));
         }
         let lesson = lesson.unwrap();
         assert!((lesson.range_mm[0] / 60.0 - 1.0).abs() < 0.05, "{lesson:?}");
@@ -178,45 +179,47 @@ mod tests {
     #[test]
     fn machines_count_as_one_part_each_and_what_they_differ_by_widens() {
         let machine = |range_mm: f64| {
-            let mut taught = Taught::default();
-            (0..9).for_each(|_| taught.take(true, &hyper(range_mm, 0.1)));
+            let mut taught = PartPriors::default();
+            (0..9).for_each(|_| taught.update(true, &hyperparameters(range_mm, 0.1)));
             taught
         };
-        let one = Taught::of_machines(&[machine(10.0)]);
-        let [one, part] = [one.of(true).unwrap(), Lesson::after(None, &hyper(10.0, 0.1))].map(|of| of.priors());
-        let numbers = |of: Priors| [of.range_mm, of.scatter_ratio].concat();
+        let one = PartPriors::pooled(&[machine(10.0)]);
+        let [one, part] =
+            [one.fit(true).unwrap(), PartFit::updated(None, &hyperparameters(10.0, 0.1))].map(|of| of.priors());
+        let numbers = |of: Prior| [of.range_mm, of.noise_ratio].concat();
         assert!(numbers(one).iter().zip(numbers(part)).all(|(a, b)| (a / b - 1.0).abs() < 1e-12), "{one:?} {part:?}");
         assert!(
-            Taught::of_machines(&[machine(10.0)]).of(false).is_none() && Taught::of_machines(&[]).of(true).is_none()
+            PartPriors::pooled(&[machine(10.0)]).fit(false).is_none() && PartPriors::pooled(&[]).fit(true).is_none()
         );
-        let two = Taught::of_machines(&[machine(10.0), machine(40.0)]).of(true).unwrap();
-        let parts = Lesson::after(Some(Lesson::after(None, &hyper(10.0, 0.1))), &hyper(40.0, 0.1));
+        let two = PartPriors::pooled(&[machine(10.0), machine(40.0)]).fit(true).unwrap();
+        let parts =
+            PartFit::updated(Some(PartFit::updated(None, &hyperparameters(10.0, 0.1))), &hyperparameters(40.0, 0.1));
         assert!((two.range_mm[0] - 20.0).abs() < 1e-9 && two.parts == 2, "{two:?}");
         assert!((two.range_mm[1] / parts.range_mm[1] - 1.0).abs() < 1e-9, "{two:?}");
-        assert!(Taught { with_correction: Some(two), without_correction: None }.is_sound());
+        assert!(PartPriors { with_correction: Some(two), without_correction: None }.is_valid());
     }
 
     #[test]
     fn parts_that_differ_widen_what_is_expected() {
         let lesson = (0..12)
-            .map(|k| hyper(if k % 2 == 0 { 5.0 } else { 80.0 }, 0.3))
-            .fold(None, |lesson, hyper| Some(Lesson::after(lesson, &hyper)));
+            .map(|k| hyperparameters(if k % 2 == 0 { 5.0 } else { 80.0 }, 0.3))
+            .fold(None, |lesson, hyperparameters| Some(PartFit::updated(lesson, &hyperparameters)));
         let priors = lesson.unwrap().priors();
-        assert!(priors.range_mm[1] > 3.5 && priors.scatter_ratio[1] < 2.1, "{priors:?}");
+        assert!(priors.range_mm[1] > 3.5 && priors.noise_ratio[1] < 2.1, "{priors:?}");
     }
 
     #[test]
     fn numbers_that_cannot_be_are_found() {
-        let good = Lesson::after(None, &hyper(15.0, 0.3));
-        let of = |lesson| Taught { with_correction: Some(lesson), without_correction: None }.is_sound();
-        assert!(of(good) && Taught::default().is_sound());
+        let good = PartFit::updated(None, &hyperparameters(15.0, 0.3));
+        let of = |lesson| PartPriors { with_correction: Some(lesson), without_correction: None }.is_valid();
+        assert!(of(good) && PartPriors::default().is_valid());
         for bad in [
-            Lesson { range_mm: [0.0, 2.0], ..good },
-            Lesson { range_mm: [15.0, 0.5], ..good },
-            Lesson { scatter_ratio: [f64::NAN, 2.0], ..good },
-            Lesson { scatter_ratio: [0.1, f64::INFINITY], ..good },
-            Lesson { parts: 0, ..good },
-            Lesson { parts: 21, ..good },
+            PartFit { range_mm: [0.0, 2.0], ..good },
+            PartFit { range_mm: [15.0, 0.5], ..good },
+            PartFit { scatter_ratio: [f64::NAN, 2.0], ..good },
+            PartFit { scatter_ratio: [0.1, f64::INFINITY], ..good },
+            PartFit { parts: 0, ..good },
+            PartFit { parts: 21, ..good },
         ] {
             assert!(!of(bad), "{bad:?}");
         }

@@ -13,14 +13,14 @@
 
 use faer::Mat;
 
-use super::{Lay, Smoothness};
+use super::{Anisotropy, Smoothness};
 
 /// By how much the rectangle is wider than the part on either side, as a share of the longer side of the part.
 const WIDER: f64 = 0.15;
 
 /// The cosines of the longest waves over a rectangle, and polynomials before them.
-pub(super) struct Waves {
-    lay: Lay,
+pub(super) struct Basis {
+    lay: Anisotropy,
     corner_mm: [f64; 2],
     lengths_mm: [f64; 2],
     /// The middle of the part and half its lengths, between which the polynomials are laid.
@@ -34,15 +34,15 @@ pub(super) struct Waves {
     /// One more than the highest order along either axis.
     counts: [usize; 2],
     /// The square of each wave's number in the plane in which the field is alike in all directions, in 1 / mm^2.
-    numbers2: Vec<f64>,
+    squared_wavenumbers: Vec<f64>,
 }
 
-impl Waves {
+impl Basis {
     /// Takes so many cosines over some places, those first of which a field with this lay has most, and the polynomials up to a degree. What is
     /// level or tilted is a motion of the part and none of them.
-    pub(super) fn over(places: &[[f64; 2]], lay: Lay, count: usize, degree: usize) -> Self {
+    pub(super) fn over(places: &[[f64; 2]], lay: Anisotropy, count: usize, degree: usize) -> Self {
         let spans = [0, 1].map(|axis| {
-            let of = places.iter().map(|&place| turned(lay, place)[axis]);
+            let of = places.iter().map(|&place| rotated(lay, place)[axis]);
             [of.clone().fold(f64::INFINITY, f64::min), of.fold(f64::NEG_INFINITY, f64::max)]
         });
         let longest_mm = spans.iter().map(|[low, high]| high - low).fold(0.0, f64::max);
@@ -64,7 +64,18 @@ impl Waves {
         // Points on a line have a width for numbers' sake.
         let halves_mm = spans.map(|[low, high]| (0.5 * (high - low)).max(0.01 * wider_mm));
         let degrees = (2..=degree).flat_map(|whole| (0..=whole).map(move |b| [whole - b, b])).collect();
-        Self { lay, corner_mm, lengths_mm, middle_mm, halves_mm, degree, degrees, orders, counts, numbers2 }
+        Self {
+            lay,
+            corner_mm,
+            lengths_mm,
+            middle_mm,
+            halves_mm,
+            degree,
+            degrees,
+            orders,
+            counts,
+            squared_wavenumbers: numbers2,
+        }
     }
 
     /// How many polynomials and cosines these are.
@@ -78,25 +89,28 @@ impl Waves {
     }
 
     /// Half the length of the shortest wave.
-    pub(super) fn shortest_mm(&self) -> f64 {
-        std::f64::consts::PI / self.numbers2.last().copied().unwrap_or(0.0).sqrt()
+    pub(super) fn min_half_wavelength_mm(&self) -> f64 {
+        std::f64::consts::PI / self.squared_wavenumbers.last().copied().unwrap_or(0.0).sqrt()
     }
 
     /// The standard deviation of each coefficient in a field of strength 1, and the share of the field's variance that is in shorter ones.
-    pub(super) fn strengths(&self, smoothness: Smoothness, range_mm: f64) -> (Vec<f64>, f64) {
-        let strength = |number2: &f64| density_mm2(smoothness, range_mm, *number2).sqrt();
-        let last2 = self.numbers2.last().copied().unwrap_or(0.0);
+    pub(super) fn standard_deviations(&self, smoothness: Smoothness, range_mm: f64) -> (Vec<f64>, f64) {
+        let strength = |number2: &f64| spectral_density_mm2(smoothness, range_mm, *number2).sqrt();
+        let last2 = self.squared_wavenumbers.last().copied().unwrap_or(0.0);
         let area_mm2 = self.lengths_mm[0] * self.lengths_mm[1];
         let longest_mm = 2.0 * self.halves_mm[0].max(self.halves_mm[1]);
         let is_long = smoothness != Smoothness::Never && range_mm >= longest_mm;
         let of_polynomial = if is_long { (area_mm2 / self.degrees.len().max(1) as f64).sqrt() } else { 0.0 };
         let polynomials = self.degrees.iter().map(|_| of_polynomial);
-        (polynomials.chain(self.numbers2.iter().map(strength)).collect(), beyond(smoothness, range_mm, last2))
+        (
+            polynomials.chain(self.squared_wavenumbers.iter().map(strength)).collect(),
+            truncated_share(smoothness, range_mm, last2),
+        )
     }
 
     /// Every polynomial and cosine at some places: a row a place, a column each.
     pub(super) fn at(&self, places: &[[f64; 2]]) -> Mat<f64> {
-        let at_mm = [0, 1].map(|axis| places.iter().map(|&place| turned(self.lay, place)[axis]).collect::<Vec<f64>>());
+        let at_mm = [0, 1].map(|axis| places.iter().map(|&place| rotated(self.lay, place)[axis]).collect::<Vec<f64>>());
         let polynomials = [0, 1].map(|axis| self.polynomials(axis, &at_mm[axis]));
         let cosines = [0, 1].map(|axis| self.cosines(axis, &at_mm[axis]));
         let of_polynomials = self.degrees.iter().map(|order| (&polynomials, order));
@@ -137,7 +151,7 @@ impl Waves {
     }
 
     /// The waves along either axis of a grid, by which [`Self::on_grid`] tells fields there.
-    pub(super) fn grid(&self, grid: &Grid) -> [Mat<f64>; 2] {
+    pub(super) fn grid(&self, grid: &BasisGrid) -> [Mat<f64>; 2] {
         [0, 1].map(|axis| {
             let at_mm: Vec<f64> =
                 (0..grid.counts[axis]).map(|k| grid.corner_mm[axis] + grid.spacing_mm * k as f64).collect();
@@ -157,27 +171,27 @@ impl Waves {
     }
 
     /// Takes a place to the axes along and across the lay.
-    pub(super) fn turned(&self, place: [f64; 2]) -> [f64; 2] {
-        turned(self.lay, place)
+    pub(super) fn rotated(&self, place: [f64; 2]) -> [f64; 2] {
+        rotated(self.lay, place)
     }
 }
 
 /// A square grid along the axes of the waves.
 #[derive(Clone, Debug)]
-pub(super) struct Grid {
+pub(super) struct BasisGrid {
     pub(super) corner_mm: [f64; 2],
     pub(super) spacing_mm: f64,
     pub(super) counts: [usize; 2],
 }
 
-fn turned(lay: Lay, [x, y]: [f64; 2]) -> [f64; 2] {
+fn rotated(lay: Anisotropy, [x, y]: [f64; 2]) -> [f64; 2] {
     let [c, s] = lay.along;
     [c * x + s * y, c * y - s * x]
 }
 
 /// The spectral density of a field of strength 1: of exp(-2 (r / range)^2), and of Matern's with kappa^2 = 8 nu / range^2, which is
 /// 4 pi nu kappa^(2 nu) / (kappa^2 + w^2)^(nu + 1) (Rasmussen and Williams 2006, 4.15).
-fn density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
+fn spectral_density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
     let matern = |nu: f64| {
         let kappa2 = 8.0 * nu / (range_mm * range_mm);
         2.0 * std::f64::consts::TAU * nu * kappa2.powf(nu) / (kappa2 + number2).powf(nu + 1.0)
@@ -192,7 +206,7 @@ fn density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
 }
 
 /// The share of the variance in waves of a larger number: the integral of the density over the plane outside of a circle.
-fn beyond(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
+fn truncated_share(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
     let matern = |nu: f64| {
         let kappa2 = 8.0 * nu / (range_mm * range_mm);
         (kappa2 / (kappa2 + number2)).powf(nu)
@@ -212,8 +226,8 @@ mod tests {
     const PART: [[f64; 2]; 2] = [[-30.0, -20.0], [30.0, 20.0]];
 
     /// The covariance of two places that the waves make.
-    fn covariance(waves: &Waves, field: &Field, places: [[f64; 2]; 2]) -> f64 {
-        let (strengths, _) = waves.strengths(field.smoothness, field.range_mm);
+    fn covariance(waves: &Basis, field: &Field, places: [[f64; 2]; 2]) -> f64 {
+        let (strengths, _) = waves.standard_deviations(field.smoothness, field.range_mm);
         let at = waves.at(&places);
         (0..waves.len()).map(|k| strengths[k].powi(2) * at[(0, k)] * at[(1, k)]).sum()
     }
@@ -221,14 +235,14 @@ mod tests {
     #[test]
     fn within_the_part_they_make_the_covariance_of_the_field() {
         for (smoothness, near) in [(Smoothness::Never, 0.05), (Smoothness::Once, 0.02), (Smoothness::Endless, 0.02)] {
-            for lay in [Lay::NONE, Lay::at(0.7, 3.0)] {
+            for lay in [Anisotropy::NONE, Anisotropy::at(0.7, 3.0)] {
                 let field = Field { smoothness, lay, ..Field::new(1.0, 12.0) };
-                let waves = Waves::over(&PART, lay, 3000, 4);
+                let waves = Basis::over(&PART, lay, 3000, 4);
                 for (a, b) in [([0.0, 0.0], [3.0, 1.0]), ([10.0, -5.0], [14.0, 2.0]), ([20.0, 10.0], [20.0, 2.0])] {
                     let [made, exact] = [covariance(&waves, &field, [a, b]), field.covariance_mm2(a, b)];
                     assert!((made - exact).abs() < near, "{smoothness:?} {lay:?} {a:?}: {made} {exact}");
                 }
-                let (_, left) = waves.strengths(smoothness, 12.0);
+                let (_, left) = waves.standard_deviations(smoothness, 12.0);
                 let [made, all] = [covariance(&waves, &field, [[1.0, 2.0]; 2]), 1.0 - left];
                 assert!((made - all).abs() < 0.03, "{smoothness:?} {lay:?}: {made} {all}");
             }
@@ -237,15 +251,15 @@ mod tests {
 
     #[test]
     fn what_shorter_waves_would_have_is_told() {
-        let waves = Waves::over(&PART, Lay::NONE, 200, 0);
-        let left = [20.0, 5.0, 1.0].map(|range_mm| waves.strengths(Smoothness::Never, range_mm).1);
+        let waves = Basis::over(&PART, Anisotropy::NONE, 200, 0);
+        let left = [20.0, 5.0, 1.0].map(|range_mm| waves.standard_deviations(Smoothness::Never, range_mm).1);
         assert!(left[0] < 0.2 && left[1] > 0.3 && left[2] > 0.8 && left[2] < 1.0, "{left:?}");
-        assert!(waves.strengths(Smoothness::Endless, 30.0).1 < 0.02);
+        assert!(waves.standard_deviations(Smoothness::Endless, 30.0).1 < 0.02);
     }
 
     #[test]
     fn polynomials_over_the_part_are_independent_and_only_long_smooth_fields_have_them() {
-        let waves = Waves::over(&PART, Lay::NONE, 10, 4);
+        let waves = Basis::over(&PART, Anisotropy::NONE, 10, 4);
         let count = waves.degrees.len();
         assert_eq!(count, 12);
         // Midpoints of 200 by 200 tiles; each polynomial has the mean square of a cosine, 1 / (78 mm 58 mm).
@@ -269,19 +283,22 @@ mod tests {
             (Smoothness::Endless, 59.0, false),
             (Smoothness::Never, 200.0, false),
         ] {
-            let (strengths, _) = waves.strengths(smoothness, range_mm);
+            let (strengths, _) = waves.standard_deviations(smoothness, range_mm);
             assert!(strengths[..count].iter().all(|strength| (*strength > 0.0) == has), "{smoothness:?} {range_mm}");
         }
         let line: Vec<[f64; 2]> = (0..30).map(|k| [f64::from(k), 1.0 + 1e-15 * f64::from(k % 3)]).collect();
         assert!(
-            Waves::over(&line, Lay::at(0.3, 2.0), 10, 4).at(&line).col_iter().all(|column| column.norm_max() < 1e3)
+            Basis::over(&line, Anisotropy::at(0.3, 2.0), 10, 4)
+                .at(&line)
+                .col_iter()
+                .all(|column| column.norm_max() < 1e3)
         );
     }
 
     #[test]
     fn on_a_grid_a_field_is_what_it_is_at_each_of_its_places() {
-        let waves = Waves::over(&PART, Lay::at(0.4, 2.0), 60, 4);
-        let grid = Grid { corner_mm: [-5.0, 2.0], spacing_mm: 1.5, counts: [4, 3] };
+        let waves = Basis::over(&PART, Anisotropy::at(0.4, 2.0), 60, 4);
+        let grid = BasisGrid { corner_mm: [-5.0, 2.0], spacing_mm: 1.5, counts: [4, 3] };
         let coefficients: Vec<f64> = (0..60).map(|k| (f64::from(k) * 0.7).sin()).collect();
         let on = waves.on_grid(&waves.grid(&grid), &coefficients);
         let (c, s) = (0.4_f64.cos(), 0.4_f64.sin());
