@@ -1,18 +1,21 @@
-//! The numerical core of Regrind: where is the part, and what is to be ground away next?
+//! The numerical core of Regrind: finds the pose of the part, and computes what to grind away next.
 //!
 //! ```text
 //!  nominal ---> surface ----+
 //!                           +--> registration --> compensation --> error map, correction, path of the wheel
 //!  probe's centres ---------+          |
-//!  (measuring: where to touch)         +--> form: what is left on the part
+//!  (measuring: where to touch)         +--> form: residual error of the part
 //! ```
 //!
-//! Pure: no file, no clock, no randomness, no machine, no logging; the same input gives the same bits on any number of threads.
+//! Pure: no file, no clock, no randomness, no machine, no logging. The same input gives the same bits on any number of
+//! threads.
 //!
-//! Conventions: millimetres and radians. Frames are the model's {M} and the CMM's {W}; a pose is named for what it does,
-//! `cmm_from_model`. A deviation is positive where material stands proud, along the outward normal, the probe's side.
+//! Conventions: millimetres and radians. The frames are the model's {M} and the CMM's {W}. The name of a pose says what
+//! it does: `cmm_from_model` transforms model coordinates to CMM coordinates. A deviation is signed along the outward
+//! normal, towards the probe's side, and is positive where there is too much material.
 //!
-//! Where is a part whose probe centres were measured? Here a dome of 60 mm radius, touched by a ball of 1.5 mm:
+//! Example: the pose of a part from measured probe centres. The part is a dome of 60 mm radius; the ball has a radius
+//! of 1.5 mm:
 //!
 //! ```
 //! use regrind_core::geometry::Point;
@@ -27,14 +30,14 @@
 //! let nominal: Vec<Point> = grid(81, 0.5).map(|(x, y)| Point::new(x, y, height(dome_mm, x, y))).collect();
 //! let nominal = Nominal::from_points(nominal, Projection::Auto)?;
 //!
-//! // The centres lie on a dome that is larger by the probe's radius; the part stands 250 mm off, and lower.
+//! // The centres lie on a dome that is larger by the probe's radius; the part is shifted by 250 mm, and lower.
 //! let centres: Vec<Point> =
 //!     grid(20, 1.5).map(|(x, y)| Point::new(x + 250.0, y, height(dome_mm + probe_mm, x, y) - 40.0)).collect();
 //!
 //! let found = register(&nominal, &centres, &Options::new(probe_mm))?;
 //! assert!((found.cmm_from_model.translation_mm.x - 250.0).abs() < 1e-3);
 //! assert!(found.verdict.rms_mm < 1e-5);
-//! // No measurement tells how a sphere is turned, and that is said.
+//! // No measurement can determine the rotation of a sphere, and the verdict says so.
 //! assert!(!found.verdict.weak_directions.is_empty());
 //! # Ok(())
 //! # }

@@ -1,9 +1,10 @@
-//! Sparse Cholesky factors, and of the inverse just the entries that stand where the matrix has some.
+//! Sparse Cholesky factors, and the entries of the inverse at the places where the matrix has entries.
 //!
-//! faer orders, factors and solves. The inverse of a sparse matrix is full, but the entries within the pattern of the factor follow from each
-//! other, from the last column to the first (Takahashi, Fagan and Chen 1973), at about twice the cost of factoring. Here
-//! that is done supernode by supernode: with the factor's blocks L11 on the diagonal and L21 below, Y = L21 L11^-1, and Z22
-//! the inverse on the rows of L21, Z21 = -Z22 Y and Z11 = (L11 L11^T)^-1 - Y^T Z21.
+//! The faer crate orders, factors and solves. The inverse of a sparse matrix is full. Its entries within the pattern of
+//! the factor follow from each other, from the last column to the first (Takahashi, Fagan and Chen 1973), at about
+//! twice the cost of the factorization. Here this is done supernode by supernode. Let L11 be the factor's block on the
+//! diagonal and L21 the block below it, Y = L21 L11^-1, and Z22 the inverse on the rows of L21. Then Z21 = -Z22 Y and
+//! Z11 = (L11 L11^T)^-1 - Y^T Z21.
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::matmul::matmul;
@@ -17,15 +18,15 @@ use faer::sparse::linalg::cholesky::{
 use faer::sparse::{SparseColMatRef, SymbolicSparseColMat};
 use faer::{Accum, Conj, Mat, MatMut, Par, Side};
 
-/// The pattern of the lower triangle of a symmetric matrix, and what factoring it will take.
+/// Pattern of the lower triangle of a symmetric matrix, with its symbolic factorization.
 pub(crate) struct Pattern {
     matrix: SymbolicSparseColMat<usize>,
     symbolic: SymbolicCholesky<usize>,
-    /// The supernode of every column of the factor.
+    /// Supernode of each column of the factor.
     supernode: Vec<u32>,
 }
 
-/// A Cholesky factor.
+/// Cholesky factor of a matrix with a given pattern.
 pub(crate) struct Factor<'a> {
     pattern: &'a Pattern,
     values: Vec<f64>,
@@ -34,12 +35,13 @@ pub(crate) struct Factor<'a> {
 /// Entries of the inverse within the pattern of the factor.
 pub(crate) struct SelectedInverse<'a> {
     pattern: &'a Pattern,
-    /// Of each supernode the square block and what is below it, one after the other.
+    /// For each supernode, the square block and the block below it, stacked.
     blocks: Vec<Mat<f64>>,
 }
 
 impl Pattern {
-    /// Orders a pattern, columns of the lower triangle with their rows ascending; `None` where memory does not suffice.
+    /// Orders and analyses a pattern: the columns of the lower triangle, with rows ascending. Returns `None` if there
+    /// is not enough memory.
     pub fn new(columns: usize, begins: Vec<usize>, rows: Vec<usize>) -> Option<Self> {
         let matrix = SymbolicSparseColMat::new_checked(columns, columns, begins, None, rows);
         let params = CholeskySymbolicParams {
@@ -65,7 +67,7 @@ impl Pattern {
         }
     }
 
-    /// Factors a matrix of this pattern; `None` where it is not positive definite.
+    /// Factors a matrix of this pattern; returns `None` if it is not positive definite or memory is not sufficient.
     pub fn factor(&self, values: &[f64]) -> Option<Factor<'_>> {
         let matrix = SparseColMatRef::new(self.matrix.as_ref(), values);
         let mut factor = vec![0.0; self.symbolic.len_val()];
@@ -81,7 +83,7 @@ impl Pattern {
 }
 
 impl<'a> Factor<'a> {
-    /// Solves for one right side.
+    /// Solves for one right-hand side; returns `None` if memory is not sufficient.
     pub fn solve(&self, right: &[f64]) -> Option<Vec<f64>> {
         let symbolic = &self.pattern.symbolic;
         let mut solution = right.to_vec();
@@ -95,7 +97,7 @@ impl<'a> Factor<'a> {
         Some(solution)
     }
 
-    /// Works out the entries of the inverse within the factor's pattern.
+    /// Computes the entries of the inverse within the factor's pattern.
     pub fn selected_inverse(&self) -> Option<SelectedInverse<'a>> {
         let symbolic = self.pattern.blocks()?;
         let factor = SupernodalLltRef::new(symbolic, &self.values);
@@ -127,7 +129,8 @@ impl<'a> Factor<'a> {
 }
 
 impl SelectedInverse<'_> {
-    /// Returns the entry of two columns of the matrix that has one there.
+    /// Returns the entry of the inverse at two columns where the matrix has an entry; NaN if it is outside the factor's
+    /// pattern.
     pub fn entry(&self, a: usize, b: usize) -> f64 {
         let at = |k: usize| self.pattern.symbolic.perm().map_or(k, |perm| perm.arrays().1[k]);
         let (column, row) = (at(a).min(at(b)), at(a).max(at(b)));
@@ -142,7 +145,8 @@ impl SelectedInverse<'_> {
         place.map_or(f64::NAN, |place| self.blocks[s][(place, column - begin)])
     }
 
-    /// Returns the inverse on some rows of the factor, ascending, all of which later supernodes hold together.
+    /// Returns the inverse on some rows of the factor, in ascending order; the later supernodes already contain all of
+    /// these entries.
     fn on_rows(&self, rows: &[usize], local: &mut [usize]) -> Mat<f64> {
         let mut dense = Mat::zeros(rows.len(), rows.len());
         let Some(symbolic) = self.pattern.blocks() else { return dense };

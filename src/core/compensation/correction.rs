@@ -1,4 +1,4 @@
-//! What the grinder is to displace its surface by.
+//! Displacement of the surface that the grinder is to apply.
 
 use std::borrow::Cow;
 
@@ -7,45 +7,54 @@ use serde::{Deserialize, Serialize};
 use super::parameters::Set;
 use crate::geometry::Grid;
 
-/// What the grinder is to displace its surface by, and the parameters that it is told: absolute, it replaces the one before.
+/// Displacement of the surface that the grinder is to apply, with the parameter corrections of its machine.
+///
+/// It is absolute: it replaces the correction of the pass before.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Correction {
-    /// Where the nodes are.
+    /// Grid of the nodes that `values_mm` belongs to.
     #[serde(rename = "net")]
     pub grid: Grid,
-    /// Wanted displacement along the outward normal at every node, in millimetres; positive leaves material.
+    /// Commanded displacement along the outward normal at every node, in millimetres; positive leaves material.
     pub values_mm: Vec<f64>,
-    /// The pass it is for, from 1.
+    /// Number of the pass that it is for, from 1.
     pub cycle: u16,
-    /// Height of the surface wanted over the nominal one, along the normal, in millimetres: the allowance that is left.
+    /// Height of the target surface above the nominal one, along the normal, in millimetres: the allowance that
+    /// remains.
     pub level_mm: f64,
-    /// What is taken back by parameters of the machine, beside the values; none where everything is theirs.
+    /// Parameter corrections of the machine, in addition to `values_mm`; `None` if the map alone corrects.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub set: Option<Set>,
 }
 
 impl Correction {
-    /// The first pass of a part: nothing is known yet.
+    /// Returns the correction for the first pass of a part, before anything is known: 0 everywhere.
     pub fn none(grid: Grid, level_mm: f64) -> Self {
         Self { grid, values_mm: vec![0.0; grid.len()], cycle: 1, level_mm, set: None }
     }
 
-    /// Returns whether it is 0 everywhere, and no parameter is taken back.
+    /// Returns true if the map is 0 everywhere and no parameter is compensated.
     pub fn is_none(&self) -> bool {
         self.set.is_none() && self.values_mm.iter().all(|value| *value == 0.0)
     }
 
-    /// Returns what map and parameters do together to the part as a registration sees it, at every node, in millimetres.
+    /// Returns the joint effect of map and parameters as it appears after registration, at every node, in
+    /// millimetres.
     pub fn seen_mm(&self) -> Cow<'_, [f64]> {
         self.with(|set| &set.seen_mm)
     }
 
-    /// Returns by how much map and parameters displace the surface together, at every node, in millimetres: what is taken off goes by that.
+    /// Returns the displacement of the surface by map and parameters together, at every node, in millimetres.
+    ///
+    /// This is the displacement that decides how much material is removed.
     pub fn displaced_mm(&self) -> Cow<'_, [f64]> {
         self.with(|set| &set.displaced_mm)
     }
 
-    /// Returns the map that a grinder is given, at every node, in millimetres: what is left for a map, and with it what setting and tilt take back.
+    /// Returns the map that the grinder receives, at every node, in millimetres.
+    ///
+    /// It is the sum of `values_mm` and of the displacement by wheel setting and tilt, which the grinder can apply
+    /// only in its map.
     pub fn map_mm(&self) -> Cow<'_, [f64]> {
         self.with(|set| &set.setting_mm)
     }
@@ -57,7 +66,7 @@ impl Correction {
         }
     }
 
-    /// Returns the correction at a place, in millimetres.
+    /// Returns the interpolated `values_mm` at a place in x and y, in millimetres.
     pub fn at(&self, place_mm: [f64; 2]) -> f64 {
         self.grid.interpolate(&self.values_mm, place_mm)
     }

@@ -1,4 +1,4 @@
-//! Why there is no map.
+//! Errors of the maps: of filter, spline and correction.
 
 use thiserror::Error;
 
@@ -6,7 +6,7 @@ use super::filter::{LEAST_READINGS, MOST_WORKED};
 use super::spline::SplineError;
 use crate::geometry::GridError;
 
-/// Why there is no map.
+/// Error that prevents a map.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]

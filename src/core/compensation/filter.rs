@@ -1,17 +1,19 @@
-//! The areal Gaussian filter (ISO 16610-61) for readings that lie anywhere, with honest edges and holes.
+//! Areal Gaussian filter (ISO 16610-61) for readings at arbitrary places, without padding at edges and holes.
 //!
-//! At a place a polynomial of order 0, 1 or 2 is fitted to the readings around it with the weights
-//! exp(-pi (r / (alpha cutoff))^2), and its height there is the filtered value: the Gaussian regression filter (ISO 16610-31, areal).
-//! In the open this is the Gaussian filter; at an edge or a hole the readings that are there are weighed alone and no padding
-//! is needed. The normal equations of a fit are moments of the weights, and since the weights separate, the moments at all nodes of a
-//! grid are sums along x and then along y: the cost is that of the reach on one axis, not of its square.
+//! At a place the filter fits a polynomial of order 0, 1 or 2 to the readings around it with the weights
+//! exp(-pi (r / (alpha cutoff))^2). The height of the polynomial there is the filtered value: the Gaussian regression
+//! filter (ISO 16610-31, areal). Far from edges and holes (in the open) this is the Gaussian filter. At an edge or a
+//! hole only the existing readings are weighted, and no padding is needed. The normal equations of a fit are moments of
+//! the weights. The weights separate, so the moments at all nodes of a grid are sums along x and then along y: the cost
+//! grows with the reach on one axis, not with its square.
 //!
-//! **Readings between nodes.** A reading is spread over the 7 x 7 nodes about it by a narrow Gaussian of width s, and what is
-//! summed along the axes is a Gaussian narrower by as much, of width sqrt(sigma^2 - s^2); the moments' polynomials are changed to match
-//! (Hermite). Both together are the wanted weight at the reading's true place, up to the sampling of the product of two
-//! Gaussians, whose error falls as exp(-2 pi^2 s^2 (1 - s^2 / sigma^2) / step^2). With a step of at most 0.55 sigma and
-//! s of 0.75 steps weights are right to 2e-4 of the largest; halving the step makes it 4e-6. A polynomial of the filter's own
-//! order is taken out before and put back after, so that planes (quadrics) pass to rounding all the same.
+//! **Readings between nodes.** A narrow Gaussian of width s spreads a reading over the 7 x 7 nodes around it. The sums
+//! along the axes then use a Gaussian that is narrower to match, of width sqrt(sigma^2 - s^2), and the polynomials of
+//! the moments change accordingly (Hermite). Both together are the required weight at the true place of the reading, up
+//! to the sampling error of the product of two Gaussians, which falls as exp(-2 pi^2 s^2 (1 - s^2 / sigma^2) / step^2).
+//! With a step of at most 0.55 sigma and s of 0.75 steps, weights are right to 2e-4 of the largest; half the step gives
+//! 4e-6. The filter subtracts a polynomial of its own order before and adds it again after, so that planes (quadrics)
+//! still pass to rounding.
 
 use std::f64::consts::PI;
 
@@ -21,23 +23,24 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Grid, bounds};
 
-/// Width of the spreading Gaussian in steps.
+/// Width of the spreading Gaussian, in steps of the grid.
 const SPREAD: f64 = 0.75;
-/// A reading is spread over so many nodes to either side: beyond it is 2e-5 of the largest.
+/// Number of nodes to either side that a reading is spread over; beyond them the weight is 2e-5 of the largest.
 const SPREAD_REACH: usize = 3;
-/// Widest step in standard deviations of the weights.
+/// Widest step of the grid, in standard deviations of the weights.
 const WIDEST_STEP: f64 = 0.55;
-/// Weights beyond so many standard deviations are below 1e-6 of the largest.
+/// Reach of the weights, in standard deviations; beyond it they are below 1e-6 of the largest.
 const REACH: f64 = 5.3;
-/// Fewer readings than this within the cut-off of a node, along x and along y, are no evidence for a surface.
+/// Minimum number of readings within the cut-off of a node, along x and along y; fewer are no evidence for a surface.
 pub(super) const LEAST_READINGS: u32 = 6;
-/// Most nodes that a filter may work on; a short cut-off on a wide grid asks for more nodes than the grid has.
+/// Maximum number of nodes that a filter may work on; a short cut-off on a wide grid needs more nodes than the grid
+/// has.
 pub(super) const MOST_WORKED: f64 = 2e7;
-/// A value whose variance is more than so many times that of one reading is a guess.
+/// Maximum variance of a value, over that of one reading; a value above it is a guess.
 const MOST_VARIANCE: f64 = 2.0;
 
-/// Largest mean square distance of the readings that count, in variances of the weights: 2 in the open, 3.6 between four readings half a
-/// cut-off apart, more in a hole.
+/// Maximum mean square distance of the weighted readings, in variances of the weights: it is 2 in the open, 3.6
+/// between four readings half a cut-off apart, and more in a hole.
 const MOST_SPREAD: f64 = 4.5;
 
 /// Order of the polynomial that the filter lets pass unchanged.
@@ -55,10 +58,10 @@ pub enum Order {
 }
 
 impl Order {
-    /// Returns alpha, the width of the weights over the cut-off, by which one half passes at the cut-off.
+    /// Returns alpha, the width of the weights over the cut-off, with which one half passes at the cut-off.
     ///
-    /// With u = (2 pi sigma / cutoff)^2 / 2 a constant or plane passes exp(-u) of a wave, a quadric (1 + u) exp(-u). They are one half
-    /// at u = ln 2 and 1.678347, and alpha = sqrt(u / pi).
+    /// With u = (2 pi sigma / cutoff)^2 / 2 a constant or plane passes exp(-u) of a wave, a quadric (1 + u) exp(-u).
+    /// Each is one half at u = ln 2 and at u = 1.678347, respectively, and alpha = sqrt(u / pi).
     pub fn alpha(self) -> f64 {
         match self {
             Self::Constant | Self::Plane => 0.469_718_639_349_825_66,
@@ -66,7 +69,7 @@ impl Order {
         }
     }
 
-    /// Returns the share of a wave's amplitude that passes in the open, its length in cut-offs.
+    /// Returns the share of a wave's amplitude that passes in the open, for a wavelength in cut-offs.
     pub fn passes(self, wavelength_in_cutoffs: f64) -> f64 {
         let u = PI * (self.alpha() / wavelength_in_cutoffs).powi(2);
         if self == Self::Quadric { (1.0 + u) * (-u).exp() } else { (-u).exp() }
@@ -81,12 +84,12 @@ impl Order {
     }
 }
 
-/// Exponents of x and y of the terms of a polynomial, by degree.
+/// Exponents of x and y of the terms of a polynomial, ordered by degree.
 const TERMS: [[usize; 2]; 6] = [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]];
-/// Moments up to the fourth degree.
+/// Number of moments up to the fourth degree.
 const MOMENTS: usize = 15;
 
-/// Returns where the moment of x^a y^b stands: by degree, then by b.
+/// Returns the index of the moment of x^a y^b: ordered by degree, then by b.
 const fn moment(a: usize, b: usize) -> usize {
     (a + b) * (a + b + 1) / 2 + b
 }
@@ -95,48 +98,50 @@ const fn terms(degree: usize) -> usize {
     (degree + 1) * (degree + 2) / 2
 }
 
-/// A Gaussian filter.
+/// Gaussian filter of a cut-off and an order.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Gaussian {
     pub cutoff_mm: f64,
     pub order: Order,
 }
 
-/// What a filter found at every node of its grid.
+/// Result of a filter at every node of its grid.
 #[derive(Clone, Debug)]
 pub(super) struct Filtered {
     pub grid: Grid,
-    /// Filtered values; 0 where not supported.
+    /// Filtered values; 0 at nodes that are not supported.
     pub values: Vec<f64>,
     /// Slopes of the fitted polynomial along x and y, per millimetre.
     pub slopes: Vec<[f64; 2]>,
-    /// Share that a reading of weight 1 at the node would have in the value there.
+    /// Share that a reading of weight 1 at the node has in the value there.
     pub leverage: Vec<f64>,
     /// Variance of the value over that of one reading.
     pub variance: Vec<f64>,
-    /// Whether there are enough readings around a node, and not all to one side.
+    /// True for a node with enough readings around it that do not all lie to one side.
     pub supported: Vec<bool>,
 }
 
 impl Gaussian {
-    /// Share of a reading in the value at its place times the readings to the square millimetre, in the open.
+    /// Returns the product of leverage and density in the open: the share of a reading in the value at its place,
+    /// times the number of readings per square millimetre.
     pub fn open_leverage(&self) -> f64 {
         let weight = (self.order.alpha() * self.cutoff_mm).powi(2);
         if self.order == Order::Quadric { 2.0 / weight } else { 1.0 / weight }
     }
 
-    /// Standard deviation of the weights, in millimetres.
+    /// Returns the standard deviation of the weights, in millimetres.
     fn sigma_mm(&self) -> f64 {
         self.order.alpha() * self.cutoff_mm / (2.0 * PI).sqrt()
     }
 
-    /// Returns how many steps a grid's spacing must be divided into along x and y for this filter.
+    /// Returns the number of steps into which a grid's spacing must be divided along x and y for this filter.
     pub fn division(&self, grid: &Grid) -> [usize; 2] {
         let widest_mm = WIDEST_STEP * self.sigma_mm();
         grid.spacing_mm.map(|spacing| (spacing / widest_mm).ceil().clamp(1.0, 1e6) as usize)
     }
 
-    /// Filters values that lie anywhere over a grid; `weights` are factors from 0 to 1, one for each.
+    /// Filters values at arbitrary places and returns the result on a grid; `weights` holds a factor from 0 to 1 for
+    /// each value.
     pub fn scattered(&self, places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, grid: &Grid) -> Filtered {
         let degree = self.order.degree();
         let trend = Trend::fit(places, values, degree);
@@ -151,7 +156,7 @@ impl Gaussian {
         filtered
     }
 
-    /// Filters values at the nodes of a grid, of those that are valid.
+    /// Filters values at the nodes of a grid; uses only the nodes with a weight above 0.
     pub fn on_grid(&self, values: &[f64], weights: &[f64], grid: &Grid) -> Filtered {
         let degree = self.order.degree();
         let (places, known): (Vec<[f64; 2]>, Vec<f64>) =
@@ -172,7 +177,7 @@ impl Gaussian {
         filtered
     }
 
-    /// Reach of the weights along x and y, in nodes.
+    /// Returns the reach of the weights along x and y, in nodes.
     fn taps(&self, grid: &Grid) -> [usize; 2] {
         [0, 1].map(|k| {
             let nodes = grid.counts()[k];
@@ -186,7 +191,7 @@ impl Gaussian {
         let kernels = |scale: f64, most: usize| {
             [0, 1].map(|k| kernels(most, scale, grid.spacing_mm[k] / sigma_mm, spread[k], taps[k]))
         };
-        // Where the readings lie about a node is asked for whatever the order.
+        // The check for one-sided readings needs the second moments, whatever the order.
         let most = (2 * degree).max(2);
         let ([wx, wy], [qx, qy]) = (kernels(1.0, most), kernels(2f64.sqrt(), 2 * degree));
         let weight = Summed::along_x(channels, &channels.weight, &wx);
@@ -243,7 +248,7 @@ fn node(order: Order, sums: &[Vec<Vec<f64>>; 3], i: usize) -> Node {
     }
 }
 
-/// Solves the normal equations of a polynomial of P terms about a node.
+/// Solves the normal equations of a polynomial of P terms about a node; returns `None` if the node is not supported.
 fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2: &[f64; MOMENTS]) -> Node {
     if one_sided(weight) {
         return None;
@@ -253,7 +258,7 @@ fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2:
     };
     let solved = gram(weight).cholesky()?;
     let terms = solved.solve(&SVector::<f64, P>::from_fn(|r, _| value[r]));
-    // The row of the inverse that gives the height: its readings' shares are weight times this polynomial.
+    // Row of the inverse that gives the height: the share of a reading is its weight times this polynomial.
     let share = solved.solve(&SVector::<f64, P>::from_fn(|r, _| if r == 0 { 1.0 } else { 0.0 }));
     let variance = share.dot(&(gram(weight2) * share));
     let slope = |k: usize| if P > 1 { terms[k.min(P - 1)] } else { 0.0 };
@@ -261,25 +266,28 @@ fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2:
     (variance <= MOST_VARIANCE && node.iter().all(|v| v.is_finite())).then_some(node)
 }
 
-/// Whether the readings lie on a line, farther to one side than they are wide, or all far away as around a hole: a polynomial would
-/// be extrapolated, or span what nobody has seen.
+/// Returns true if the readings lie on a line, farther to one side than their own spread, or all far away, as around
+/// a hole.
+///
+/// There a polynomial would extrapolate, or bridge an area without any reading.
 fn one_sided(m: &[f64; MOMENTS]) -> bool {
     let (mx, my) = (m[1] / m[0], m[2] / m[0]);
     let (cxx, cxy, cyy) = (m[3] / m[0] - mx * mx, m[4] / m[0] - mx * my, m[5] / m[0] - my * my);
     let spread = cxx + cyy;
-    // At the corner of a dense square the mean is off by 1.8 of the spread; one standard deviation off a straight edge by 1.9.
+    // At the corner of a dense square the squared offset of the mean is 1.8 of the spread; one standard deviation
+    // outside a straight edge it is 1.9.
     let inside = cxx * cyy - cxy * cxy > 1e-4 * spread * spread && mx * mx + my * my <= 2.0 * spread;
     !inside || spread > MOST_SPREAD
 }
 
-/// Sampled sums on a grid with a border as wide as the reach.
+/// Sampled sums on a grid with a border that is as wide as the reach.
 struct Channels {
     columns: usize,
     rows: usize,
     border: [usize; 2],
     weight: Vec<f64>,
     value: Vec<f64>,
-    /// Squares of the weights; empty where all are 0 or 1.
+    /// Squares of the weights; empty if all weights are 0 or 1.
     weight2: Vec<f64>,
 }
 
@@ -308,7 +316,7 @@ impl Channels {
     }
 }
 
-/// Spreads readings over the nodes about them.
+/// Spreads readings over the nodes around them.
 fn spread_out(
     places: &[[f64; 2]],
     values: &[f64],
@@ -316,7 +324,7 @@ fn spread_out(
     grid: &Grid,
     border: [usize; 2],
 ) -> Channels {
-    // The number of parts depends on the sizes alone, so that sums are the same on every machine.
+    // The number of parts depends on the sizes alone, so that the sums are the same on every machine.
     let nodes = (grid.columns + 2 * border[0]) * (grid.rows + 2 * border[1]);
     let parts = if nodes < 4 * places.len() { 4 } else { 1 };
     let size = places.len().div_ceil(parts).max(1);
@@ -353,7 +361,8 @@ fn spread_one(
         let at = (place[k] - grid.first_mm[k]) / grid.spacing_mm[k];
         let nearest = at.round().clamp(0.0, last as f64);
         first[k] = nearest as usize;
-        // exp(-((n - d) / s)^2 / 2), from two exponentials: that of n^2 is a constant, that of n d a power.
+        // exp(-((n - d) / s)^2 / 2) from two exponentials: the factor in n^2 is a constant, the factor in n d is a
+        // power.
         let off = at - nearest;
         let (middle, ratio) = ((-0.5 * (off / SPREAD).powi(2)).exp(), (off / (SPREAD * SPREAD)).exp());
         let mut shares = [middle * peaks[0]; 2 * SPREAD_REACH + 1];
@@ -380,11 +389,13 @@ fn spread_one(
     }
 }
 
-/// Returns the sampled kernels that give the moments t^0 .. t^most of the weights exp(-(scale t)^2 / 2) after spreading.
+/// Returns the sampled kernels that give the moments t^0 .. t^most of the weights exp(-(scale t)^2 / 2) after
+/// spreading.
 ///
-/// t is the distance of a reading from the node in standard deviations, `step` that of the nodes, `spread` the width by which
-/// readings were spread. With G the wanted Gaussian, G = S * T for the spreading S and a narrower T, t^k G is a sum of derivatives of
-/// G, and each is S convolved with the same derivative of T: a Hermite polynomial times T.
+/// t is the distance of a reading from the node in standard deviations, `step` the spacing of the nodes and `spread`
+/// the width of the spreading, both in the same unit. With G the required Gaussian, G = S * T for the spreading S and
+/// a narrower Gaussian T. t^k G is a sum of derivatives of G, and each of them is S convolved with the same
+/// derivative of T: a Hermite polynomial times T.
 fn kernels(most: usize, scale: f64, step: f64, spread: f64, taps: usize) -> Vec<Vec<f64>> {
     let tau = (1.0 - (scale * spread).powi(2)).sqrt();
     let (t1, t2) = (1.0 / tau, 1.0 / (tau * tau));
@@ -407,7 +418,7 @@ fn kernels(most: usize, scale: f64, step: f64, spread: f64, taps: usize) -> Vec<
         .collect()
 }
 
-/// Sums along x of one channel, for each power of x.
+/// Sums of one channel along x, for each power of x.
 struct Summed {
     columns: usize,
     powers: Vec<Vec<f64>>,
@@ -422,7 +433,7 @@ impl Summed {
                 let mut sums = vec![0.0; columns * channels.rows];
                 let rows = sums.par_chunks_mut(columns).zip(channel.par_chunks(channels.columns));
                 rows.with_min_len(8).for_each(|(out, row)| {
-                    // Most rows of the border, and holes, are empty.
+                    // Most rows of the border, and rows in holes, are empty.
                     if row.iter().any(|v| *v != 0.0) {
                         for (tap, factor) in kernel.iter().enumerate() {
                             out.iter_mut().zip(&row[tap..]).for_each(|(sum, v)| *sum += factor * v);
@@ -435,7 +446,7 @@ impl Summed {
         Self { columns, powers }
     }
 
-    /// Returns the moments up to a degree along one row of nodes, by [`moment`].
+    /// Returns the moments up to a degree along one row of nodes, indexed by [`moment`].
     fn along_y(&self, kernels: &[Vec<f64>], degree: usize, row: usize) -> Vec<Vec<f64>> {
         let mut moments = vec![vec![0.0; self.columns]; terms(degree)];
         for (a, sums) in self.powers.iter().enumerate().take(degree + 1) {
@@ -451,7 +462,7 @@ impl Summed {
     }
 }
 
-/// How many readings lie in any rectangle of nodes: sums of all to the left and below.
+/// Cumulative sums of readings to the left and below, which give the number of readings in any rectangle of nodes.
 struct Counts {
     grid: Grid,
     sums: Vec<u32>,
@@ -478,7 +489,7 @@ impl Counts {
         Self { grid: *grid, sums }
     }
 
-    /// Returns how many readings lie in the square about a node.
+    /// Returns the number of readings in the square around a node.
     fn within(&self, i: usize, j: usize, half_side_mm: f64) -> u32 {
         let range = |at: usize, k: usize, nodes: usize| {
             let reach = (half_side_mm / self.grid.spacing_mm[k]).round().min(1e9) as usize;
@@ -490,7 +501,7 @@ impl Counts {
     }
 }
 
-/// A polynomial over all readings, taken out before filtering.
+/// Polynomial over all readings, subtracted before filtering.
 pub(super) struct Trend {
     middle: [f64; 2],
     size: f64,
@@ -498,16 +509,16 @@ pub(super) struct Trend {
 }
 
 impl Trend {
-    /// Fits a polynomial of a degree up to 2, or of a lower one where the readings have no such.
+    /// Fits a polynomial of a degree up to 2, or of a lower degree if the readings do not determine this one.
     pub fn fit(places: &[[f64; 2]], values: &[f64], degree: usize) -> Self {
         let [low, high] = bounds(places.iter().copied());
         let middle = [0, 1].map(|k| 0.5 * (low[k] + high[k]));
         let size = 0.5 * (high[0] - low[0]).max(high[1] - low[1]).max(f64::MIN_POSITIVE);
         let mut trend = Self { middle, size, terms: Vec::new() };
-        // Readings on a line have no plane; their mean is always there.
+        // Readings on a line do not determine a plane; their mean always exists.
         trend.terms =
             (0..=degree).rev().find_map(|degree| trend.solve(places, values, terms(degree))).unwrap_or_default();
-        // Once more on what is left: normal equations lose half the digits, and this brings them back.
+        // Second solution on the residuals: normal equations lose half the digits, and this restores them.
         let rest: Vec<f64> = places.iter().zip(values).map(|(p, v)| v - trend.at(*p)).collect();
         let more = trend.solve(places, &rest, trend.terms.len()).unwrap_or_default();
         trend.terms.iter_mut().zip(more).for_each(|(term, more)| *term += more);
@@ -541,7 +552,7 @@ impl Trend {
         self.terms.iter().zip(self.basis(place)).map(|(term, basis)| term * basis).sum()
     }
 
-    /// Adds the polynomial to values and slopes at the nodes of a grid, of those that are wanted.
+    /// Adds the polynomial to values and slopes at the nodes of a grid for which `wanted` returns true.
     pub fn put_back(&self, grid: &Grid, wanted: impl Fn(usize) -> bool, values: &mut [f64], slopes: &mut [[f64; 2]]) {
         let term = |k: usize| self.terms.get(k).copied().unwrap_or(0.0);
         for k in (0..grid.len()).filter(|&k| wanted(k)) {
@@ -560,10 +571,10 @@ impl Filtered {
         trend.put_back(&self.grid, |k| supported[k], &mut self.values, &mut self.slopes);
     }
 
-    /// Returns value, leverage and variance at a place of the grid; `None` where no node about it is supported.
+    /// Returns value, leverage and variance at a place of the grid; `None` if no node around it is supported.
     ///
-    /// The values and half the slopes of the four nodes about a place, weighed as for a bilinear value, are right up to the third
-    /// derivative: the error of the one makes up for that of the other.
+    /// The values plus half the slopes of the four nodes around a place, weighted as for a bilinear value, are right
+    /// up to the third derivative: the error of the one cancels the error of the other.
     pub fn at(&self, place: [f64; 2]) -> Option<[f64; 3]> {
         let grid = &self.grid;
         let [(i, u), (j, v)] = grid.cell(place);
@@ -576,7 +587,7 @@ impl Filtered {
         if total < 1e-6 {
             return None;
         }
-        // With a corner missing the others' values are brought to the place along their slopes.
+        // If a corner is missing, the values of the others are extended to the place along their full slopes.
         let along = if total > 1.0 - 1e-9 { 0.5 } else { 1.0 };
         let mut sums = [0.0; 3];
         for (node, share) in corners.into_iter().filter(|(_, share)| *share > 0.0) {

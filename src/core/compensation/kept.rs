@@ -1,8 +1,8 @@
-//! The readings that a map is made of.
+//! Readings that a map is computed from.
 
 use crate::geometry::Sample;
 
-/// The readings that are used, places and values apart.
+/// Inlier readings: their places and values in separate vectors.
 pub(super) struct Kept {
     pub places: Vec<[f64; 2]>,
     pub values: Vec<f64>,

@@ -1,24 +1,29 @@
-//! What the grinder leaves in every pass, learned pass by pass, and how much of it to take back.
+//! Repeatable error of the grinder, learned pass by pass, and the share of it to compensate.
 //!
-//! A measured error is e = R + s u + N: R comes back in every pass, u is the correction, s the share of it that the part answers
-//! with, and N is drawn afresh each time, by the grinder and by the measurement, so that nothing can take it away. A correction that takes
-//! all of e back grinds the N of the last pass into the next one. So every pass tells e - s u = R + N, and R is estimated from all of
-//! them in two steps, for each band of wavelengths by itself: an octave each, from the cut-off up.
+//! A measured error is e = R + s u + N. R is the repeatable error, the same in every pass. u is the correction, and s
+//! is the response: the share of u that the part answers with. N is the non-repeatable error (noise) of grinder and
+//! measurement: it is new in every pass, and nothing can compensate it. A correction that takes back all of e grinds
+//! the N of the last pass into the next one. So every pass gives an observation e - s u = R + N. R is estimated from
+//! all of them in two steps, separately for each band of wavelengths: one octave each, from the cut-off up.
 //!
-//! A Kalman filter makes the mean. With p for the variance of the mean over that of N, the share of the newest pass in it and
-//! what is known afterwards are
+//! A Kalman filter estimates the mean. With p for the variance of the mean over that of N, the gain g of the newest
+//! pass and the variance p' afterwards are
 //!
 //! ```text
 //!  g = p / (1 + p)        p' = p / (1 + p) + q
 //! ```
 //!
-//! From nothing (p without bound) these are the shares 1, 1/2, 1/3 of a plain mean, which leaves N sqrt(1 + 1/k) after k passes; q keeps
-//! the filter awake to a machine that drifts. When s is known better the mean is told anew so that the correction it asks for stays: a small
-//! error of s would otherwise be ground in times all of R, where now it only counts for what is still seen of it.
-//! Then Wiener's share of the mean m is believed, 1 - p' |N|^2 / |m|^2: where nothing stands out of the scatter, nothing is taken back. What
-//! passes differ by tells |N|^2; before that, unless it is stated, only the noise of the points is known, and its share of each band
-//! follows from the filter. Of a scatter that was stated as a whole each band is given as much, until passes tell; as that is only its mean, the share is that
-//! of all scatters with this mean (the exponential distribution says least beside it): with c = |m|^2 / (p' |N|^2), 1 - (1 - exp(-c)) / c.
+//! Without prior knowledge (p without bound) the gains are 1, 1/2, 1/3, those of a plain mean, which leaves
+//! N sqrt(1 + 1/k) after k passes. The process noise q keeps the filter responsive to a machine that drifts. When the
+//! estimate of s improves, the mean is scaled so that its correction stays the same. Otherwise a small error of s would
+//! multiply all of R and be ground in; this way it multiplies only the error that is still measured.
+//!
+//! Then the mean m is shrunk by Wiener's share, 1 - p' |N|^2 / |m|^2: where nothing exceeds the noise, nothing is
+//! taken back. The differences between passes give |N|^2. Before there are any, and unless |N|^2 is stated, only the
+//! noise of the points is known, and its share of each band follows from the filter. If the noise is stated for all
+//! bands together, each band gets an equal part of it until passes give their own estimate. This part is only a mean,
+//! so the share is then the average over all noise variances with this mean, exponentially distributed (the
+//! distribution of maximum entropy for a given mean): with c = |m|^2 / (p' |N|^2), 1 - (1 - exp(-c)) / c.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,18 +33,21 @@ use super::map::{ErrorMap, MapOptions, filter_grid};
 use super::response::{Response, Sense};
 use crate::geometry::Grid;
 
-/// Variance by which a pass makes what is believed of R older, over that of N.
+/// Process noise: variance that one pass adds to that of the estimate of R, over the variance of N.
 const DRIFT: f64 = 0.02;
-/// The same from one part to the next: another blank, dressed anew, in a machine that has cooled.
+/// Process noise from one part to the next: another blank, a newly dressed wheel, a machine that has cooled.
 const DRIFT_TO_NEXT_PART: f64 = 0.3;
-/// An error so many standard deviations of a mean square above what is expected is a change of the machine and not its scatter.
+/// Threshold for a change of the machine: number of standard deviations by which the mean square of the innovation
+/// exceeds its expectation. Below it the innovation counts as noise.
 const CHANGED_SIGMAS: f64 = 6.0;
-/// Scatter is correlated over longer ways than the shortest waves, so that so many of its values make one that is independent.
+/// Number of values of the noise that make one independent value: noise is correlated over longer distances than the
+/// shortest waves.
 pub(super) const CORRELATED: f64 = 4.0;
-/// Standard uncertainty of s before anything answered, and what another part adds to it.
+/// Standard uncertainty of s before any pass has answered.
 const RESPONSE_SIGMA: f64 = 0.1;
+/// Standard uncertainty that another part adds to s.
 const RESPONSE_SIGMA_OF_NEXT_PART: f64 = 0.02;
-/// A response outside this is none of the correction alone, and not believed.
+/// Limits of a credible response; one outside them has other causes than the correction and is ignored.
 pub(super) const RESPONSE_LIMITS: [f64; 2] = [0.5, 1.5];
 
 /// By what is chosen how much of an error is taken back.
@@ -57,27 +65,27 @@ pub enum GainRule {
     Wavelength,
 }
 
-/// What is known of one band of wavelengths.
+/// State of the estimate in one band of wavelengths.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Band {
-    /// Waves longer than this belong to it, in millimetres.
+    /// Shortest wavelength of the band, in millimetres.
     pub(super) from_mm: f64,
     /// Variance of the mean over that of N; `None` while nothing is known.
     pub(super) belief: Option<f64>,
-    /// Sum of what passes told of the variance of N, in square millimetres, and of how many.
+    /// Sum of the estimates of the variance of N, in square millimetres, and their weighted count.
     pub(super) scatter: [f64; 2],
-    /// The share that the newest pass has in the mean.
+    /// Gain of the newest pass in the mean.
     pub(super) gain: f64,
-    /// The share of the mean that is believed.
+    /// Share of the mean that remains after shrinkage.
     pub(super) share: f64,
-    /// Whether the last pass was taken for that of a machine that has changed.
+    /// True if the last pass was treated as that of a machine that has changed.
     pub(super) changed: bool,
-    /// The share that what other machines taught still has in the mean: that is no evidence of this one.
+    /// Share of the mean that still comes from other machines; it is no evidence of this machine.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub(super) borrowed: f64,
 }
 
-/// The mean of what passes told of R, each by its share.
+/// Weighted mean of the observations of R, on the grid of the correction.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Mean {
     #[serde(rename = "net")]
@@ -85,66 +93,71 @@ pub(super) struct Mean {
     pub(super) values_mm: Vec<f64>,
 }
 
-/// An error on the grid of a correction.
+/// Error on the grid of a correction.
 pub(super) struct ErrorOnGrid {
     pub(super) grid: Grid,
     pub(super) error_mm: Vec<f64>,
     pub(super) valid: Vec<bool>,
-    /// Mean square of the standard uncertainty of a node from the noise of the points.
+    /// Mean square of the standard uncertainty of a node that comes from the noise of the points, in square
+    /// millimetres.
     pub(super) noise_mm2: f64,
 }
 
-/// What is known of the error that comes back in every pass.
+/// State of the estimate of the repeatable error.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LearningState {
     rule: GainRule,
-    /// Change of the surface over change of the correction, and its standard uncertainty.
+    /// Response (change of the surface over change of the correction) and its standard uncertainty.
     pub(super) response: [f64; 2],
-    /// From the shortest waves to the longest.
+    /// Bands from the shortest waves to the longest.
     pub(super) bands: Vec<Band>,
-    /// All wavelengths together: bands overlap, so that their scatters do not add up to that of the whole.
+    /// Band of all wavelengths together: bands overlap, so that their noise variances do not add up to that of the
+    /// whole.
     pub(super) whole: Band,
-    /// Passes that it was learned from.
+    /// Number of passes that this state was learned from.
     passes: u32,
-    /// On the grid of the correction.
+    /// Estimate of R, on the grid of the correction.
     pub(super) mean: Option<Mean>,
-    /// What the pass after the last one taken in is to be corrected by, on the grid of the correction.
+    /// Correction of the pass after the last one processed, in millimetres, on the grid of the correction.
     #[serde(skip)]
     pub(super) wanted_mm: Option<Vec<f64>>,
 }
 
-/// What the next pass is expected to leave.
+/// Error that the next pass is expected to leave.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Forecast {
-    /// Root mean square of the error that is expected, in millimetres.
+    /// Expected root mean square of the error, in millimetres.
     pub rms_mm: f64,
-    /// Its standard deviation from part to part, in millimetres.
+    /// Standard deviation of `rms_mm` from part to part, in millimetres.
     pub sigma_mm: f64,
-    /// Root mean square that no correction can go below, in millimetres, the scallops between the tracks included; `None` while only one pass was
-    /// seen.
+    /// Root mean square that no correction can go below, in millimetres, including the scallops between the tracks;
+    /// `None` while the non-repeatable error is unknown, as after only one pass.
     pub floor_mm: Option<f64>,
 }
 
 /// One measured pass.
 #[derive(Clone, Copy)]
 pub struct Seen<'a> {
-    /// What it was ground with.
+    /// Correction that the pass was ground with.
     pub correction: &'a Correction,
-    /// What it left.
+    /// Error that the pass left.
     pub error: &'a ErrorMap,
-    /// How the part answered to the change of the correction, after the first pass.
+    /// Response of the part to the change of the correction; `None` for the first pass.
     pub answer: Option<Response>,
-    /// What of something that comes back in every pass, given on the grid of the correction in millimetres, parameters and slides of the machine
-    /// make; none where it is not looked for.
+    /// Function that extracts the part of a repeatable error that parameters and slides of the machine explain;
+    /// `None` if these are not estimated.
     pub smooth: Option<Smoother<'a>>,
 }
 
-/// Tells what of values at the nodes of the correction is that of parameters and slides of the machine.
+/// Function of values at the nodes of the correction, in millimetres, that returns the part of them that parameters
+/// and slides of the machine explain, at the same nodes.
 pub type Smoother<'a> = &'a (dyn Fn(&[f64]) -> Vec<f64> + Sync);
 
 impl LearningState {
-    /// Knows nothing yet. `repeatability_mm` is the rms of what a pass adds by itself, where that is known from elsewhere; it is shared out
-    /// over the bands alike.
+    /// Creates a state without knowledge of any pass.
+    ///
+    /// `repeatability_mm` is the rms of the non-repeatable error of a pass, if it is known from elsewhere; its
+    /// variance is divided equally between the bands.
     pub fn new(rule: GainRule, map: &MapOptions, size_mm: [f64; 2], repeatability_mm: Option<f64>) -> Self {
         let mut edges = vec![map.cutoff_mm];
         if rule == GainRule::Wavelength {
@@ -158,7 +171,8 @@ impl LearningState {
             Band { from_mm, belief: None, scatter, gain: 1.0, share: 1.0, changed: false, borrowed: 0.0 }
         };
         let whole = band(map.cutoff_mm, 1.0, 1.0);
-        // How it is shared out over several nobody stated: in each that counts for one of the values of which a pass has many.
+        // Its division between several bands is unknown, so in each band it weighs as one of the many values of a
+        // pass.
         let stated = |from_mm: f64| match rule {
             GainRule::Wavelength => (CORRELATED * independent_values(size_mm[0] * size_mm[1], from_mm)).recip(),
             GainRule::Fixed(_) | GainRule::Adaptive => 1.0,
@@ -175,9 +189,9 @@ impl LearningState {
         }
     }
 
-    /// Takes in what a pass left; afterwards [`Self::wanted_mm`] tells the next correction.
+    /// Updates the state with the error of a pass; afterwards [`Self::wanted_mm`] returns the next correction.
     ///
-    /// Of a pass that was not ground as it was commanded nothing is learned, and the next one is asked for the same again.
+    /// From a pass that was not ground as commanded nothing is learned, and the same correction is commanded again.
     pub fn after(&self, seen: &Seen) -> Self {
         let mut known = self.clone();
         if seen.answer.is_some_and(|answer| !matches!(answer.sense, Sense::AsCommanded | Sense::Unclear)) {
@@ -198,7 +212,7 @@ impl LearningState {
             band.take_in(told.mean_square(&news), band.independent(&told));
             add(&mut mean.values_mm, band.gain, &news);
         }
-        // All points together tell it: it is believed as it is, and bands shrink what is left beside it.
+        // All points together determine the smooth part: it is used in full, and the bands shrink only the rest.
         let mut believed = seen.smooth.map_or_else(|| vec![0.0; told.grid.len()], |smooth| smooth(&mean.values_mm));
         let rest: Vec<f64> = mean.values_mm.iter().zip(&believed).map(|(mean, smooth)| mean - smooth).collect();
         let noise = known.noise_mm2(told.noise_mm2);
@@ -218,13 +232,13 @@ impl LearningState {
         known
     }
 
-    /// Returns what the correction of the next pass is, in millimetres, at each node of the grid of the last one; `None` before a pass of
-    /// this part was taken in.
+    /// Returns the correction of the next pass, in millimetres, at each node of the grid of the last one; `None`
+    /// before a pass of this part was processed.
     pub fn wanted_mm(&self) -> Option<&[f64]> {
         self.wanted_mm.as_deref()
     }
 
-    /// Returns what the next part of the same kind begins with.
+    /// Returns the state that the next part of the same kind begins with.
     pub fn for_next_part(&self) -> Self {
         let mut known = self.clone();
         for band in known.bands.iter_mut().chain([&mut known.whole]) {
@@ -236,10 +250,11 @@ impl LearningState {
         known
     }
 
-    /// Returns what the pass after this error is expected to leave, with scallops of this rms between its tracks.
+    /// Returns the expected error of the pass after this error, for scallops of the given rms between its tracks.
     ///
-    /// What is too fine for the map stays: the scatter of the points, and the scallops. A probe that reaches the bottom of the grooves has felt
-    /// them already, so that the greater of what was found and of what is known to be there counts, and not both.
+    /// Structure too fine for the map remains: the noise of the points, and the scallops. A probe that reaches the
+    /// bottom of the grooves has already measured the scallops. So the larger of the measured residuals and the known
+    /// scallops counts, not their sum.
     pub fn forecast(&self, error: &ErrorMap, scallops_mm: f64) -> Forecast {
         let rest2 = error.residual_sigma_mm.max(scallops_mm).powi(2);
         let (mut left2, mut scatter2, mut independent) = (0.0, 0.0, 0.0);
@@ -248,8 +263,8 @@ impl LearningState {
         for ((band, values), noise_mm2) in self.bands.iter().zip(self.split(&told, told.error_mm.clone())).zip(noise) {
             let seen2 = told.mean_square(&values);
             let [n2, taken] = [band.scatter_mm2().unwrap_or(noise_mm2), self.taken(band)];
-            // What comes back and is not taken back, the scatter that is ground in and that of the next pass; and what is taken back by a
-            // response that is known that well only.
+            // Sum of: the repeatable error that is not compensated, the noise that the correction grinds in, the
+            // noise of the next pass, and the error from the uncertainty of the response.
             let left = match (self.rule, band.scatter_mm2(), band.belief) {
                 (GainRule::Adaptive | GainRule::Wavelength, Some(_), Some(belief)) => n2 * (1.0 + band.share * belief),
                 _ => (1.0 - taken).powi(2) * (seen2 - n2).max(0.0) + n2 * (1.0 + taken * taken),
@@ -258,43 +273,46 @@ impl LearningState {
             scatter2 += n2;
             independent += band.independent(&told);
         }
-        // What bands have in common is in none of them.
+        // Bands overlap, so their mean squares do not add up to that of the whole; the ratio of the noise corrects
+        // for this.
         let whole2 = self.whole.scatter_mm2().unwrap_or(scatter2);
         let in_common = if scatter2 > 0.0 { whole2 / scatter2 } else { 1.0 };
         let rms_mm = (rest2 + in_common * left2).sqrt();
-        // The rms of m independent values scatters by 1 / sqrt(2 m); while N is a guess, so is the forecast.
+        // The rms of m independent values varies by 1 / sqrt(2 m), relatively. While N is a guess, so is the
+        // forecast.
         let known = self.bands.iter().all(|band| band.scatter[1] > 0.0 && !(band.is_guessed() && band.borrowed > 0.0));
         let relative = if known { 1.0 / (2.0 * independent).sqrt() } else { 0.5 };
         Forecast { rms_mm, sigma_mm: relative * rms_mm, floor_mm: known.then(|| (rest2 + whole2).sqrt()) }
     }
 
-    /// Returns the share of the newest error that is taken back, from the shortest waves to the longest, with the wavelength from which each
-    /// counts.
+    /// Returns the share of the newest error that is compensated in each band, with the shortest wavelength of the
+    /// band in millimetres first: `[from_mm, share]`, from the shortest waves to the longest.
     pub fn gains(&self) -> Vec<[f64; 2]> {
         self.bands.iter().map(|band| [band.from_mm, self.taken(band)]).collect()
     }
 
-    /// The share of the newest error that is taken back.
+    /// Returns the share of the newest error that is compensated in a band.
     fn taken(&self, band: &Band) -> f64 {
         if let GainRule::Fixed(share) = self.rule { share } else { band.gain * band.share }
     }
 
-    /// Returns the share of a correction that the part answers with, and its standard uncertainty.
+    /// Returns the response, the share of a correction that the part answers with, and its standard uncertainty.
     pub fn response(&self) -> [f64; 2] {
         self.response
     }
 
-    /// Returns the rms of what a pass adds by itself, in millimetres, as far as passes have told.
+    /// Returns the rms of the non-repeatable error of a pass, in millimetres; `None` while it is neither stated nor
+    /// estimated.
     pub fn scatter_mm(&self) -> Option<f64> {
         self.whole.scatter_mm2().map(f64::sqrt)
     }
 
-    /// Returns the number of passes that this was learned from.
+    /// Returns the number of passes that this state was learned from.
     pub fn passes(&self) -> u32 {
         self.passes
     }
 
-    /// Whether every number is one that can be, for what was read from a file.
+    /// Returns true if every number is in its valid range, for a state read from a file.
     pub fn is_sound(&self) -> bool {
         let number = |v: f64| v.is_finite() && v >= 0.0;
         let [least, most] = RESPONSE_LIMITS;
@@ -317,7 +335,7 @@ impl LearningState {
             && self.bands.windows(2).all(|w| w[0].from_mm < w[1].from_mm)
     }
 
-    /// Splits values on the grid of an error into what each band holds of them; the parts add up to the values.
+    /// Splits values on the grid of an error into their parts in each band; the parts add up to the values.
     pub(super) fn split(&self, told: &ErrorOnGrid, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
         let whole = rest.clone();
@@ -330,11 +348,12 @@ impl LearningState {
         parts
     }
 
-    /// What the noise of the measured points leaves in each band of a map, as a mean square, given that of the whole.
+    /// Returns the noise of the measured points in each band of a map, as a mean square, given that of the whole map.
     ///
-    /// Equation: white noise below a Gaussian of width s has a power of 1 / s^2, and between two of widths s and t one of
-    /// 1 / s^2 + 1 / t^2 - 4 / (s^2 + t^2). The map has been through the Gaussian of the cut-off already, so that the widths add up in
-    /// squares. That is so in the open; near the border the longest waves take up to twice as much.
+    /// Equation: white noise that passes a Gaussian of width s has a power of 1 / s^2. Between two Gaussians of
+    /// widths s and t its power is 1 / s^2 + 1 / t^2 - 4 / (s^2 + t^2). The map has already passed the Gaussian of
+    /// the cut-off, so that the squares of the widths add up. This holds in the open; near the border the longest
+    /// waves contain up to twice as much.
     fn noise_mm2(&self, whole_mm2: f64) -> Vec<f64> {
         let first2 = self.bands[0].from_mm.powi(2);
         let width2 = |k: usize| if k == 0 { 1.0 } else { 1.0 + self.bands[k].from_mm.powi(2) / first2 };
@@ -345,7 +364,8 @@ impl LearningState {
 }
 
 impl Mean {
-    /// The mean times a factor, on a grid: as it is where it stands on it, what lies between its nodes otherwise, and nothing without any.
+    /// Returns the mean times a factor on a grid: unchanged on its own grid, interpolated on another one, 0 if there
+    /// is no mean.
     fn on(mean: Option<&Self>, grid: Grid, factor: f64) -> Self {
         let mut values_mm = mean.map_or_else(|| vec![0.0; grid.len()], |m| m.grid.resample(&m.values_mm, &grid));
         values_mm.iter_mut().for_each(|value| *value *= factor);
@@ -354,8 +374,10 @@ impl Mean {
 }
 
 impl ErrorOnGrid {
-    /// An error on another grid: everything that is learned stands on the grid of the correction, so that only the error, which becomes
-    /// small, is ever taken from between nodes.
+    /// Returns an error on another grid, that of the correction.
+    ///
+    /// All learned values are on the grid of the correction, so that only the error, which becomes small, is ever
+    /// interpolated.
     fn of(error: &ErrorMap, grid: Grid) -> Self {
         let noise_mm2 = mean_square(&error.valid, &error.sigma_mm);
         let valid = (0..grid.len()).map(|k| error.grid.nearest(grid.place_mm(k)).is_some_and(|node| error.valid[node]));
@@ -366,11 +388,11 @@ impl ErrorOnGrid {
         mean_square(&self.valid, values)
     }
 
-    /// Values without waves shorter than a wavelength.
+    /// Returns values without the waves that are shorter than `cutoff_mm`.
     fn low_passed(&self, values: &[f64], cutoff_mm: f64) -> Vec<f64> {
         match filter_grid(&self.grid, values, &self.valid, cutoff_mm, Order::default(), false) {
             Ok(smooth) => smooth.values,
-            // A map too small for this wavelength has no waves that are longer.
+            // A map too small for this wavelength contains no longer waves.
             Err(_) => vec![0.0; self.grid.len()],
         }
     }
@@ -382,25 +404,27 @@ impl Band {
         (count > 0.0).then(|| sum / count)
     }
 
-    /// Whether no pass has told how much of the scatter is in this band: only how much it is in all of them was stated.
+    /// Returns true if no pass has yet estimated the noise of this band, and only that of all bands together is
+    /// stated.
     fn is_guessed(&self) -> bool {
         self.scatter[1] > 0.0 && self.scatter[1] < 1.0
     }
 
-    /// Takes in the mean square of what a pass told beside what was believed.
+    /// Updates the band with the mean square of the innovation of a pass, from `independent` independent values.
     fn take_in(&mut self, news_mm2: f64, independent: f64) {
         let expected = self.belief.zip(self.scatter_mm2()).map(|(belief, n2)| (1.0 + belief) * n2);
         let changed = 1.0 + CHANGED_SIGMAS * (2.0 / independent * (1.0 + 1.0 / self.scatter[1].max(1.0))).sqrt();
         let stands_out = expected.is_some_and(|expected| news_mm2 > changed * expected);
         match self.belief {
-            // Not the scatter of before: the machine has changed, and what is believed of it counts for little.
+            // This exceeds the known noise: the machine has changed, and the earlier estimate of R counts for little.
             Some(_) if stands_out && !self.changed => {
                 self.belief = self.scatter_mm2().map(|n2| news_mm2 / n2 - 1.0).filter(|belief| belief.is_finite());
             }
-            // Nor was it a change, if the next pass stands out as well: what was known of the scatter was too little.
+            // A second outlying pass is no change: the noise was underestimated.
             Some(belief) if stands_out => self.scatter = [news_mm2 / (1.0 + belief), 1.0],
             Some(belief) => {
-                // How far other machines' word is off is a guess, and so is what is left for the scatter beside it.
+                // The uncertainty of a mean from other machines is a guess, and so is the noise that remains after
+                // it.
                 let counts = (1.0 + self.borrowed * belief).powi(-2);
                 self.scatter[0] += counts * news_mm2 / (1.0 + belief);
                 self.scatter[1] += counts;
@@ -413,16 +437,17 @@ impl Band {
         self.borrowed *= 1.0 - self.gain;
     }
 
-    /// Chooses the share of the mean, given by its mean square, that is believed; `noise_mm2` is what the points alone scatter by.
+    /// Computes the share of the mean that remains, from its mean square; `noise_mm2` is the noise of the points
+    /// alone.
     fn shrink(&mut self, mean_mm2: f64, noise_mm2: f64) {
         let of_mean_mm2 = self.scatter_mm2().unwrap_or(noise_mm2) * self.belief.unwrap_or(1.0);
         let over = mean_mm2 / of_mean_mm2;
         let share = if self.is_guessed() { 1.0 + (-over).exp_m1() / over } else { 1.0 - over.recip() };
-        // Of nothing all may be believed.
+        // 0 / 0: of a mean of 0 all may remain.
         self.share = if share.is_nan() { 1.0 } else { share.max(0.0) };
     }
 
-    /// Number of independent values that a map has in this band.
+    /// Returns the number of independent values that a map has in this band.
     pub(super) fn independent(&self, told: &ErrorOnGrid) -> f64 {
         let [dx, dy] = told.grid.spacing_mm;
         let area_mm2 = dx * dy * told.valid.iter().filter(|valid| **valid).count() as f64;
@@ -430,12 +455,13 @@ impl Band {
     }
 }
 
-/// Number of independent values on an area, of waves longer than this: [`CORRELATED`] squares of twice the shortest make one.
+/// Returns the number of independent values on an area for waves longer than `from_mm`: [`CORRELATED`] squares with
+/// sides of twice this wavelength make one.
 fn independent_values(area_mm2: f64, from_mm: f64) -> f64 {
     (area_mm2 / (2.0 * from_mm).powi(2) / CORRELATED).max(1.0)
 }
 
-/// What is believed of the response with an answer taken in, each by its certainty.
+/// Returns the response and its standard uncertainty after a new answer, as a mean weighted by inverse variance.
 fn combined([before, sigma]: [f64; 2], answer: &Response, independent: f64) -> [f64; 2] {
     let [least, most] = RESPONSE_LIMITS;
     if !(least..=most).contains(&answer.slope) {
@@ -450,7 +476,7 @@ fn is_zero(value: &f64) -> bool {
     *value == 0.0
 }
 
-/// Over what is valid.
+/// Returns the mean square of the valid values.
 fn mean_square(valid: &[bool], values: &[f64]) -> f64 {
     let used = || valid.iter().zip(values).filter(|(valid, _)| **valid);
     used().map(|(_, value)| value * value).sum::<f64>() / used().count().max(1) as f64
@@ -465,7 +491,7 @@ mod tests {
     use super::*;
 
     const GRID: Grid = Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
-    /// Bands from 2.5, 5 and 10 mm; an octave more would be half the part.
+    /// Bands from 2.5, 5 and 10 mm; a further octave would be half the part.
     const CUTOFF_MM: f64 = 2.5;
 
     fn begin(rule: GainRule, repeatability_mm: Option<f64>) -> LearningState {
@@ -489,7 +515,8 @@ mod tests {
         (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
     }
 
-    /// Scatter that no two passes share: a wave of its own for each of up to ten, so many of which fit on the part.
+    /// Noise that no two passes share: each of up to ten passes has its own wave, with a whole number of periods on
+    /// the part.
     fn scatter(pass: u32, rms_mm: f64) -> Vec<f64> {
         let number = f64::from(pass + 2) * std::f64::consts::TAU / 41.0;
         let at = |[x, _]: [f64; 2]| (number * x + f64::from(pass)).sin();
@@ -502,7 +529,8 @@ mod tests {
 
     #[test]
     fn from_nothing_the_mean_of_all_passes_is_taken_back() {
-        // An error far above the scatter is believed; its shares are those of a plain mean, a little more for a machine that may drift.
+        // An error far above the noise is used in full; its gains are those of a plain mean, slightly larger for a
+        // machine that may drift.
         let mut known = begin(GainRule::Adaptive, None);
         for pass in 1..=4 {
             let error = scatter(pass, 0.01).iter().map(|n| n + 1.0).collect();
@@ -515,11 +543,12 @@ mod tests {
 
     #[test]
     fn where_nothing_stands_out_of_the_scatter_nothing_is_taken_back() {
-        // Known scatter of 1 um in one band: of 2 um rms Wiener takes 1 - 1.02 / 4, of 0.5 um nothing.
+        // Known noise of 1 um in one band: of 2 um rms Wiener's share is 1 - 1.02 / 4, of 0.5 um it is 0.
         let gain = |rms_mm: f64| after(&begin(GainRule::Adaptive, Some(1e-3)), &none(), &map(|_| rms_mm)).gains()[0][1];
         assert!((gain(2e-3) - (1.0 - (1.0 + DRIFT) / 4.0)).abs() < 1e-12, "{}", gain(2e-3));
         assert_eq!(gain(0.5e-3), 0.0);
-        // Without a second pass the noise of the points is what is known: nearly all of it is in the shortest waves, and they are left.
+        // Without a second pass only the noise of the points is known: nearly all of it is in the shortest waves, so
+        // that these are not compensated.
         let noisy = |error: ErrorMap| ErrorMap { sigma_mm: vec![1e-3; GRID.len()], ..error };
         let short = noisy(map(|[x, _]| 0.9e-3 * (x * std::f64::consts::TAU / 4.0).sin()));
         let known = after(&begin(GainRule::Wavelength, None), &none(), &short);
@@ -533,7 +562,8 @@ mod tests {
 
     #[test]
     fn a_scatter_that_was_stated_as_a_whole_is_a_guess_in_each_band_until_passes_tell() {
-        // Three bands, a third of the stated 1 um^2 in each: of a mean of the same square 1 - (1 - 1 / e) is believed, of one far above all.
+        // Three bands, a third of the stated 1 um^2 in each: of a mean with this square 1 - (1 - 1 / e) remains, of
+        // one far above it nearly all.
         let known = begin(GainRule::Wavelength, Some(1e-3));
         let share = |mean_um: f64| {
             let mut band = Band { belief: Some(1.0), ..known.bands[0] };
@@ -543,7 +573,8 @@ mod tests {
         assert!((share((1.0f64 / 3.0).sqrt()) - (-1f64).exp()).abs() < 1e-12, "{}", share((1.0f64 / 3.0).sqrt()));
         assert!((share(10.0) - (1.0 - 1.0 / 300.0)).abs() < 1e-12, "{}", share(10.0));
         assert!(share(1e-3) < 1e-5, "{}", share(1e-3));
-        // What passes tell soon counts for more: 1,200 mm^2 are 48 squares of 5 mm, and the guess is worth one of these.
+        // The estimates of the passes soon outweigh it: 1,200 mm^2 are 48 squares of 5 mm, and the guess weighs as
+        // one of these.
         let mut band = Band { belief: Some(1.0), ..known.bands[0] };
         band.take_in(0.0, 3.0);
         assert!((band.scatter_mm2().unwrap() - 1e-6 / 3.0 / 49.0).abs() < 1e-12, "{:?}", band.scatter);
@@ -595,7 +626,7 @@ mod tests {
         for (u, e) in known.wanted_mm().unwrap().iter().zip(&form.values_mm) {
             assert!((u + e / known.response()[0]).abs() < 1e-15);
         }
-        // Four times what was asked for is no answer to it.
+        // Four times the commanded change is no answer to it.
         let wild = Response { slope: 4.0, ..answer };
         let known = begin(GainRule::Adaptive, None).after(&Seen {
             correction: &none(),
@@ -623,9 +654,11 @@ mod tests {
 
     #[test]
     fn a_better_response_counts_for_what_is_still_seen() {
-        // A part that answers with 0.8 of what is asked. By hand, in units of the error: the second pass leaves 0.2 and tells so; with a gain of
-        // 0.505 the mean is 0.901, of which 0.987 is believed beside a scatter of 0.2^2 / 2.02: 0.1105 is left. Then 0.344, 0.935, 0.9945
-        // and 0.0701. On a grid beside that of the correction, with a hole, so that what lies between nodes is lost.
+        // A part that answers with 0.8 of the command. By hand, in units of the error: the second pass leaves 0.2 and
+        // yields the response. With a gain of 0.505 the mean is 0.901, of which 0.987 remains for a noise variance of
+        // 0.2^2 / 2.02: the third pass leaves 0.1105. Then 0.344, 0.935, 0.9945 and 0.0701. The grid of the error is
+        // offset from that of the correction and has a hole, so that interpolation between the nodes loses some of
+        // it.
         let form = |[x, y]: [f64; 2]| 0.02 * (0.15 * x + 0.1).sin() * (0.12 * y).cos();
         let grid = Grid { columns: 38, rows: 29, first_mm: [-18.6, -14.3], spacing_mm: [1.0, 1.0] };
         let mut known = begin(GainRule::Adaptive, None);
@@ -686,8 +719,8 @@ mod tests {
 
     #[test]
     fn noise_is_shared_out_over_the_bands_as_the_filter_does_it() {
-        // What white noise leaves at a place is the sum over the squares of what one point leaves everywhere: a point in the middle, and
-        // points all over for the mean with the border.
+        // White noise leaves at a place the sum of the squares of what one point leaves at all places: one point in
+        // the middle, and points everywhere for the mean that includes the border.
         let known = begin(GainRule::Wavelength, None);
         let powers = |node: usize| {
             let mut point = vec![0.0; GRID.len()];
@@ -747,7 +780,7 @@ mod tests {
         let [rms_mm, floor_mm] = found(0.0, 0.0);
         for (k, without) in [rms_mm, floor_mm].into_iter().enumerate() {
             assert!((found(0.0, 3e-3)[k] - without.hypot(3e-3)).abs() < 1e-15);
-            // What the probe has found in the grooves is the same again.
+            // The probe has measured the same scallops in the grooves: they do not count twice.
             assert_eq!(found(4e-3, 3e-3)[k], found(4e-3, 0.0)[k]);
         }
     }

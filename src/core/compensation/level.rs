@@ -1,19 +1,20 @@
-//! What a map says where nothing was measured: it levels off, and never extrapolates.
+//! Values of a map outside the measured area: the map levels off to a constant and never extrapolates.
 
 use crate::geometry::Grid;
 
-/// Values at every node of a grid, and for each the node that they come from.
+/// Values at every node of a grid, with the source node of each.
 pub(super) struct Levelled {
     pub values: Vec<f64>,
-    /// The nearest node with a value of its own; the node itself where it has one.
+    /// Nearest node with a value of its own; the node itself if it has one.
     pub sources: Vec<usize>,
 }
 
-/// Gives every node without a value that of the nearest node with one.
+/// Gives every node without a value the value of the nearest node that has one.
 ///
-/// Over `distance_mm` the surface goes over into that constant without a kink: at the distance t from the source it stands off by
-/// g t (1 - t / L)^2, with the slope g at the source towards the node. So it leaves with the slope that it has there, never gets
-/// farther from the constant than 4/27 g L, and is the constant, with no slope, from L on. With L = 0 it is the constant at once.
+/// The surface changes into that constant over `distance_mm` (L) without a kink. At the distance t from the source it
+/// differs from the constant by g t (1 - t / L)^2, where g is the slope at the source in the direction of the node.
+/// So the surface leaves the source with the slope that it has there, never differs from the constant by more than
+/// 4/27 g L, and equals the constant, with slope 0, from L on. With L = 0 the constant begins at once.
 pub(super) fn level_off(
     grid: &Grid,
     mut values: Vec<f64>,
@@ -33,9 +34,10 @@ pub(super) fn level_off(
     Levelled { values, sources }
 }
 
-/// Returns for every node the nearest one that is known, itself where it is; at least one must be.
+/// Returns the nearest known node of every node; a known node is its own. At least one node must be known.
 ///
-/// Two sweeps over the grid, down and up, hand on from neighbour to neighbour where the nearest known node is (Danielsson 1980).
+/// Two sweeps over the grid, down and up, pass the nearest known node on from neighbour to neighbour (Danielsson
+/// 1980).
 pub(super) fn nearest_known(grid: &Grid, known: &[bool]) -> Vec<usize> {
     const NONE: usize = usize::MAX;
     let (columns, rows) = (grid.columns, grid.rows);
@@ -97,7 +99,7 @@ mod tests {
         let values = (0..GRID.len()).map(|k| if known[k] { 0.1 * GRID.place_mm(k)[0] } else { 0.0 }).collect();
         let slopes = vec![[0.1, 0.0]; GRID.len()];
         let levelled = level_off(&GRID, values, &slopes, &known, 12.0).values;
-        // One millimetre on: 1 + 0.1 (1 - 1/12)^2.
+        // 1 mm away: 1 + 0.1 (1 - 1/12)^2.
         assert!((levelled[11] - (1.0 + 0.1 * (11.0f64 / 12.0).powi(2))).abs() < 1e-15);
         assert!(levelled.iter().all(|v| *v <= 1.0 + 4.0 / 27.0 * 1.2 + 1e-12));
         assert!((22..31).all(|i| levelled[i] == 1.0));

@@ -1,4 +1,4 @@
-//! From scattered deviations to a smooth map on a grid, with what is known of its uncertainty.
+//! Filter from scattered deviations to a smooth map on a grid, with its uncertainty.
 //!
 //! ```text
 //!  readings -> outliers out -> filter (Gaussian, robust, spline) -> levelled off outside -> ErrorMap
@@ -15,7 +15,7 @@ use super::sampling::{check_cutoff, point_spacings_mm};
 use super::spline::{Roughness, spline};
 use crate::geometry::{Grid, Sample};
 
-/// Least cut-off of the surface that readings are judged by, in distances between them.
+/// Minimum cut-off of the surface that readings are compared with, in distances between readings.
 const WIDE: f64 = 4.0;
 
 /// What makes the deviations smooth.
@@ -33,29 +33,31 @@ pub enum Smoothing {
     Spline,
 }
 
-/// How a map is made.
+/// Options of a map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapOptions {
     /// Wavelength at which half of the amplitude passes, in millimetres.
     pub cutoff_mm: f64,
-    /// Wanted distance of the nodes, in millimetres.
+    /// Required distance of the nodes, in millimetres.
     pub spacing_mm: f64,
-    /// Distance from what was measured over which the map levels off, in millimetres: the radius of the wheel; 0 levels off at once.
+    /// Distance from the measured area over which the map levels off, in millimetres: the radius of the wheel; 0
+    /// levels off at once.
     pub level_off_mm: f64,
-    /// Width over which the wheel touches, in millimetres, see [`super::contact_width_mm`]; 0 where it is not known.
+    /// Width over which the wheel touches, in millimetres, see [`super::contact_width_mm`]; 0 if unknown.
     pub contact_width_mm: f64,
-    /// What makes the deviations smooth.
+    /// Filter that smooths the deviations.
     pub smoothing: Smoothing,
-    /// What the Gaussian filters let pass unchanged.
+    /// Order of the polynomial that the Gaussian filters pass unchanged.
     pub order: Order,
-    /// How the spline's smoothness is chosen.
+    /// Choice of the spline's smoothness.
     pub roughness: Roughness,
-    /// Readings off by more than so many standard deviations are left out; `None` keeps them all.
+    /// Number of standard deviations beyond which a reading is an outlier; `None` keeps all readings.
     pub outlier_limit: Option<f64>,
 }
 
 impl MapOptions {
-    /// The Gaussian filter of first order, outliers beyond five standard deviations out, levelled off at once.
+    /// Returns the options of a Gaussian filter of first order that rejects outliers beyond five standard deviations
+    /// and levels off at once.
     pub fn new(cutoff_mm: f64, spacing_mm: f64) -> Self {
         Self {
             cutoff_mm,
@@ -70,39 +72,45 @@ impl MapOptions {
     }
 }
 
-/// A smooth map of the error of the part.
+/// Smooth map of the error of the part.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ErrorMap {
-    /// Where the nodes are.
+    /// Grid of the nodes.
     pub grid: Grid,
-    /// The error at every node in millimetres, finite everywhere; where `valid` is not, levelled off from the nearest valid node.
+    /// Error at every node in millimetres, finite everywhere; at nodes that are not `valid`, levelled off from the
+    /// nearest valid node.
     pub values_mm: Vec<f64>,
-    /// Whether enough was measured around a node.
+    /// True for a node with enough readings around it.
     pub valid: Vec<bool>,
-    /// Standard deviation of the deviations from the map, in millimetres: what the filter took out.
+    /// Standard deviation of the deviations from the map, in millimetres: the part that the filter removed.
     pub residual_sigma_mm: f64,
-    /// Standard uncertainty of the error at every node from the scatter of single readings, in millimetres; where `valid` is not, that of
-    /// the nearest valid node, which says nothing of how far the part goes on as it does there.
+    /// Standard uncertainty of the error at every node from the noise of single readings, in millimetres. At a node
+    /// that is not `valid` it is that of the nearest valid node, and does not include how far the part differs from
+    /// the constant there.
     pub sigma_mm: Vec<f64>,
-    /// Standard deviation of a single reading in millimetres, as far as readings near each other disagree: noise, and waves that the filter takes out.
+    /// Standard deviation of a single reading in millimetres, from the differences of nearby readings: noise, and
+    /// waves that the filter removes.
     pub point_sigma_mm: f64,
-    /// Indices of the readings that were left out as outliers, ascending.
+    /// Indices of the readings rejected as outliers, ascending.
     pub outliers: Vec<usize>,
     /// Distance of neighbouring readings, in millimetres, in the direction in which it is larger.
     pub point_spacing_mm: f64,
-    /// What should be done better, in words; empty where all is well.
+    /// Advice on the measurement and the options, for people; empty if there is none.
     pub advice: Vec<String>,
 }
 
-/// Takes outliers out of deviations, filters the rest and lays it on a grid.
+/// Rejects outliers among the deviations, filters the rest and returns the map on a grid.
 ///
-/// Shapes: readings in any order. Frames: x and y of the model frame. Units: millimetres. Equation: weighted least squares of a
-/// polynomial at every node with weights exp(-pi (r / (alpha cutoff))^2), see [`Order::alpha`]; or the smoothing spline. Of what two neighbouring
-/// readings found far from the surface around the Gaussian filter leaves half at least, unless less than an eighth of it passes at once. A cut-off that is
-/// short for the wheel or the distance of the points is no error but is said in [`ErrorMap::advice`].
+/// Shapes: readings in any order. Frames: x and y of the model frame. Units: millimetres. Equation: weighted least
+/// squares of a polynomial at every node with weights exp(-pi (r / (alpha cutoff))^2), see [`Order::alpha`]; or the
+/// smoothing spline.
+///
+/// A feature is far from the surface in two neighbouring readings. The Gaussian filter keeps at least half of its
+/// height, unless less than an eighth of it passes in one application. A cut-off that is too short for the wheel or
+/// for the distance of the points is no error; [`ErrorMap::advice`] reports it.
 ///
 /// # Errors
-/// Deviations that are not finite, too few of them for the cut-off, options out of range, and a grid that cannot be.
+/// Deviations that are not finite, too few of them for the cut-off, options out of range, and an invalid grid.
 pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, MapError> {
     check(readings, options)?;
     let grid = Grid::over(readings.iter().map(|r| r.at_mm), options.spacing_mm)?;
@@ -151,20 +159,24 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
     Ok(ErrorMap { advice, ..map }.advised(options, readings.len(), apart_mm))
 }
 
-/// Lets what the filter leaves of features go through it again, until half of each is in the filtered surface.
+/// Filters the residuals of features again and adds the result, until at least half of each feature is in the
+/// surface.
 ///
-/// `features` are numbers of readings, with their heights over the surface around. A chip that two targets lie on is narrower than the filter.
+/// `features` holds indices of readings, with their heights over the surface around. A chip that covers two targets
+/// is narrower than the filter.
 fn hold_features(filtered: &mut Filtered, gaussian: &Gaussian, kept: &Kept, features: &[(usize, f64)]) {
-    /// A feature of which an eighth passes at a time is held after so many. Readings that are denser hold less of it.
+    /// Maximum number of repetitions: enough for a feature of which an eighth passes at a time. Where readings are
+    /// denser, less of it remains.
     const MOST_TIMES: usize = 8;
-    /// More than half, for between the nodes of the map there is less than at the readings.
+    /// Share of the height to keep: more than half, since between the nodes of the map there is less than at the
+    /// readings.
     const HELD: f64 = 0.65;
     for _ in 0..MOST_TIMES {
         let mut left = vec![0.0; kept.values.len()];
         let mut all_held = true;
         for &(k, height) in features {
             let own = kept.values[k] - filtered.at(kept.places[k]).map_or(kept.values[k], |[value, ..]| value);
-            // A feature that is held already does not grow while others are.
+            // A feature that is complete does not grow while others do.
             if own * height.signum() > (1.0 - HELD) * height.abs() {
                 left[k] = own;
                 all_held = false;
@@ -179,10 +191,11 @@ fn hold_features(filtered: &mut Filtered, gaussian: &Gaussian, kept: &Kept, feat
     }
 }
 
-/// Lays the form that a model tells at many places on a grid, through the filter of the map.
+/// Returns the map of a form that a model predicts at many places, through the filter of the map.
 ///
-/// Each place has its standard uncertainty, in millimetres, which goes through the filter as the form does. What is told has no scatter of
-/// its own: nothing is left out as an outlier, and what the points beside the form scatter by is what the model says.
+/// Each place has its standard uncertainty, in millimetres, which passes the filter as the form does. A predicted
+/// form has no noise of its own: no reading is rejected as an outlier. The noise of the points, `scatter_mm`, is that
+/// of the model.
 ///
 /// # Errors
 /// Those of [`error_map`].
@@ -191,19 +204,19 @@ pub fn told_map(told: &[(Sample, f64)], options: &MapOptions, scatter_mm: f64) -
     let form: Vec<Sample> = told.iter().map(|(sample, _)| *sample).collect();
     let sigma = |(sample, sigma_mm): &(Sample, f64)| Sample { deviation_mm: *sigma_mm, ..*sample };
     let (map, sigma) = (error_map(&form, &options)?, error_map(&told.iter().map(sigma).collect::<Vec<_>>(), &options)?);
-    // What is fitted to them may go beyond them between two.
+    // A polynomial fitted to the uncertainties can exceed their range between two places.
     let [least, most] = told.iter().fold([f64::INFINITY, 0.0], |[a, b], (_, of)| [a.min(*of), b.max(*of)]);
     let sigma_mm = sigma.values_mm.iter().map(|value| value.clamp(least.min(most), most)).collect();
     let residual_sigma_mm = scatter_mm.hypot(map.residual_sigma_mm);
     Ok(ErrorMap { sigma_mm, residual_sigma_mm, point_sigma_mm: scatter_mm, ..map })
 }
 
-/// The filter that readings are judged by: with a cut-off of four distances between them at least. With a shorter one a reading is
-/// compared with little but itself.
+/// Filter of the surface that readings are compared with; its cut-off is at least four distances between them. With a
+/// shorter one a reading is compared mostly with itself.
 struct Wide {
     gaussian: Gaussian,
     grid: Grid,
-    /// Whether it is the filter of the map.
+    /// True if it is the filter of the map.
     same: bool,
 }
 
@@ -212,7 +225,7 @@ impl Wide {
         robust(&self.gaussian, &kept.places, &kept.values, &self.grid)
     }
 
-    /// Returns the standard deviation of one reading; `filtered` is what the map's own filter found.
+    /// Returns the standard deviation of one reading; `filtered` is the result of the map's own filter.
     fn point_sigma(&self, kept: &Kept, filtered: &Filtered) -> f64 {
         if self.same {
             return residuals(filtered, &kept.places, &kept.values, None).sigma();
@@ -222,7 +235,7 @@ impl Wide {
     }
 }
 
-/// Returns how many readings there are to the square millimetre, typically, from their shares in the values.
+/// Returns the typical number of readings per square millimetre, from their leverages.
 fn density(filtered: &Filtered, gaussian: &Gaussian) -> f64 {
     let supported = (0..filtered.grid.len()).filter(|&k| filtered.supported[k]);
     let mut shares: Vec<f64> = supported.map(|k| filtered.leverage[k]).collect();
@@ -250,7 +263,8 @@ fn check(readings: &[Sample], options: &MapOptions) -> Result<(), MapError> {
     }
 }
 
-/// Returns the grid that the filter works on: nodes of the map and as many between them as the weights ask for.
+/// Returns the grid that the filter works on: the nodes of the map, and as many nodes between them as the weights
+/// need.
 fn worked_grid(grid: &Grid, gaussian: &Gaussian) -> Result<Grid, MapError> {
     let division = gaussian.division(grid);
     let finer = |k: usize| (grid.counts()[k] - 1) as f64 * division[k] as f64 + 1.0;
@@ -263,7 +277,7 @@ fn worked_grid(grid: &Grid, gaussian: &Gaussian) -> Result<Grid, MapError> {
     Ok(Grid { columns: finer(0) as usize, rows: finer(1) as usize, first_mm: grid.first_mm, spacing_mm })
 }
 
-/// What was found at the nodes of a map, before it is levelled off.
+/// Result at the nodes of a map, before it levels off.
 struct Smooth {
     values: Vec<f64>,
     slopes: Vec<[f64; 2]>,
@@ -273,7 +287,7 @@ struct Smooth {
 }
 
 impl Smooth {
-    /// Picks the nodes of the map out of those that were worked on.
+    /// Selects the nodes of the map from those that the filter worked on.
     fn from_filtered(filtered: &Filtered, grid: &Grid, point_sigma: f64) -> Self {
         let step = |worked: usize, wanted: usize| if wanted > 1 { (worked - 1) / (wanted - 1) } else { 1 };
         let (across, along) = (step(filtered.grid.columns, grid.columns), step(filtered.grid.rows, grid.rows));
@@ -288,7 +302,7 @@ impl Smooth {
         }
     }
 
-    /// Puts the spline's surface in the place of the filter's; what was measured enough stays as it is.
+    /// Replaces the surface of the filter by that of the spline; `valid` stays unchanged.
     fn with_spline(self, grid: &Grid, kept: &Kept, density: f64, options: &MapOptions) -> Result<Self, MapError> {
         let fitted = spline(kept, grid, density, options.cutoff_mm, options.roughness)?;
         Ok(Self {
@@ -319,7 +333,7 @@ impl Smooth {
 }
 
 impl ErrorMap {
-    /// Returns a map whose values are known as they are: no scatter, no outliers.
+    /// Returns a map with exactly known values: no noise, no outliers.
     pub fn known(grid: Grid, values_mm: Vec<f64>, valid: Vec<bool>) -> Self {
         Self {
             grid,
@@ -360,24 +374,26 @@ impl ErrorMap {
     }
 }
 
-/// A surface on a grid that was filtered.
+/// Filtered surface on a grid.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FilteredGrid {
-    /// Filtered values at every node, in the units of those that were given; those that are not valid are the nearest valid one's.
+    /// Filtered values at every node, in the units of the input; a node that is not valid has the value of the
+    /// nearest valid one.
     pub values: Vec<f64>,
-    /// Whether enough is known around a node.
+    /// True for a node with enough valid values around it.
     pub valid: Vec<bool>,
-    /// How often the filter was applied: 1 for the plain form.
+    /// Number of times that the filter was applied: 1 for the plain form.
     pub rounds: usize,
 }
 
-/// Filters a map that already lies on a grid, as an interferometer gives it: ISO 16610-61, or its robust form ISO 16610-71.
+/// Filters a map on a grid, such as that of an interferometer: ISO 16610-61, or its robust form ISO 16610-71.
 ///
-/// Shapes: a value and whether it is valid for every node, row by row, x fastest. Values that are not valid may be anything and are not
-/// read. Units: any for the values; the cut-off in millimetres.
+/// Shapes: a value and its validity for every node, row by row, x fastest. Values that are not valid are not read.
+/// Units: any for the values; the cut-off in millimetres.
 ///
 /// # Errors
-/// Numbers of values other than that of the nodes, valid values that are not finite, a cut-off that is not above 0.
+/// A number of values other than that of the nodes, valid values that are not finite, a cut-off that is not above 0,
+/// and no node with enough valid values around it.
 pub fn filter_grid(
     grid: &Grid,
     values: &[f64],

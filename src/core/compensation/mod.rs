@@ -1,15 +1,16 @@
-//! What to remove next? Turns deviations into a map, the map into a correction, and tells whether the part answered.
+//! Compensation: turns deviations into a map and the map into a correction, and checks the response of the part.
 //!
 //! ```text
 //!  deviations --error_map--> ErrorMap --Correction::next--> Correction --(ground, measured)--> Response
-//!  (scattered)               (filtered, on a grid)           (absolute, versioned)              (did it answer as commanded?)
+//!  (scattered)               (filtered, on a grid)           (absolute, versioned)              (answer as commanded?)
 //!      |
 //!      +--parameters--> Parameters --Set--> (wheel radius, setting, tilt: corrected as such, not baked into the map)
 //! ```
 //!
-//! Pure: no file, no clock, no randomness. Frames: everything is over x and y of the model frame {M}. Units: millimetres. Signs:
-//! a deviation is positive where material stands proud; a correction is positive where the surface is wanted higher, along the
-//! outward normal, so that a correction takes back a deviation of the opposite sign.
+//! Pure: no file, no clock, no randomness. Frames: everything is over x and y of the model frame {M}. Units:
+//! millimetres. Signs: a deviation is positive where material stands proud. A correction is positive where the
+//! surface is to be higher along the outward normal, so that a correction compensates a deviation of the opposite
+//! sign.
 
 mod correction;
 mod error;

@@ -1,4 +1,4 @@
-//! What the next pass is asked for: the correction so far, less what was found, within limits.
+//! Correction of the next pass: the correction so far less the error found, within limits.
 
 use thiserror::Error;
 
@@ -7,37 +7,37 @@ use super::learning::LearningState;
 use super::map::ErrorMap;
 use super::parameters::Set;
 
-/// What a correction must keep to.
+/// Limits of a correction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CorrectionLimits {
-    /// Depth of the pass under the one before, in millimetres, unless it takes more to cut everywhere.
+    /// Depth of a pass below the one before, in millimetres; a pass is deeper where it must be to cut everywhere.
     pub depth_of_cut_mm: f64,
-    /// What is taken off at least where least is taken off, in millimetres.
+    /// Minimum depth of removal at any place, in millimetres.
     pub least_depth_mm: f64,
-    /// Largest correction anywhere, in millimetres.
+    /// Maximum correction at any place, in millimetres.
     pub largest_correction_mm: f64,
-    /// Level of the first pass, in millimetres: what removal is counted from.
+    /// Level of the first pass, in millimetres; removal is counted from it.
     pub allowance_mm: f64,
-    /// All that may be removed below the surface of the first pass, in millimetres.
+    /// Maximum total removal below the surface of the first pass, in millimetres.
     pub removal_budget_mm: f64,
-    /// The most that the machine may take off in one pass anywhere, in millimetres.
+    /// Maximum depth that the machine may remove in one pass at any place, in millimetres.
     pub largest_depth_mm: f64,
 }
 
-/// The correction of the next pass and what it will do.
+/// Correction of the next pass and its expected removal.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NextPass {
-    /// For the next pass.
+    /// Correction of the next pass.
     pub correction: Correction,
-    /// Depth of this pass under the one before, in millimetres: the depth of cut, or more where the part is low.
+    /// Depth of this pass below the one before, in millimetres: the depth of cut, or more where the part is low.
     pub depth_mm: f64,
-    /// Removed in all below the surface of the first pass, where it is most, in millimetres.
+    /// Total removal below the surface of the first pass, at the place of the most removal, in millimetres.
     pub removed_mm: f64,
-    /// Share of the part where the wheel will cut air, as far as it can be foreseen.
+    /// Predicted share of the part where the wheel does not cut.
     pub air_share: f64,
 }
 
-/// Why there is no next pass.
+/// Error that prevents a next pass.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -69,8 +69,10 @@ pub enum NextPassError {
 }
 
 impl Correction {
-    /// Returns the correction that takes back what is worth it, whatever any limit says of it; for the same pass and level. What parameters
-    /// take back is not the map's.
+    /// Returns the correction that compensates the learned error, for the same pass and level, without any check of
+    /// limits.
+    ///
+    /// The map leaves out the part that the parameters in `set` compensate.
     pub fn changed(&self, known: &LearningState, set: Option<&Set>) -> Self {
         let seen_mm = self.seen_mm();
         let mut values_mm = known.wanted_mm().unwrap_or(&seen_mm).to_vec();
@@ -80,7 +82,8 @@ impl Correction {
         Self { values_mm, set: set.cloned(), ..self.clone() }
     }
 
-    /// Returns what the part has lost in all where it loses most, below the surface of a first pass without a correction, in millimetres.
+    /// Returns the total removal at the place of the most removal, below the surface of a first pass without a
+    /// correction, in millimetres.
     ///
     /// # Errors
     /// A correction above its limit, and a removal above the budget.
@@ -90,7 +93,7 @@ impl Correction {
             let ([x_mm, y_mm], limit_mm) = (self.grid.place_mm(k), limits.largest_correction_mm);
             return Err(NextPassError::TooLarge { found_mm: self.values_mm[k], x_mm, y_mm, limit_mm });
         }
-        // The correction itself adds where it is negative, and so do parameters.
+        // Negative values of the correction and of the parameters increase the removal.
         let deepest_mm = self.displaced_mm().iter().copied().fold(0.0, f64::min);
         let removed_mm = limits.allowance_mm - self.level_mm - deepest_mm;
         // A picometre is rounding, not removal.
@@ -100,12 +103,13 @@ impl Correction {
         Ok(removed_mm)
     }
 
-    /// Takes back of the error that the last pass left what is worth taking back, and goes deep enough to cut everywhere. `set` is what
-    /// parameters of the machine take back of it, and the map what is left.
+    /// Returns the next pass: it compensates the learned part of the error of the last pass, and is deep enough to
+    /// cut everywhere. The parameters in `set` compensate a part of the error, and the map the rest.
     ///
-    /// Only removal is possible: the new surface must lie below the present one everywhere. A rise of the correction by d raises the
-    /// surface by s d, s being the part's response, and every pass adds its own scatter; so the depth is at least the largest rise, two
-    /// standard deviations of the scatter and the least depth of cut together.
+    /// A pass can only remove material: the new surface must lie below the present one everywhere. A rise of the
+    /// correction by d raises the surface by s d, where s is the response of the part, and every pass adds its own
+    /// non-repeatable error. So the depth is at least the sum of the largest rise, two standard deviations of this
+    /// error and the minimum depth of removal.
     ///
     /// Frames: x and y of the model frame. Units: millimetres.
     ///
@@ -121,7 +125,7 @@ impl Correction {
         let changed = self.changed(known, set);
         let on_grid: Vec<f64> =
             changed.displaced_mm().iter().zip(self.displaced_mm().iter()).map(|(next, now)| next - now).collect();
-        // Where it was measured: there it is known how much the wheel will cut.
+        // At the nodes of the measured map: only there the depth of the next cut can be predicted.
         let changes_mm = self.grid.resample(&on_grid, &error.grid);
         let (response, scatter_mm) = (known.response()[0], known.scatter_mm().unwrap_or(0.0));
         let rise_mm = on_grid.iter().map(|change| response * change).fold(0.0, f64::max);
@@ -141,12 +145,12 @@ impl Correction {
     }
 }
 
-/// The share of a normal distribution that lies more than z standard deviations below its mean; within 1e-7.
+/// Returns the share of a normal distribution that lies more than z standard deviations below its mean; within 1e-7.
 fn normal_tail(z: f64) -> f64 {
     if z.is_nan() || z > 8.0 {
         return 0.0;
     }
-    // Abramowitz and Stegun, 26.2.17, for z >= 0; the other side by symmetry.
+    // Abramowitz and Stegun, 26.2.17, for z >= 0; negative z by symmetry.
     let t = 1.0 / (1.0 + 0.231_641_9 * z.abs());
     let terms = [0.319_381_530, -0.356_563_782, 1.781_477_937, -1.821_255_978, 1.330_274_429];
     let sum = terms.iter().rev().fold(0.0, |sum, term| (sum + term) * t);

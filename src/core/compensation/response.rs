@@ -1,12 +1,13 @@
-//! Did the part answer as it was asked to?
+//! Response of the part to its correction: did it change as commanded?
 //!
-//! The change of the error from one pass to the next is compared with the change of the correction. The slope of the one over the
-//! other is 1 where everything is right, -1 where a sign is wrong, 2 where the correction was applied twice, near 0 where it was not applied or
-//! was applied somewhere else; in the latter case it fits better once it is mirrored or turned. A map that is nearly symmetric
-//! makes the part better even when it is mirrored, so the way that leaves least unexplained is asked for, not the sign of the slope alone.
+//! The change of the error from one pass to the next is compared with the change of the correction. The slope of the
+//! first over the second is 1 if everything is right, -1 if a sign is wrong, and 2 if the correction was applied
+//! twice. It is near 0 if the correction was not applied, or was applied at the wrong place; then the fit improves if
+//! the map is mirrored or turned. A nearly symmetric map improves the part even if it is mirrored. So the
+//! transformation that leaves the smallest unexplained change decides, not the sign of the slope alone.
 //!
-//! Whatever of a change looks like a motion of the part is taken away by the next registration, and is never seen. It is taken out
-//! of what was asked and of what was answered before they are compared.
+//! The next registration removes every change that looks like a motion of the part, so that it never appears in a
+//! map. Motions are therefore removed from both the commanded and the measured change before the comparison.
 
 use nalgebra::{Matrix6, Vector6};
 
@@ -14,7 +15,7 @@ use super::correction::Correction;
 use super::map::ErrorMap;
 use crate::geometry::{Point, Vector};
 
-/// How the part answered.
+/// Kind of the part's response.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Sense {
@@ -32,37 +33,38 @@ pub enum Sense {
     Doubled,
     /// Not at all.
     NoEffect,
-    /// The change that was asked for is too small beside the scatter to tell.
+    /// The commanded change is too small compared with the noise for a decision.
     Unclear,
 }
 
-/// The answer of a part to a change of its correction.
+/// Response of a part to a change of its correction.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Response {
     /// Change of the error over change of the correction; 1 is as commanded.
     pub slope: f64,
-    /// Correlation of the two, from -1 to 1.
+    /// Correlation of the two changes, from -1 to 1.
     pub correlation: f64,
-    /// Root mean square of the change that was asked for, as far as it can be seen, in millimetres.
+    /// Root mean square of the commanded change without motions of the part, in millimetres.
     pub asked_mm: f64,
-    /// Root mean square of what the change asked for does not explain of the answer, in millimetres.
+    /// Root mean square of the measured change that the commanded one does not explain, in millimetres.
     pub unexplained_mm: f64,
-    /// What to think of it.
+    /// Classification of the response.
     pub sense: Sense,
 }
 
-/// A mirrored or turned map must leave less than this share of what the straight one leaves unexplained.
+/// Share of the unexplained variance of the straight map; a mirrored or turned map must leave less than this.
 const CLEARLY_BETTER: f64 = 0.5;
-/// Share of the answer that may stay unexplained before another way than the straight one is thought of.
+/// Share of the response's variance that may stay unexplained before mirrored and turned maps are considered.
 const WELL_EXPLAINED: f64 = 0.05;
-/// Slope above which an answer is nearer to twice what was asked for than to the once of a stiff machine.
+/// Slope above which a response is nearer to twice the command than to a single command on a stiff machine.
 const TWICE: f64 = 1.6;
 
-/// Compares the change of the error with the change of the correction.
+/// Compares the change of the error with the change of the correction, and returns the response.
 ///
-/// Shapes: `places` are points of the nominal surface with their unit normals, in any order, where both maps have been measured.
-/// `scatter_mm` is by how much the error may change by itself, as a standard deviation: the repeatability of grinding and measuring
-/// together. Frames: the model frame.
+/// Shapes: `errors` and `corrections` of the pass before and of the last pass; `places` are points of the nominal
+/// surface with their unit normals, in any order, where both maps were measured. `scatter_mm` is the standard
+/// deviation by which the error changes without any command: the repeatability of grinding and measuring together.
+/// Frames: the model frame.
 pub fn response(
     errors: [&ErrorMap; 2],
     corrections: [&Correction; 2],
@@ -74,7 +76,7 @@ pub fn response(
     let unseen = Motions::new(places);
     let over =
         |value: &dyn Fn([f64; 2]) -> f64| unseen.without(places.iter().map(|(p, _)| value([p.x, p.y])).collect());
-    // Parameters move the part as a map does, and are answered alike.
+    // Parameters move the surface as a map does, and the part responds to them in the same way.
     let asked = corrections.map(|correction| (correction.grid, correction.seen_mm()));
     let [earlier, later] = asked.each_ref().map(|(grid, values)| move |place| grid.interpolate(values, place));
     let changed = |place: [f64; 2]| later(place) - earlier(place);
@@ -126,7 +128,7 @@ fn sense(straight: &Fit, mirrored: &[(Sense, Fit)], scatter_mm: f64) -> Sense {
     if straight.slope.abs() < 0.4 { Sense::NoEffect } else { Sense::Unclear }
 }
 
-/// A regression through the means.
+/// Regression through the origin.
 struct Fit {
     slope: f64,
     correlation: f64,
@@ -147,11 +149,11 @@ fn regress(asked: &[f64], answer: &[f64]) -> Fit {
     }
 }
 
-/// The changes that a motion of the part makes: they span what no registered map can show.
+/// Changes by motions of the part: they span all changes that registration removes from a map.
 struct Motions {
-    /// For each place what the six motions change there, with lengths in units of the part's size.
+    /// Change by each of the six motions at each place, with lengths in units of the part's size.
     rows: Vec<Vector6<f64>>,
-    /// The pseudo-inverse of their sum of squares; on a flat part some motions change nothing.
+    /// Pseudo-inverse of their sum of squares; on a flat part some motions change nothing.
     inverse: Matrix6<f64>,
 }
 
@@ -173,7 +175,7 @@ impl Motions {
         Self { inverse: inverse.sum(), rows }
     }
 
-    /// Returns values at the places without what a motion could make.
+    /// Returns values at the places without the part that a motion explains.
     fn without(&self, mut values: Vec<f64>) -> Vec<f64> {
         let seen: Vector6<f64> = self.rows.iter().zip(&values).map(|(row, v)| row * *v).sum();
         let motion = self.inverse * seen;
@@ -194,7 +196,7 @@ mod tests {
         ErrorMap::known(GRID, values_mm, vec![true; GRID.len()])
     }
 
-    /// An error without any symmetry.
+    /// Returns an error without any symmetry, in millimetres.
     fn error(x: f64, y: f64) -> f64 {
         5e-3 * ((0.4 * x + 0.7).sin() + (0.5 * y - 0.2 * x + 1.1).cos() + 0.02 * x * y + 0.05 * x)
     }
@@ -206,7 +208,7 @@ mod tests {
         response([&before, &map(|x, y| error(x, y) + seen(x, y))], [&none, &asked], &places(), 2e-4)
     }
 
-    /// The nodes, on a part that is flat.
+    /// Returns the nodes of the grid on a flat part.
     fn places() -> Vec<(Point, Vector)> {
         (0..GRID.len()).map(|k| GRID.place_mm(k)).map(|[x, y]| (Point::new(x, y, 0.0), Vector::z())).collect()
     }

@@ -1,69 +1,73 @@
-//! The robust Gaussian filter (ISO 16610-71) and the readings that do not belong to the surface.
+//! Robust Gaussian filter (ISO 16610-71) and detection of readings that do not belong to the surface.
 //!
-//! Readings far from the filtered surface are weighed less, by Tukey's biweight (1 - (r / c)^2)^2 with c = 4.4 median |r|, and the filter is
-//! applied again, until c changes by less than 1 % or fifteen rounds are over.
+//! The filter gives readings far from the filtered surface less weight, by Tukey's biweight (1 - (r / c)^2)^2 with
+//! c = 4.4 median |r|, and repeats until c changes by less than 1 % or after fifteen rounds.
 //!
-//! **Outliers.** Near a reading the surface leans towards it, the more the fewer others are about. With the share l of the
-//! reading in the value at its place, and the variance v of that value, a residual r has the variance sigma^2 (1 - 2 l + v);
-//! z = r / sqrt(1 - 2 l + v) scatters alike everywhere. Sigma is 1.4826 median |z|. What has |z| above the limit is an outlier
-//! unless one of its eight neighbours is off to the same side too, by half the limit and a quarter of the height at least: that is a feature of
-//! the part, or dirt as large as one, and no point rule can tell which. A place that is touched again is not its own neighbour. As the surface leans towards a wide feature, heights are also told from
-//! the plane through what was read around.
+//! **Outliers.** Near a reading the surface leans towards it, the more the fewer other readings are around. With the
+//! share l of the reading in the value at its place, and the variance v of that value, a residual r has the variance
+//! sigma^2 (1 - 2 l + v); z = r / sqrt(1 - 2 l + v) has the same variance everywhere. Sigma is 1.4826 median |z|. A
+//! reading with |z| above the limit is an outlier, unless one of its eight neighbours is off to the same side by at
+//! least half the limit and a quarter of the height. That is a feature of the part, or dirt of the same size; no rule
+//! for single points can separate the two. A repeated reading of the same place is not a neighbour. As the surface
+//! leans towards a wide feature, heights are also measured from the plane through the readings around it.
 
 use nalgebra::{Matrix3, Vector3};
 
 use super::filter::{Filtered, Gaussian};
 use crate::geometry::{Grid, Nearest, Point};
 
-/// Most rounds of the robust filter.
+/// Maximum number of rounds of the robust filter.
 const ROUNDS: usize = 15;
-/// Change of the scale at which it has settled.
+/// Relative change of c below which the filter has converged.
 const SETTLED: f64 = 0.01;
-/// c over the median of the residuals.
+/// c over the median of the absolute residuals.
 const BIWEIGHT: f64 = 4.4;
-/// Standard deviation over the median of the absolute values, of a normal distribution.
+/// Standard deviation over the median of the absolute values, for a normal distribution.
 const SIGMA_OVER_MEDIAN: f64 = 1.482_602_218_505_602;
-/// Below this share of its variance a residual tells nothing about its reading.
+/// Minimum freedom of a residual, its variance over that of a reading; below it the residual carries no information
+/// on its reading.
 const LEAST_FREEDOM: f64 = 0.02;
-/// Fewer readings than this have no scatter to compare with.
+/// Minimum number of readings for a noise estimate to compare with.
 const LEAST_READINGS: usize = 20;
-/// Residuals below this are rounding of the files, not outliers, in millimetres.
+/// Minimum scale of the residuals, in millimetres; below it they are rounding of the files, not outliers.
 const LEAST_SCALE_MM: f64 = 1e-6;
-/// A neighbour that is off by these shares of the limit and of the height of a reading found the same as it.
+/// Minimum share of the limit by which a neighbour must be off to confirm a reading.
 const SHARE_OF_LIMIT: f64 = 0.5;
+/// Minimum share of the height of a reading by which a neighbour must be off to confirm it.
 const SHARE_OF_HEIGHT: f64 = 0.25;
-/// Readings about one, of which those that are no neighbours tell what is usual there.
+/// Number of readings around one; those that are no neighbours give the plane to compare with.
 const AROUND: usize = 48;
-/// What is within so many distances of neighbours along both axes is a neighbour: eight are, on a grid.
+/// Maximum distance of a neighbour along both axes, in spacings: on a grid there are eight.
 const NEIGHBOUR: f64 = 1.5;
-/// Readings nearer than so many distances along both axes are one place, touched again: they say nothing of the places around.
+/// Distance along both axes, in spacings, below which readings are repeats of one place; they carry no information on
+/// the places around.
 const SAME_PLACE: f64 = 0.25;
 
-/// The robust filter's result.
+/// Result of the robust filter.
 #[derive(Clone, Debug)]
 pub(super) struct Robust {
     pub filtered: Filtered,
     /// Weight of every reading.
     pub weights: Vec<f64>,
-    /// Residual of every reading; `NaN` where the surface is not known.
+    /// Residual of every reading; `NaN` where there is no surface.
     pub plain: Vec<f64>,
-    /// The same over the square root of its freedom; `NaN` where it tells nothing.
+    /// Residual over the square root of its freedom; `NaN` if the freedom is too small.
     pub scaled: Vec<f64>,
     /// Standard deviation of one reading.
     pub sigma: f64,
-    /// How often the filter was applied.
+    /// Number of times that the filter was applied.
     pub rounds: usize,
 }
 
 /// Residuals of readings from a filtered surface.
 pub(super) struct Residuals {
-    /// Reading less surface; `NaN` where the surface is not known.
+    /// Reading minus surface; `NaN` where there is no surface.
     pub plain: Vec<f64>,
     /// Variance of a residual over that of a reading.
     pub freedom: Vec<f64>,
 }
 
-/// Compares readings with the surface that was filtered from them.
+/// Returns the residuals of readings from the surface that was filtered from them.
 pub(super) fn residuals(
     filtered: &Filtered,
     places: &[[f64; 2]],
@@ -88,7 +92,8 @@ impl Residuals {
         self.plain.iter().zip(&self.freedom).map(each).collect()
     }
 
-    /// Returns the standard deviation of one reading: the residuals' sum of squares over their freedom.
+    /// Returns the standard deviation of one reading: the square root of the residuals' sum of squares over their
+    /// freedom.
     pub fn sigma(&self) -> f64 {
         let known = (0..self.plain.len()).filter(|&k| self.freedom[k] > LEAST_FREEDOM && self.plain[k].is_finite());
         let (squares, freedom) = known.fold((0.0, 0.0), |(s, f), k| (s + self.plain[k].powi(2), f + self.freedom[k]));
@@ -103,7 +108,7 @@ pub(super) fn robust(gaussian: &Gaussian, places: &[[f64; 2]], values: &[f64], g
     iterate(gaussian.scattered(places, values, None, grid), values.len(), again, compare)
 }
 
-/// Filters and weighs by turns, from the plain filter's result.
+/// Alternates filtering and weighting, starting from the result of the plain filter.
 pub(super) fn iterate(
     first: Filtered,
     count: usize,
@@ -117,13 +122,13 @@ pub(super) fn iterate(
     let mut rounds = 1;
     while rounds < ROUNDS {
         let c = BIWEIGHT * median_size(&found.plain);
-        // NaN, at first, is not settled; a surface without residuals is.
+        // NaN, at first, is not converged; a surface without residuals is.
         if c == 0.0 || (c - scale).abs() <= SETTLED * c {
             break;
         }
         scale = c;
         let weigh = |r: &f64| if r.abs() < c { (1.0 - (r / c).powi(2)).powi(2) } else { 0.0 };
-        // A reading without a surface about it keeps its weight: it may be the first of one.
+        // A reading without a surface around it keeps its weight: it may be the first of one.
         weights = found.plain.iter().map(|r| if r.is_nan() { 1.0 } else { weigh(r) }).collect();
         filtered = again(&weights);
         found = compare(&filtered, Some(&weights));
@@ -134,20 +139,20 @@ pub(super) fn iterate(
     Robust { filtered, weights, plain: found.plain, scaled, sigma, rounds }
 }
 
-/// Readings that are far from the filtered surface, by their indices, ascending.
+/// Readings far from the filtered surface, by their indices, ascending.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Far {
-    /// Those that are alone, and do not belong to the surface.
+    /// Readings that no neighbour confirms: they do not belong to the surface.
     pub outliers: Vec<usize>,
-    /// Those that a neighbour agrees with.
+    /// Readings that a neighbour confirms.
     pub features: Vec<usize>,
 }
 
 impl Robust {
-    /// Returns the readings that are far from the surface.
+    /// Returns the readings far from the surface.
     ///
-    /// `apart` is the distance of neighbouring readings along x and y. `None` where more than a tenth would be outliers: such readings are
-    /// no exception, and the surface has no other rule.
+    /// `apart` is the distance of neighbouring readings along x and y. Returns `None` if more than a tenth would be
+    /// outliers: then they are no exception, and no other rule defines the surface.
     pub fn far(&self, (places, values): (&[[f64; 2]], &[f64]), limit: f64, apart: [f64; 2]) -> Option<Far> {
         if places.len() < LEAST_READINGS {
             return Some(Far::default());
@@ -173,7 +178,7 @@ impl Robust {
         (outliers.len() * 10 <= places.len()).then_some(Far { outliers, features })
     }
 
-    /// Whether one of the eight neighbours is off too, to the same side; `off` is sorted along x.
+    /// Returns true if one of the eight neighbours is off to the same side too; `off` is sorted along x.
     fn is_feature(&self, n: usize, off: &[usize], places: &[[f64; 2]], apart: [f64; 2]) -> bool {
         let k = off[n];
         let away = |j: usize| [0, 1].map(|axis| places[j][axis] - places[k][axis]);
@@ -188,7 +193,7 @@ impl Robust {
     }
 }
 
-/// Whether a place so far away along x and y is that of a neighbour, neither the same place nor beyond the eight around it.
+/// Returns true if a place at this distance along x and y is one of the eight neighbours, and not the same place.
 fn is_beside(away: [f64; 2], apart: [f64; 2]) -> bool {
     is_within(away, apart, NEIGHBOUR) && !is_within(away, apart, SAME_PLACE)
 }
@@ -197,7 +202,7 @@ fn is_within(away: [f64; 2], apart: [f64; 2], distances: f64) -> bool {
     (0..2).all(|axis| away[axis].abs() <= distances * apart[axis])
 }
 
-/// Readings by their places.
+/// Readings indexed by their places.
 struct Around<'r> {
     places: &'r [[f64; 2]],
     values: &'r [f64],
@@ -206,7 +211,8 @@ struct Around<'r> {
 }
 
 impl Around<'_> {
-    /// Whether a neighbour of a reading stands over the plane through what is around both too, by `least` and by a quarter of the reading's height.
+    /// Returns true if a neighbour of a reading is above the plane through the readings around both, by at least
+    /// `least` and a quarter of the reading's height; `side` is the sign of up.
     fn agrees(&self, k: usize, side: f64, least: f64) -> bool {
         let own = on_plane(&self.places[k]);
         let near = self.tree.to(&own, AROUND as u32 + 1).map(|(other, _)| other).filter(|other| *other != k);
@@ -233,7 +239,7 @@ fn on_plane(&[x, y]: &[f64; 2]) -> Point {
     Point::new(x, y, 0.0)
 }
 
-/// Returns the median of the absolute values, of those that are numbers; 0 of none.
+/// Returns the median of the absolute values, without `NaN`; 0 if there is none.
 fn median_size(values: &[f64]) -> f64 {
     let mut sizes: Vec<f64> = values.iter().filter(|v| !v.is_nan()).map(|v| v.abs()).collect();
     if sizes.is_empty() {

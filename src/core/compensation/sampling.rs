@@ -1,32 +1,33 @@
-//! Which waves can be corrected at all: how far apart points lie, how wide the wheel touches, and what cut-off both ask for.
+//! Limits of the waves that can be corrected: distance of the points, contact width of the wheel, and the cut-off
+//! that both require.
 
 use rayon::prelude::*;
 
 use super::MapError;
 use crate::geometry::Sample;
 
-/// Readings whose neighbours are looked up for the spacing; more would not change a median.
+/// Number of readings whose neighbours are searched for the spacing; more would not change a median.
 const PROBED: usize = 50;
-/// Readings nearer to each other than this share of the spacing that all would have on a square grid are one place, touched again.
+/// Share of the spacing on a square grid of as many readings; readings nearer to each other are repeats of one place.
 const SAME_PLACE: f64 = 0.02;
 
 /// Returns the width over which a wheel touches a flat surface, in millimetres: 2 sqrt(2 R a - a^2).
 ///
-/// `wheel_radius_mm` is that of the section across which the width is meant, `depth_mm` the depth of cut. The wheel
-/// evens out within that width, so no shorter wave can be ground in.
+/// `wheel_radius_mm` (R) is the radius of the section across which the width is measured, `depth_mm` (a) the depth of
+/// cut. The wheel averages within that width, so no shorter wave can be ground in.
 pub fn contact_width_mm(wheel_radius_mm: f64, depth_mm: f64) -> f64 {
     let depth_mm = depth_mm.clamp(0.0, wheel_radius_mm.max(0.0));
     2.0 * (2.0 * wheel_radius_mm * depth_mm - depth_mm * depth_mm).max(0.0).sqrt()
 }
 
-/// Compares a cut-off with twice the larger of contact width and distance of the points: a shorter wave is either not seen by the points or
-/// cannot be ground by the wheel.
+/// Checks a cut-off against twice the larger of contact width and distance of the points: a shorter wave is either
+/// not resolved by the points or cannot be ground by the wheel.
 ///
 /// # Errors
-/// A cut-off below it, with what limits it and the remedy.
+/// A cut-off below this limit, with its cause and the remedy.
 pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_mm: f64) -> Result<(), MapError> {
     let least_mm = 2.0 * contact_width_mm.max(point_spacing_mm);
-    // A tenth is the uncertainty of a spacing that is estimated.
+    // 10 % is the uncertainty of an estimated spacing.
     if cutoff_mm >= 0.9 * least_mm {
         return Ok(());
     }
@@ -39,9 +40,9 @@ pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_
 
 /// Estimates the distance between neighbouring readings in millimetres, in the direction in which it is larger.
 ///
-/// Around a reading the nearest other place is looked for in each of four sectors, about +x, -x, +y and -y. The median over
-/// readings is taken for x and y apart: rows that are dense along and sparse across give the distance across. A place that
-/// was touched again is one place. 0 where there are too few readings to tell.
+/// Around a reading the nearest other place is searched in each of four sectors, about +x, -x, +y and -y. The median
+/// over readings is computed for x and y separately: rows that are dense along and sparse across give the distance
+/// across. Repeated readings of a place count as one place. Returns 0 if there are too few readings for an estimate.
 pub fn point_spacing_mm(readings: &[Sample]) -> f64 {
     let [x, y] = point_spacings_mm(readings);
     x.max(y)
@@ -63,7 +64,7 @@ pub(super) fn point_spacings_mm(readings: &[Sample]) -> [f64; 2] {
     [median([0, 1]), median([2, 3])]
 }
 
-/// Returns the spacing that so many readings would have on a square grid over the same box.
+/// Returns the spacing that the same number of readings would have on a square grid over the same box.
 fn square_spacing_mm(readings: &[Sample]) -> f64 {
     let [width, depth] = [0, 1].map(|axis| {
         let along = readings.iter().map(|r| r.at_mm[axis]);
@@ -72,7 +73,7 @@ fn square_spacing_mm(readings: &[Sample]) -> f64 {
     (width.max(0.0) * depth.max(0.0) / readings.len().max(1) as f64).sqrt()
 }
 
-/// Returns the distances of the nearest other places about +x, -x, +y and -y; infinite where there is none.
+/// Returns the distances of the nearest other places about +x, -x, +y and -y; infinite where none exists.
 fn nearest_by_sector([x, y]: [f64; 2], readings: &[Sample], same_mm: f64) -> [f64; 4] {
     let mut nearest2 = [f64::INFINITY; 4];
     for r in readings {

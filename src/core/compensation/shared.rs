@@ -1,44 +1,53 @@
-//! What other machines taught of a recipe, as a beginning for one that has not ground it yet.
+//! Repeatable error that other machines learned for a recipe, as a prior for a machine that has not ground it yet.
 //!
-//! What comes back in every pass on machine j is R_j = C + D_j: C is common to all that grind the recipe alike, D_j the machine's own. Passes
-//! on K machines told means m_j of R_j with variances v_j. For each band of wavelengths by itself, with P for the power of R, the mean over
-//! the machines of |m_j|^2 - v_j, and k for the share of it that is the machine's own,
+//! The repeatable error on machine j is R_j = C + D_j: C is common to all machines that grind the same recipe, D_j is
+//! the machine's own. Passes on K machines give means m_j of R_j with variances v_j. Each band of wavelengths is
+//! separate. With P for the power of R, the mean over the machines of |m_j|^2 - v_j, and k for the share of P that is
+//! the machine's own,
 //!
 //! ```text
 //!  t = k P      c = (1 - k) P      w_j = 1 / (t + v_j)
 //!  C^ = c sum(w m) / (1 + c sum w)           q = t + c / (1 + c sum w)
 //! ```
 //!
-//! are the best linear prediction of what comes back on a machine that has not ground it, and its variance (random effects: Henderson 1975, Robinson
-//! 1991). With k = 1 it is nothing, with k = 0 and one machine that machine's own mean by Wiener's share.
+//! are the best linear prediction of the repeatable error on a machine that has not ground the recipe, and its
+//! variance (random effects: Henderson 1975, Robinson 1991). With k = 1 the prediction is 0. With k = 0 and one
+//! machine it is that machine's own mean times Wiener's share.
 //!
-//! **How much machines differ** is told by recipes that two of them have both ground: |m_1 - m_2|^2 - v_1 - v_2 is 2 t of that recipe. The shares k
-//! of n comparisons have a mean, and the next machine may differ by more: it is widened by 1 + 1/n. Where comparisons of this machine itself tell more,
-//! theirs counts, and so does what all waves of a comparison tell together: of one band, a few waves may agree by chance. Without any, how alike
-//! machines are is unknown, and nothing is taken over; nor is it from machines that have more of their own than in common.
+//! **Machine similarity** is estimated from recipes that two machines have both ground: |m_1 - m_2|^2 - v_1 - v_2 is
+//! 2 t of that recipe. The n comparisons give a mean of k. The next machine can differ by more, so this mean is
+//! widened by 1 + 1/n. If comparisons with this machine itself give a larger k, theirs counts. If all bands of a
+//! comparison together give a larger k than one band, it counts too, since in one band a few waves can agree by
+//! chance. Without any comparison the similarity of machines is unknown, and nothing is taken over. Nor is anything
+//! taken over from machines that have more of their own than in common.
 //!
-//! **Never narrower than own evidence.** What others taught counts for one pass of its own at most, and the share that it still has in a mean is kept
-//! beside it: a machine teaches by its own passes alone, else what one of them found would come back as the word of all.
+//! **Own evidence prevails.** The prior from other machines weighs as one own pass at most, so it is never narrower.
+//! Its remaining share of a mean is stored with the mean: a machine passes on only what its own passes showed.
+//! Otherwise the finding of one machine would come back as that of all.
 
 use super::learning::{Band, CORRELATED, ErrorOnGrid, LearningState, Mean, RESPONSE_LIMITS};
 use crate::geometry::Grid;
 
-/// Variance of the mean over that of N, at least: what one pass tells.
+/// Minimum variance of the mean over that of N: that after one pass.
 const LEAST_BELIEF: f64 = 1.0;
-/// How far machines differ in their response before any tells (standard deviation), and for how many machines that counts.
+/// Standard deviation of the response between machines, before any is known.
 const RESPONSES_DIFFER: f64 = 0.05;
+/// Number of machines that [`RESPONSES_DIFFER`] weighs as.
 const RESPONSES_COUNT_FOR: f64 = 2.0;
-/// Machines of which more than this share is their own have next to nothing to teach, and may be alike by chance.
+/// Maximum share of the power that is a machine's own; above it machines have next to nothing to share, and can agree
+/// by chance.
 const MOST_OWN: f64 = 0.5;
-/// A mean of which others' word is more than this share tells nothing of its machine.
+/// Maximum share of a mean that comes from other machines; above it the mean carries no information on its own
+/// machine.
 const MOST_BORROWED: f64 = 0.5;
-/// What comes back in every pass is less than this anywhere, and a comparison takes fewer steps, in millimetres and numbers.
+/// Maximum repeatable error at any place, in millimetres.
 const MOST_MEAN_MM: f64 = 1.0;
+/// Maximum number of steps of a comparison.
 const MOST_STEPS: f64 = 1e9;
-/// Bands are the same where they begin within this share of each other.
+/// Relative difference below which two bands begin at the same wavelength.
 const SAME: f64 = 1e-9;
 
-/// How much of what comes back in every pass is a machine's own, as far as comparisons tell.
+/// Estimate from comparisons of the share of the repeatable error that is a machine's own.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Alike {
     comparisons: Vec<Comparison>,
@@ -46,42 +55,46 @@ pub struct Alike {
 
 #[derive(Clone, Debug, PartialEq)]
 struct Comparison {
-    /// Whether the machine that is to begin is one of the two.
+    /// True if the machine that is to begin is one of the two.
     is_own: bool,
-    /// Where each band begins, in millimetres, and the share of its power that is the machine's own; none where it could not be compared.
+    /// Shortest wavelength of each band, in millimetres, and the share of its power that is the machine's own; `None`
+    /// if it was not comparable.
     shares: Vec<(f64, Option<f64>)>,
-    /// The same of all of them together.
+    /// The same share for all bands together.
     whole: f64,
 }
 
-/// What a machine that has not ground a recipe begins with.
+/// Initial state of a machine that has not ground a recipe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Shared {
-    /// What is known of it, as after passes of its own; [`LearningState::wanted_mm`] is the correction of its first pass.
+    /// State of the machine, as after passes of its own; [`LearningState::wanted_mm`] is the correction of its first
+    /// pass.
     pub known: LearningState,
-    /// For each band that was taken over: the waves from which it is, in millimetres, and the rms share of what comes back there that is taken to be
-    /// a machine's own.
+    /// For each band taken over: its shortest wavelength, in millimetres, and the assumed rms share of the repeatable
+    /// error that is a machine's own.
     pub differ: Vec<[f64; 2]>,
 }
 
-/// What one machine told of a band.
+/// Observation of a band by one machine.
 struct Told {
     values_mm: Vec<f64>,
     mean_mm2: f64,
-    /// Variance of the mean, and that of what a pass adds by itself.
+    /// Variance of the mean.
     variance_mm2: f64,
+    /// Variance of the non-repeatable error of a pass.
     scatter_mm2: f64,
 }
 
 impl Alike {
-    /// Takes down what a person states: the rms share of what comes back in every pass that is a machine's own, in all wavelengths. It counts as one comparison.
+    /// Adds a person's statement: the rms share of the repeatable error that is a machine's own, in all wavelengths.
+    /// It weighs as one comparison.
     pub fn state(&mut self, rms_share: f64) {
         let share = rms_share * rms_share;
         self.comparisons.push(Comparison { is_own: true, shares: vec![(0.0, Some(share))], whole: share });
     }
 
-    /// Holds what two machines found of one recipe, whichever, against each other; `is_own` where one of them is the machine that is to begin.
-    /// Returns whether they can be compared.
+    /// Compares the states of two machines for one recipe, in any order, and returns true if they are comparable;
+    /// `is_own` is true if one of them is the machine that is to begin.
     pub fn compare(&mut self, [one, other]: [&LearningState; 2], is_own: bool) -> bool {
         let Some(grid) = one.mean.as_ref().map(|mean| mean.grid) else { return false };
         if !has_same_bands(one, other) {
@@ -102,12 +115,13 @@ impl Alike {
         is_compared
     }
 
-    /// Returns the number of comparisons, a statement among them.
+    /// Returns the number of comparisons, including a statement.
     pub fn comparisons(&self) -> usize {
         self.comparisons.len()
     }
 
-    /// Returns what share of the power of waves from a length on is a machine's own; `None` where nothing tells.
+    /// Returns the share of the power of waves from a wavelength on that is a machine's own; `None` if no comparison
+    /// covers it.
     pub fn own_share(&self, from_mm: f64) -> Option<f64> {
         let all = self.expected(from_mm, |_| true)?;
         Some(self.expected(from_mm, |of| of.is_own).map_or(all, |own| own.max(all)))
@@ -122,7 +136,8 @@ impl Alike {
 }
 
 impl Comparison {
-    /// The share in the band that waves of this length are of: the longest band of a smaller part holds all that are longer.
+    /// Returns the share in the band of this wavelength; the longest band of a smaller part contains all longer
+    /// waves.
     fn share(&self, from_mm: f64) -> Option<f64> {
         let (_, share) = self.shares.iter().rev().find(|(from, _)| *from <= from_mm * (1.0 + SAME))?;
         share.map(|share| share.max(self.whole))
@@ -130,7 +145,9 @@ impl Comparison {
 }
 
 impl LearningState {
-    /// Returns why another machine cannot begin with this, and no two be compared by it, though every number is one; `None` where they can.
+    /// Returns why this state cannot seed, or be compared with, another machine's; `None` if it can.
+    ///
+    /// The state can be unfit even if [`LearningState::is_sound`] returns true.
     pub fn unfit_to_teach(&self) -> Option<String> {
         if self.bands.iter().any(|band| band.belief.is_some_and(|belief| belief <= 0.0)) {
             return Some("a mean is said to be known without any doubt".into());
@@ -149,8 +166,9 @@ impl LearningState {
         (steps > MOST_STEPS).then(why)
     }
 
-    /// Begins with what other machines found of the same recipe, as far as machines are alike, on the grid of the correction; `None` where they tell
-    /// nothing of it. `self` is what is known without them.
+    /// Returns the initial state from the states of other machines for the same recipe, on the grid of the
+    /// correction, as far as machines are similar; `None` if no other state is usable. `self` is the state without
+    /// them.
     #[must_use]
     pub fn begun_with(&self, others: &[&Self], alike: &Alike, grid: Grid) -> Option<Shared> {
         let others: Vec<&Self> =
@@ -177,7 +195,7 @@ impl LearningState {
             mean.values_mm.iter_mut().zip(values_mm).for_each(|(sum, value)| *sum += value);
         }
         if !differ.is_empty() {
-            // Whoever has but others' word for it tells nothing of its own machine.
+            // A state with only the means of others carries no information on its own machine.
             let own = |of: &&Vec<Option<Told>>| of.iter().any(Option::is_some);
             let tell: Vec<&Self> = others.iter().zip(&all).filter(|(_, of)| own(of)).map(|(other, _)| *other).collect();
             known.response = response(&tell, self.response);
@@ -194,12 +212,13 @@ fn has_same_bands(one: &LearningState, other: &LearningState) -> bool {
     one.bands.len() == other.bands.len() && one.bands.iter().zip(&other.bands).all(same)
 }
 
-/// An error of nothing, all over a grid.
+/// Returns an error of 0 on all of a grid.
 fn nothing_on(grid: Grid) -> ErrorOnGrid {
     ErrorOnGrid { grid, error_mm: Vec::new(), valid: vec![true; grid.len()], noise_mm2: 0.0 }
 }
 
-/// What passes of a machine told of each band, on a grid; none where it is not known how well, or others told it to the machine.
+/// Returns what the passes of a machine show of each band, on a grid; `None` if its variance is unknown, or if most
+/// of it comes from other machines.
 fn told(known: &LearningState, grid: &Grid) -> Vec<Option<Told>> {
     let Some(mean) = &known.mean else { return known.bands.iter().map(|_| None).collect() };
     let on_grid = nothing_on(*grid);
@@ -207,7 +226,7 @@ fn told(known: &LearningState, grid: &Grid) -> Vec<Option<Told>> {
     let of_band = |(band, values_mm): (&Band, Vec<f64>)| {
         let (belief, scatter_mm2) = band.belief.zip(band.scatter_mm2())?;
         let is_told = scatter_mm2 > 0.0 && band.borrowed <= MOST_BORROWED;
-        // What is its own in the mean is the rest beside what it was told: known as much less well.
+        // The machine's own part of the mean is what remains without the borrowed share, so its variance is larger.
         let variance_mm2 = belief * scatter_mm2 / (1.0 - band.borrowed).powi(2);
         let mean_mm2 = on_grid.mean_square(&values_mm);
         is_told.then_some(Told { values_mm, mean_mm2, variance_mm2, scatter_mm2 })
@@ -215,7 +234,7 @@ fn told(known: &LearningState, grid: &Grid) -> Vec<Option<Told>> {
     known.bands.iter().zip(parts).map(of_band).collect()
 }
 
-/// The power in a band that is the machine's own, and all of it; `None` where no power stands out of the scatter.
+/// Returns the power in a band that is the machine's own, and all of its power; `None` if no power exceeds the noise.
 fn own_and_power(a: &Told, b: &Told) -> Option<[f64; 2]> {
     let power_mm2 = 0.5 * [a, b].map(|of| of.mean_mm2 - of.variance_mm2).iter().sum::<f64>();
     let apart: f64 = a.values_mm.iter().zip(&b.values_mm).map(|(a, b)| (a - b).powi(2)).sum();
@@ -224,7 +243,8 @@ fn own_and_power(a: &Told, b: &Told) -> Option<[f64; 2]> {
     (power_mm2 > 0.0).then_some([own_mm2, power_mm2])
 }
 
-/// What comes back in a band on a machine that has not ground the recipe, with its variance; `None` where nothing does that is common.
+/// Returns the predicted repeatable error in a band on a machine that has not ground the recipe, and its variance;
+/// `None` if there is no common part.
 fn predicted(machines: &[&Told], own_share: f64, nodes: usize) -> Option<(Vec<f64>, f64)> {
     let power = machines.iter().map(|of| of.mean_mm2 - of.variance_mm2).sum::<f64>() / machines.len().max(1) as f64;
     let (own, common) = (own_share * power, (1.0 - own_share) * power);
@@ -240,7 +260,7 @@ fn predicted(machines: &[&Told], own_share: f64, nodes: usize) -> Option<(Vec<f6
     Some((values_mm, own + common / rest))
 }
 
-/// What is known of all wavelengths together, where others tell how much a pass adds by itself.
+/// Returns the band of all wavelengths together, with the non-repeatable error of the others unless it has its own.
 fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
     let of_others: Vec<f64> = others.iter().filter_map(|other| other.whole.scatter_mm2()).collect();
     let others_mm2 = of_others.iter().sum::<f64>() / of_others.len() as f64;
@@ -255,7 +275,8 @@ fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
     Band { belief, borrowed: 1.0, ..with }
 }
 
-/// What is expected of the response: that of the others, as far as machines differ in it, beside what was known before.
+/// Returns the expected response and its standard uncertainty, from the responses of the others, as far as machines
+/// differ in it, and from the earlier estimate.
 fn response(others: &[&LearningState], [before, sigma]: [f64; 2]) -> [f64; 2] {
     let n = others.len() as f64;
     let mean = others.iter().map(|other| other.response[0]).sum::<f64>() / n;
@@ -278,7 +299,7 @@ mod tests {
         LearningState::new(rule, &MapOptions::new(2.5, 1.0), [40.0, 30.0], None)
     }
 
-    /// Values that look random and are the same each time, of a power of 1.
+    /// Returns pseudo-random values of power 1 that are the same for the same seed.
     fn field(seed: u64) -> Vec<f64> {
         let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(1);
         let mut next = || {
@@ -290,7 +311,7 @@ mod tests {
         (0..GRID.len()).map(|_| 12f64.sqrt() * next()).collect()
     }
 
-    /// A machine that knows its mean with this variance of what a pass adds.
+    /// Returns the state of a machine with this mean, variance ratio of the mean and noise variance.
     fn machine(rule: GainRule, values_mm: Vec<f64>, [belief, scatter_mm2]: [f64; 2]) -> LearningState {
         let mut known = fresh(rule);
         for band in known.bands.iter_mut().chain([&mut known.whole]) {
@@ -316,8 +337,8 @@ mod tests {
 
     #[test]
     fn of_two_machines_it_is_what_is_worked_out_by_hand() {
-        // One band; means of a power of 5 and 5, v = 0.5 * 2 = 1: P = 4. A share of 0.25 twice over (one comparison): k = 0.5, t = c = 2, w = 1/3,
-        // 1 + 2 * 2/3 = 7/3: each mean counts 2/3 / (7/3) = 2/7, q = 2 + 2 * 3/7 = 20/7.
+        // One band; means of a power of 5 and 5, v = 0.5 * 2 = 1: P = 4. A share of 0.25, twice (one comparison):
+        // k = 0.5, t = c = 2, w = 1/3, 1 + 2 * 2/3 = 7/3: each mean counts 2/3 / (7/3) = 2/7, q = 2 + 2 * 3/7 = 20/7.
         let flat = |value: f64| machine(GainRule::Adaptive, vec![value; GRID.len()], [0.5, 2.0]);
         let (one, two) = (flat(5f64.sqrt()), flat(-(5f64.sqrt())));
         let begun =
@@ -330,7 +351,7 @@ mod tests {
         for (wanted, r) in known.wanted_mm().unwrap().iter().zip(values) {
             assert_eq!(*wanted, -r / known.response()[0]);
         }
-        // Two that say the contrary of each other.
+        // Two machines that contradict each other.
         assert!(power(&begun(&[&one, &two]).known.mean.unwrap().values_mm) < 1e-24);
     }
 
@@ -361,7 +382,7 @@ mod tests {
                     let (own, noise) = (field(seed), field(seed + 1000));
                     sum(&[((1.0 - share).sqrt(), &common), (share.sqrt(), &own), (0.05, &noise)])
                 };
-                // A noise of 0.05 in all, of which each band has what the bands of white noise have.
+                // A noise of 0.05 in all, divided between the bands as white noise is.
                 let machines = [100 + 2 * pair, 101 + 2 * pair].map(|seed| {
                     let mut known = machine(rule, of(seed), [1.0, 1.0]);
                     let noise = known.split(&nothing_on(GRID), sum(&[(0.05, &field(seed + 1000))]));
@@ -374,7 +395,7 @@ mod tests {
             }
             let all = alike.expected(2.5, |_| true).unwrap();
             assert!((all / 1.05 - share).abs() < 0.03 + 0.05 * share || all == 1.0 && share == 1.0, "{share}: {all}");
-            // The one comparison of this machine itself is widened more.
+            // The single comparison with this machine itself is widened more.
             assert!(alike.own_share(2.5).unwrap() >= all);
         }
     }
@@ -400,7 +421,7 @@ mod tests {
 
     #[test]
     fn own_passes_soon_outweigh_what_others_taught() {
-        // However sure the others are.
+        // However certain the others are.
         let rule = GainRule::Adaptive;
         let other = machine(rule, vec![5.0; GRID.len()], [0.02, 1e-4]);
         let mut known = fresh(rule).begun_with(&[&other], &stated(0.01), GRID).unwrap().known;
@@ -445,7 +466,7 @@ mod tests {
         let mut alike = Alike::default();
         assert!(alike.compare([&machine(rule, on(GRID), [0.1, 1e-6]), &other], false));
         assert!(alike.own_share(2.5).unwrap() < 1e-3, "{alike:?}");
-        // Bands of another cut-off, a machine that has ground nothing, nobody at all.
+        // Bands of another cut-off, a machine that has ground nothing, no machine at all.
         let coarse = LearningState::new(rule, &MapOptions::new(4.0, 1.0), [40.0, 30.0], None);
         assert!(coarse.begun_with(&[&other], &stated(0.05), GRID).is_none());
         assert!(fresh(rule).begun_with(&[&fresh(rule)], &stated(0.05), GRID).is_none());
@@ -488,15 +509,15 @@ mod tests {
         let compared = |is_own, share, whole| Comparison { is_own, shares: vec![(5.0, Some(share))], whole };
         let mut alike = Alike { comparisons: vec![compared(false, 0.02, 0.01)] };
         assert_eq!(alike.own_share(2.5), None);
-        // The longest band holds all that are longer, but no band stands for one that could not be compared.
+        // The longest band contains all longer waves, but no band replaces one that was not comparable.
         assert_eq!(alike.own_share(20.0), Some(0.04));
         let shares = vec![(5.0, Some(0.02)), (10.0, None)];
         let short = Alike { comparisons: vec![Comparison { is_own: false, shares, whole: 0.01 }] };
         assert_eq!([5.0, 10.0, 20.0].map(|from_mm| short.own_share(from_mm)), [Some(0.04), None, None]);
-        // This machine differs by more than the others from each other.
+        // This machine differs from the others by more than they differ from each other.
         alike.comparisons.push(compared(true, 0.3, 0.1));
         assert_eq!(alike.own_share(5.0), Some(0.6));
-        // One that is unlike as a whole is so in every wave, whatever a few of them say.
+        // A machine that differs as a whole differs in every band, even if a few waves agree.
         alike.comparisons.push(compared(true, 0.0, 0.4));
         assert!((alike.own_share(5.0).unwrap() - 0.35 * 1.5).abs() < 1e-12);
     }

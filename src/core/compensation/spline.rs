@@ -1,21 +1,23 @@
-//! A smoothing surface fitted to scattered readings: tensor-product cubic B-splines, held smooth by what it would take to bend it.
+//! Smoothing surface fitted to scattered readings: tensor-product cubic B-splines with a penalty on bending.
 //!
-//! The coefficients c minimise |d - B c|^2 + mu c^T P c, where c^T P c is the integral of f_xx^2 + 2 f_xy^2 + f_yy^2 over the grid: the
-//! bending of a thin plate, worked out exactly for the splines. So A c = B^T d with A = B^T B + mu P, which is sparse (7 x 7
-//! neighbours) and is solved by sparse Cholesky. Planes cost nothing and pass.
+//! The coefficients c minimise |d - B c|^2 + mu c^T P c, where c^T P c is the integral of f_xx^2 + 2 f_xy^2 + f_yy^2
+//! over the grid: the bending of a thin plate, computed exactly for the splines. So A c = B^T d with A = B^T B + mu
+//! P. A is sparse (7 x 7 neighbours), and sparse Cholesky solves the system. Planes have no penalty and pass.
 //!
-//! **Cut-off.** With rho readings to the square millimetre a wave of wave number k passes by 1 / (1 + mu k^4 / rho), whatever
-//! its direction; so mu = rho (cutoff / 2 pi)^4 lets half of it pass at the cut-off, as the spline filters of ISO 16610-22 and -62 do. It
-//! falls off as the fourth power, less sharply than the Gaussian does. Or mu is chosen by generalised cross-validation, within
-//! cut-offs from the one asked for, up to the size of the part.
+//! **Cut-off.** With rho readings per square millimetre a wave of wave number k passes by 1 / (1 + mu k^4 / rho), in
+//! any direction. So mu = rho (cutoff / 2 pi)^4 passes half of it at the cut-off, as the spline filters of
+//! ISO 16610-22 and -62 do. The transmission falls with the fourth power, less sharply than that of the Gaussian.
+//! Alternatively generalised cross-validation chooses mu, for cut-offs between the requested one and the size of the
+//! part.
 //!
-//! **Uncertainty.** Readings that scatter by sigma make c scatter by sigma^2 S, S = A^-1 B^T B A^-1, so a value b^T c has
-//! the standard uncertainty sigma sqrt(b^T S b): what repeated measurements would show. Only entries of S between neighbours
-//! are needed. With Z = A^-1, dZ / d ln mu = -mu Z P Z, and so S = Z + dZ / d ln mu: the selected inverses of A at mu a little
-//! smaller and larger give Z and the derivative. sigma^2 = |d - B c|^2 / (n - 2 tr H + tr H^2), H = B A^-1 B^T.
+//! **Uncertainty.** Noise sigma of the readings gives c the covariance sigma^2 S, S = A^-1 B^T B A^-1. So a value
+//! b^T c has the standard uncertainty sigma sqrt(b^T S b), its variation over repeated measurements. Only entries of S
+//! between neighbours are needed. With Z = A^-1, dZ / d ln mu = -mu Z P Z, and so S = Z + dZ / d ln mu: the selected
+//! inverses of A at a slightly smaller and a slightly larger mu give Z and the derivative.
+//! sigma^2 = |d - B c|^2 / (n - 2 tr H + tr H^2), H = B A^-1 B^T.
 //!
-//! **Cost.** n readings take 152 n sums to lay in; N coefficients take about N^1.5 to factor, thrice, and twice as much for
-//! each of the two selected inverses.
+//! **Cost.** n readings take 152 n sums to assemble. N coefficients take about N^1.5 to factor, three times, and
+//! twice as much for each of the two selected inverses.
 
 use std::f64::consts::TAU;
 
@@ -28,13 +30,14 @@ use super::kept::Kept;
 use crate::geometry::Grid;
 use crate::sparse::{Pattern, SelectedInverse};
 
-/// Knots to a cut-off: with five the splines themselves let waves at the cut-off pass to 0.2 %.
+/// Number of knots per cut-off: with five the splines alone pass waves at the cut-off to 0.2 %.
 const KNOTS: f64 = 5.0;
-/// Most coefficients; a factor of so many takes some 2 GB.
+/// Maximum number of coefficients; a factor of this size takes some 2 GB.
 const MOST_COEFFICIENTS: f64 = 2e5;
 /// Step of ln mu for the derivative of the inverse.
 const STEP: f64 = 0.02;
-/// Share of the largest diagonal entry that is added to all: far outside what was measured nothing else holds the surface to a figure.
+/// Share of the largest diagonal entry that is added to all of them: far outside the readings nothing else determines
+/// the surface.
 const RIDGE: f64 = 1e-13;
 
 /// How the smoothness of a spline is chosen.
@@ -49,7 +52,7 @@ pub enum Roughness {
     CrossValidation,
 }
 
-/// Why there is no smoothing surface.
+/// Error that prevents a smoothing surface.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -63,7 +66,7 @@ pub enum SplineError {
     NotDetermined { points: usize },
 }
 
-/// A smoothing surface at the nodes of a grid.
+/// Smoothing surface at the nodes of a grid.
 #[derive(Clone, Debug)]
 pub(super) struct Fitted {
     pub values: Vec<f64>,
@@ -72,14 +75,14 @@ pub(super) struct Fitted {
     pub sigma: Vec<f64>,
     /// Standard deviation of one reading.
     pub point_sigma: f64,
-    /// The cut-off that the smoothness comes to, in millimetres.
+    /// Effective cut-off of the chosen smoothness, in millimetres.
     #[allow(dead_code, reason = "told by tests")]
     pub cutoff_mm: f64,
 }
 
 /// Fits a smoothing surface to readings over a grid.
 ///
-/// `density` is how many readings there are to the square millimetre.
+/// `density` is the number of readings per square millimetre.
 pub(super) fn spline(
     kept: &Kept,
     grid: &Grid,
@@ -126,7 +129,7 @@ struct Axis {
     cells: usize,
 }
 
-/// Cubic B-splines, or a derivative of them by u, over one cell, as polynomials in u from 0 to 1.
+/// Returns the four cubic B-splines of one cell, or a derivative of them by u, at u from 0 to 1.
 fn basis(derivative: usize, u: f64) -> [f64; 4] {
     let v = 1.0 - u;
     match derivative {
@@ -150,16 +153,17 @@ impl Axis {
         self.cells as f64 * self.step
     }
 
-    /// Returns the first of the four splines at a place, and how far within its cell it is.
+    /// Returns the index of the first of the four splines at a place, and its position u within the cell.
     fn cell(&self, at: f64) -> (usize, f64) {
         let u = ((at - self.first) / self.step).clamp(0.0, self.cells as f64);
         let cell = (u as usize).min(self.cells - 1);
         (cell, u - cell as f64)
     }
 
-    /// Returns the integrals of products of derivatives of neighbouring splines: for each spline with itself and the next three.
+    /// Returns the integrals of products of derivatives of neighbouring splines: for each spline with itself and the
+    /// next three.
     fn products(&self, derivative: usize) -> Vec<[f64; 4]> {
-        // Gauss-Legendre with four points is exact up to the seventh degree; here it is the sixth at most.
+        // Gauss-Legendre with four points is exact up to the seventh degree; here the degree is at most six.
         const GAUSS: [(f64, f64); 4] = [
             (-0.861_136_311_594_052_6, 0.347_854_845_137_453_85),
             (-0.339_981_043_584_856_26, 0.652_145_154_862_546_1),
@@ -182,25 +186,25 @@ impl Axis {
     }
 }
 
-/// A coefficient has entries with itself and 24 later neighbours.
+/// Number of entries of a coefficient: with itself and 24 later neighbours.
 const LATER: usize = 25;
 
-/// Returns where the entry with the neighbour di columns and dj rows on stands among a coefficient's later ones.
+/// Returns the index, among a coefficient's entries, of the neighbour di columns and dj rows later.
 fn later(di: isize, dj: isize) -> usize {
     if dj == 0 { di as usize } else { (4 + (dj - 1) * 7 + di + 3) as usize }
 }
 
-/// The normal equations, without the weight of the bending.
+/// Normal equations, with the bending separate and not yet weighted.
 struct System<'a> {
     axes: [Axis; 2],
     places: &'a [[f64; 2]],
     values: &'a [f64],
     /// B^T B, [`LATER`] entries to a coefficient.
     normal: Vec<f64>,
-    /// The bending, likewise.
+    /// Bending P, in the same layout.
     bending: Vec<f64>,
     right: Vec<f64>,
-    /// Coefficients and their later neighbours that exist, in the order of the pattern.
+    /// Coefficients and their existing later neighbours, in the order of the pattern.
     entries: Vec<(u32, u8)>,
     pattern: Pattern,
 }
@@ -238,7 +242,7 @@ impl<'a> System<'a> {
         }
     }
 
-    /// Returns A for a weight of the bending, in the order of the pattern.
+    /// Returns A for the weight mu of the bending, in the order of the pattern.
     fn matrix(&self, mu: f64) -> Vec<f64> {
         let at = |&(c, s): &(u32, u8)| c as usize * LATER + s as usize;
         let largest =
@@ -307,9 +311,10 @@ impl<'a> System<'a> {
         })
     }
 
-    /// Returns the weight of the bending, between two, with the least n |d - B c|^2 / (n - tr H)^2.
+    /// Returns the weight of the bending in a range that minimises n |d - B c|^2 / (n - tr H)^2.
     ///
-    /// Nine weights are tried, evenly spaced in their logarithm, and the least and its neighbours are searched by golden section.
+    /// Nine weights, evenly spaced in their logarithm, are tried; golden section then searches between the neighbours
+    /// of the best.
     fn cross_validated(&self, least: f64, most: f64) -> Option<f64> {
         const TRIED: usize = 9;
         let count = self.values.len() as f64;
@@ -338,7 +343,7 @@ fn offset(s: usize) -> [isize; 2] {
     if s < 4 { [s as isize, 0] } else { [((s - 4) % 7) as isize - 3, ((s - 4) / 7) as isize + 1] }
 }
 
-/// Returns the entries that exist, where each column begins, and the rows.
+/// Returns the existing entries, the start of each column, and the rows.
 fn neighbours(nx: usize, ny: usize) -> (Vec<(u32, u8)>, Vec<usize>, Vec<usize>) {
     let (mut entries, mut begins, mut rows) = (Vec::new(), vec![0], Vec::new());
     for c in 0..nx * ny {
@@ -406,7 +411,7 @@ impl Local {
         })
     }
 
-    /// Returns b^T S b of a symmetric matrix given by coefficient and later neighbour.
+    /// Returns b^T S b for a symmetric matrix S given by coefficient and later neighbour.
     fn form(&self, matrix: &[f64]) -> f64 {
         let mut sum = 0.0;
         for a in 0..16 {

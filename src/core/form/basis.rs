@@ -1,41 +1,43 @@
-//! The polynomials that form is taken apart into.
+//! Polynomial bases for the decomposition of form.
 
 use crate::geometry::{Aperture, Sample};
 use crate::surface::analytic::{ZernikeNumbering, jacobi_values};
 
 use super::FormError;
 
-/// Most terms of a Legendre series: complete up to degree 13.
+/// Maximum number of terms of a Legendre series: complete up to degree 13.
 const MOST_LEGENDRE: usize = 105;
-/// Most terms of a Zernike series in Noll's and the ANSI numbering.
+/// Maximum number of terms of a Zernike series in Noll's and the ANSI numbering.
 const MOST_ZERNIKE: usize = 105;
 
-/// A sequence of polynomials over x and y.
+/// Sequence of polynomials over x and y.
 ///
-/// Frame: model. Units: millimetres. Each term has a mean square of 1 over its own domain, the full disc or rectangle; on another
-/// aperture the terms are told apart by least squares over the points ([`super::fit`]).
+/// Frame: model. Units: millimetres. Each term has a mean square of 1 over its own domain, the full disc or rectangle.
+/// On another aperture, least squares over the points separates the terms ([`super::fit`]).
 #[derive(Clone, Debug, PartialEq)]
 pub enum Basis {
-    /// Zernike polynomials, from the first index of the numbering on; those of Fringe with the factor of the others.
+    /// Zernike polynomials, from the first index of the numbering on. Fringe terms have the same normalisation as the
+    /// others.
     Zernike {
-        /// Which index stands for which term.
+        /// Numbering that assigns an index to each term.
         numbering: ZernikeNumbering,
-        /// The middle of the disc.
+        /// Centre of the disc.
         centre_mm: [f64; 2],
-        /// The radius of the disc.
+        /// Radius of the disc.
         radius_mm: f64,
     },
-    /// Products L_i(x) L_j(y) of Legendre polynomials: i + j rising, within it i falling.
+    /// Products L_i(x) L_j(y) of Legendre polynomials, in order of rising i + j, then of falling i.
     Legendre {
-        /// The middle of the rectangle.
+        /// Centre of the rectangle.
         centre_mm: [f64; 2],
-        /// Half its size along x and y.
+        /// Half of its size along x and y.
         half_mm: [f64; 2],
     },
 }
 
 impl Basis {
-    /// Returns the polynomials that suit an aperture: Zernike's for a disc, a ring and an ellipse, Legendre's for a rectangle and a polygon.
+    /// Returns the polynomials that suit an aperture: Zernike for a disc, a ring and an ellipse, Legendre for a
+    /// rectangle and a polygon.
     pub fn of(aperture: &Aperture) -> Self {
         match aperture {
             Aperture::Circle { .. } | Aperture::Annulus { .. } | Aperture::Ellipse { .. } => Self::zernike(aperture),
@@ -43,7 +45,8 @@ impl Basis {
         }
     }
 
-    /// Returns the Fringe Zernike polynomials on the smallest disc about the middle of an aperture's bounds that holds it.
+    /// Returns the Fringe Zernike polynomials on the smallest disc that contains the aperture and is centred on its
+    /// bounds.
     pub fn zernike(aperture: &Aperture) -> Self {
         let (centre_mm, half_mm) = middle(aperture.bounds());
         let radius_mm = match aperture {
@@ -56,13 +59,13 @@ impl Basis {
         Self::Zernike { numbering: ZernikeNumbering::Fringe, centre_mm, radius_mm }
     }
 
-    /// Returns the Legendre polynomials on a rectangle, given by its two corners.
+    /// Returns the Legendre polynomials on a rectangle, given by its two corners in mm.
     pub fn legendre(bounds_mm: [[f64; 2]; 2]) -> Self {
         let (centre_mm, half_mm) = middle(bounds_mm);
         Self::Legendre { centre_mm, half_mm }
     }
 
-    /// Returns what the polynomials are called.
+    /// Returns the name of the polynomials.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Zernike { numbering: ZernikeNumbering::Noll, .. } => "Zernike (Noll)",
@@ -87,7 +90,7 @@ impl Basis {
         }
     }
 
-    /// Returns how many terms there are at most.
+    /// Returns the maximum number of terms.
     pub(super) fn most(&self) -> usize {
         match self {
             Self::Zernike { numbering: ZernikeNumbering::Fringe, .. } => 37,
@@ -96,7 +99,7 @@ impl Basis {
         }
     }
 
-    /// Returns the largest number of terms, up to some, that is complete: no term without its companions of other azimuths.
+    /// Returns the largest complete number of terms up to `most`: no term lacks its companions of the same order.
     pub(super) fn complete(&self, most: usize) -> usize {
         let counts =
             |fringe: bool| (0..).map(move |n: usize| if fringe { (n + 1) * (n + 1) } else { (n + 1) * (n + 2) / 2 });
@@ -104,7 +107,10 @@ impl Basis {
         counts(fringe).take_while(|count| *count <= most.min(self.most())).last().unwrap_or(0)
     }
 
-    /// Makes the first terms ready to be evaluated.
+    /// Prepares the first terms for evaluation.
+    ///
+    /// # Errors
+    /// A number of terms out of range, and a domain without an area.
     pub(super) fn terms(&self, terms: usize) -> Result<Terms, FormError> {
         if !(1..=self.most()).contains(&terms) {
             return Err(FormError::Terms { terms, basis: self.name(), most: self.most() });
@@ -125,7 +131,7 @@ impl Basis {
     }
 }
 
-/// The first terms of a basis.
+/// First terms of a basis, ready for evaluation.
 pub(super) enum Terms {
     Zernike { orders: Vec<Order>, terms: usize, centre_mm: [f64; 2], radius_mm: f64 },
     Legendre { degrees: Vec<[usize; 2]>, centre_mm: [f64; 2], half_mm: [f64; 2] },
@@ -139,7 +145,7 @@ impl Terms {
         }
     }
 
-    /// Writes the value of every term at a sample; `index` is what messages call it.
+    /// Writes the value of every term at a sample to `row`. `index` identifies the sample in errors.
     pub(super) fn values(&self, index: usize, sample: &Sample, row: &mut [f64]) -> Result<(), FormError> {
         let [x, y] = sample.at_mm;
         match self {
@@ -164,22 +170,23 @@ impl Terms {
     }
 }
 
-/// How far beyond their disc Zernike polynomials are still evaluated, in radii.
+/// Largest distance from the centre of the disc, in radii, at which Zernike polynomials are evaluated.
 const FAR: f64 = 1.5;
-/// Most radial polynomials of one azimuthal order: up to degree 13, and the one of degree 12 of Fringe.
+/// Maximum number of radial polynomials of one azimuthal order: up to degree 13, and Fringe's term of degree 12.
 const RADIAL: usize = 7;
 
-/// The Zernike terms of one azimuthal order.
+/// Zernike terms of one azimuthal order.
 pub(super) struct Order {
     m: u32,
-    /// Radial polynomials needed.
+    /// Number of radial polynomials needed.
     radial: usize,
-    /// For each term its place in the row, (n - m) / 2, whether it is a sine, and the factor that makes its mean square 1.
+    /// For each term: its place in the row, (n - m) / 2, true if it is a sine, and the factor that makes its mean
+    /// square 1.
     terms: Vec<(usize, usize, bool, f64)>,
 }
 
 impl Order {
-    /// Sorts terms, given by degree and azimuthal order, by the latter.
+    /// Groups terms, given by degree and azimuthal order, by the absolute azimuthal order.
     fn grouped(terms: impl Iterator<Item = (u32, i32)>) -> Vec<Self> {
         let mut orders: Vec<Self> = Vec::new();
         for (place, (n, m)) in terms.enumerate() {
@@ -196,7 +203,8 @@ impl Order {
     }
 }
 
-/// Writes the values of all terms: rho^m cos and sin are the parts of (u + i v)^m, the rest is P_k^(0, m)(2 rho^2 - 1).
+/// Writes the values of all terms. rho^m cos and rho^m sin are the parts of (u + i v)^m; the radial factor is P_k^(0,
+/// m)(2 rho^2 - 1).
 fn zernike(orders: &[Order], [u, v]: [f64; 2], q: f64, row: &mut [f64]) {
     let mut power = [1.0, 0.0];
     let mut radial = [0.0; RADIAL];
@@ -209,10 +217,10 @@ fn zernike(orders: &[Order], [u, v]: [f64; 2], q: f64, row: &mut [f64]) {
     }
 }
 
-/// Highest degree of one Legendre polynomial, and one more.
+/// Number of Legendre polynomials in one variable: degrees 0 to 13.
 const DEGREES: usize = 14;
 
-/// Returns the Legendre polynomials of degree 0 to 13 at a place, times sqrt(2 n + 1), by Bonnet's recurrence.
+/// Returns the Legendre polynomials of degree 0 to 13 at `t`, times sqrt(2 n + 1), by Bonnet's recurrence.
 fn legendre(t: f64) -> [f64; DEGREES] {
     let mut plain = [1.0; DEGREES];
     plain[1] = t;
@@ -223,7 +231,7 @@ fn legendre(t: f64) -> [f64; DEGREES] {
     std::array::from_fn(|n| plain[n] * (2.0 * n as f64 + 1.0).sqrt())
 }
 
-/// Returns the two degrees of a Legendre term: degree by degree, that of x falling.
+/// Returns the degrees of a Legendre term in x and y: by rising total degree, then by falling degree of x.
 fn degrees(k: usize) -> [usize; 2] {
     let sum = ((8 * k + 1).isqrt() - 1) / 2;
     let j = k - sum * (sum + 1) / 2;

@@ -1,10 +1,10 @@
-//! Why there is no such figure.
+//! Errors of the form figures.
 
 use thiserror::Error;
 
 use crate::geometry::Sample;
 
-/// Why there is no such figure.
+/// Reason why a form figure cannot be computed.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -38,7 +38,7 @@ pub enum FormError {
     NoSlope { integration_mm: f64 },
 }
 
-/// Refuses samples that no figure can be made of.
+/// Rejects samples that are too few or not finite.
 pub(super) fn check(samples: &[Sample], least: usize) -> Result<(), FormError> {
     if samples.len() < least {
         return Err(FormError::TooFewPoints { points: samples.len(), least });

@@ -1,4 +1,4 @@
-//! The figures of the points themselves.
+//! Figures of form, computed from the points themselves.
 
 use serde::Serialize;
 
@@ -12,21 +12,21 @@ use crate::geometry::{Aperture, Sample, bounds};
 
 /// Terms of the fit in PVr (Evans 2009: the first 36 Fringe Zernike polynomials).
 const PVR_TERMS: usize = 36;
-/// PV 99.8 % leaves out one point of so many at either end.
+/// PV 99.8 % leaves out one point in this many at either end.
 const LEFT_OUT: usize = 1000;
-/// Cells over the bounds that coverage is counted in, along the longer side, at most.
+/// Maximum number of cells for the coverage, along the longer side of the bounds.
 const MOST_CELLS: f64 = 64.0;
-/// Points that a cell of the coverage holds on average.
+/// Average number of points in a cell of the coverage.
 const POINTS_A_CELL: f64 = 4.0;
 
-/// How figures are made.
+/// Options for the figures.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FormOptions {
-    /// The aperture that the polynomials and the coverage are meant on; without one the bounds of the points.
+    /// Aperture of the polynomials and the coverage. `None` for the bounds of the points.
     pub aperture: Option<Aperture>,
-    /// What is taken off by least squares before anything else.
+    /// Forms to remove by least squares before anything else.
     pub removed: Vec<Removed>,
-    /// The wavelength that ISO 10110-5 names.
+    /// Wavelength that the ISO 10110-5 notation names.
     pub wavelength_nm: f64,
 }
 
@@ -36,77 +36,78 @@ impl Default for FormOptions {
     }
 }
 
-/// A deviation and where it is.
+/// Deviation and its position.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Extreme {
-    /// The deviation in millimetres.
+    /// Deviation in millimetres.
     pub value_mm: f64,
-    /// x and y in the model frame.
+    /// x and y in the model frame, in millimetres.
     pub at_mm: [f64; 2],
 }
 
-/// The robust peak to valley: PV of a fit, and three times the rms of what it leaves.
+/// Robust peak to valley (PVr): PV of a fit plus three times the rms of its residuals.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RobustPv {
-    /// The sum of both.
+    /// PVr, the sum of both, in millimetres.
     pub value_mm: f64,
-    /// PV of the fit at the points.
+    /// PV of the fit at the points, in millimetres.
     pub fit_pv_mm: f64,
-    /// Root mean square of what it leaves.
+    /// Root mean square of the residuals of the fit, in millimetres.
     pub residual_rms_mm: f64,
-    /// The polynomials.
+    /// Name of the polynomials.
     pub basis: &'static str,
-    /// How many terms the points carried, 36 at most.
+    /// Number of terms that the points determine, 36 at most.
     pub terms: usize,
 }
 
-/// How much of the aperture was measured.
+/// Measured part of the aperture.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Coverage {
     /// Share of the cells within the aperture that hold a point.
     pub share: f64,
-    /// Side of a cell.
+    /// Side of a cell, in millimetres.
     pub cell_mm: f64,
 }
 
-/// What is left on the part.
+/// Form figures of the deviations.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Figures {
-    /// How many points.
+    /// Number of points.
     pub points: usize,
-    /// What was taken off before anything else.
+    /// Forms removed before anything else.
     pub removed: Vec<Removed>,
-    /// Largest less least.
+    /// Largest minus smallest deviation.
     pub pv_mm: f64,
-    /// The robust peak to valley.
+    /// Robust peak to valley.
     pub pvr: RobustPv,
-    /// PV of all points but the outermost 0.2 %, as [`pv_of_most`] has it.
+    /// PV of all points without the outermost 0.2 %, by [`pv_of_most`].
     pub pv998_mm: f64,
     /// Root mean square about zero.
     pub rms_mm: f64,
-    /// The mean.
+    /// Mean deviation.
     pub mean_mm: f64,
-    /// The highest point: stock left, where it is above 0.
+    /// Highest point: stock left, if it is above 0.
     pub highest: Extreme,
-    /// The lowest point: undercut, where it is below 0.
+    /// Lowest point: undercut, if it is below 0.
     pub lowest: Extreme,
-    /// How much of the aperture was measured.
+    /// Measured part of the aperture.
     pub coverage: Coverage,
-    /// Power, irregularity and their like.
+    /// Power, irregularity and the related figures of ISO 10110-5.
     pub iso_10110: Iso10110,
-    /// Zernike polynomials on the smallest disc that holds the aperture.
+    /// Fit of Zernike polynomials on the smallest disc that contains the aperture; `None` if it fails.
     pub zernike: Option<Fit>,
-    /// Legendre polynomials on the smallest rectangle that holds it.
+    /// Fit of Legendre polynomials on the smallest rectangle that contains the aperture; `None` if it fails.
     pub legendre: Option<Fit>,
 }
 
-/// Makes the figures of deviations.
+/// Computes the form figures of deviations.
 ///
-/// Shapes: samples in any order, those that took no part left out. Frame: x and y of the model frame. Units: millimetres. The
-/// polynomials of PVr are those that suit the aperture: Zernike's or Legendre's ([`Basis::of`]).
+/// Shapes: samples in any order, without the rejected points. Frame: x and y of the model frame. Units: millimetres.
+/// The polynomials of PVr suit the aperture: Zernike or Legendre ([`Basis::of`]).
 ///
 /// # Errors
-/// Fewer than four points, points on a line, numbers that are not finite, a point far outside of the aperture, a wavelength that is none.
+/// Fewer than four points, points on a line, numbers that are not finite, a point far outside of the aperture, and a
+/// wavelength that is not a finite number above 0.
 pub fn figures(samples: &[Sample], options: &FormOptions) -> Result<Figures, FormError> {
     check(samples, 4)?;
     let aperture = match &options.aperture {
@@ -164,9 +165,10 @@ fn robust_pv(fit: &Fit, samples: &[Sample]) -> Result<RobustPv, FormError> {
     })
 }
 
-/// Returns the peak to valley of all values but the outermost 0.2 %, half of them at either end: PV 99.8 %.
+/// Returns the peak to valley of all values without the outermost 0.2 %, half of them at either end: PV 99.8 %.
 ///
-/// Whole values are left out, never more than that share: of fewer than a thousand none. None where there are no values.
+/// Only whole values are left out, never more than that share; with fewer than a thousand values, none is. Returns
+/// `None` if there are no values.
 pub fn pv_of_most(values: impl Iterator<Item = f64>) -> Option<f64> {
     let mut values: Vec<f64> = values.collect();
     values.sort_unstable_by(f64::total_cmp);
@@ -174,7 +176,8 @@ pub fn pv_of_most(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(values.get(values.len().checked_sub(1 + beyond)?)? - values.get(beyond)?)
 }
 
-/// Counts the cells within the aperture that hold a point; the cells are as large as four points take on average.
+/// Computes the share of the cells within the aperture that hold a point. A cell has the size that four points take on
+/// average.
 fn coverage(aperture: &Aperture, samples: &[Sample]) -> Coverage {
     let [low, high] = aperture.bounds();
     let size: [f64; 2] = std::array::from_fn(|k| high[k] - low[k]);

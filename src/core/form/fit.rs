@@ -1,9 +1,10 @@
-//! Least squares of polynomials over the points as they lie.
+//! Least-squares fit of polynomials to the points at their measured positions.
 //!
-//! The rows [terms | deviation] go through a QR decomposition, share by share, of which only the small triangles R are kept and
-//! decomposed again in their order, so that the number of cores does not change the result. The last column of the last R holds
-//! Q^T d. The columns of Q are the terms made orthogonal on the true aperture, in their order (Gram and Schmidt); Q^T d / sqrt(n) is
-//! the root mean square that each of them takes, whatever terms follow. R^-1 Q^T d are the coefficients of the terms themselves.
+//! The rows [terms | deviation] are decomposed by QR in chunks. Only the small triangles R are kept. They are stacked
+//! in order and decomposed again, so the number of cores does not change the result. The last column of the final R
+//! contains Q^T d. The columns of Q are the terms made orthogonal on the true aperture, in their order (Gram-Schmidt).
+//! Q^T d / sqrt(n) is the root mean square that each of them explains, whatever terms follow. R^-1 Q^T d are the
+//! coefficients of the terms themselves.
 
 use nalgebra::DMatrix;
 use rayon::prelude::*;
@@ -13,30 +14,30 @@ use super::basis::{Basis, Terms};
 use super::error::check;
 use crate::geometry::Sample;
 
-/// Rows that are decomposed at a time.
+/// Number of rows in a chunk.
 const SHARE: usize = 512;
-/// A term of which less than this share is new is not determined.
+/// Smallest share of a term that is independent of the terms before it. Below it the points do not determine the term.
 const NEW: f64 = 1e-7;
-/// A fit that chooses its number of terms has so many points a term at least.
+/// Fewest points per term of a fit that selects its number of terms.
 const POINTS_A_TERM: usize = 4;
 
-/// Polynomials fitted to deviations.
+/// Fit of polynomials to deviations.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fit {
-    /// The polynomials.
+    /// Polynomials of the fit.
     pub basis: Basis,
-    /// The coefficient of each term in millimetres; a term's mean square is 1 over the full disc or rectangle.
+    /// Coefficient of each term in millimetres. The mean square of a term is 1 over the full disc or rectangle.
     pub coefficients_mm: Vec<f64>,
-    /// With its sign, the root mean square that each term takes of the deviations once it is orthogonal to those before it on
-    /// the points, in millimetres.
+    /// Root mean square of the deviations that each term explains, in millimetres and with its sign, after the term is
+    /// made orthogonal on the points to those before it.
     pub orthogonal_mm: Vec<f64>,
-    /// Root mean square of what the terms leave, in millimetres.
+    /// Root mean square of the residuals, in millimetres.
     pub residual_rms_mm: f64,
-    /// How many points were fitted.
+    /// Number of fitted points.
     pub points: usize,
 }
 
-/// Fits the first terms of a basis to samples.
+/// Fits the first terms of a basis to samples and returns the fit.
 ///
 /// Frame: model. Units: millimetres.
 ///
@@ -59,10 +60,10 @@ pub fn fit(basis: &Basis, terms: usize, samples: &[Sample]) -> Result<Fit, FormE
     })
 }
 
-/// Fits as many complete sets of terms as the points carry, four points a term, but no more than some.
+/// Fits as many complete sets of terms as the points determine, with four points per term, and at most `most` terms.
 ///
 /// # Errors
-/// Points that carry not one term, or that are not finite or far outside.
+/// Points that do not determine even one term, or that are not finite or far outside.
 pub fn fit_most(basis: &Basis, most: usize, samples: &[Sample]) -> Result<Fit, FormError> {
     check(samples, POINTS_A_TERM)?;
     let mut terms = basis.complete(most.min(samples.len() / POINTS_A_TERM));
@@ -75,7 +76,7 @@ pub fn fit_most(basis: &Basis, most: usize, samples: &[Sample]) -> Result<Fit, F
 }
 
 impl Fit {
-    /// Returns the value of the fit at every sample, in millimetres.
+    /// Returns the value of the fit at every sample, in millimetres and in the order of the samples.
     ///
     /// # Errors
     /// A sample far outside of the polynomials' domain.
@@ -87,22 +88,22 @@ impl Fit {
         };
         let values: Vec<Result<f64, FormError>> =
             samples.par_iter().enumerate().map_init(|| vec![0.0; terms.len()], value).collect();
-        // The first sample that fails in their order, not in time.
+        // The error is that of the first failing sample in order, not in time.
         values.into_iter().collect()
     }
 }
 
-/// What least squares gives.
+/// Solution of a least-squares problem.
 pub(super) struct Solved {
     pub(super) coefficients: Vec<f64>,
     pub(super) orthogonal: Vec<f64>,
-    /// Root mean square of what is left.
+    /// Root mean square of the residuals.
     pub(super) residual: f64,
-    /// The first term that the points do not determine.
+    /// First term that the points do not determine.
     pub(super) undetermined: Option<usize>,
 }
 
-/// Solves for the coefficients of functions whose values `row` writes.
+/// Solves for the coefficients of functions whose values at a sample `row` writes.
 pub(super) fn solve(
     terms: usize,
     samples: &[Sample],
@@ -145,7 +146,7 @@ fn back_substituted(r: &DMatrix<f64>, terms: usize, points: usize) -> Solved {
     let scale = (points as f64).sqrt();
     let undetermined = (0..terms).find(|&k| {
         let norm = r.column(k).rows(0, k + 1).norm();
-        // Not greater: a NaN determines nothing.
+        // Not a plain comparison: a NaN determines nothing.
         !matches!(r[(k, k)].abs().partial_cmp(&(NEW * norm)), Some(std::cmp::Ordering::Greater))
     });
     let orthogonal: Vec<f64> = (0..terms).map(|k| r[(k, terms)] * r[(k, k)].signum() / scale).collect();

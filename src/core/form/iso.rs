@@ -18,38 +18,39 @@ use super::fit::solve;
 use super::removed::{Removed, pv, without};
 use crate::geometry::{Aperture, Sample};
 
-/// Highest power of r of the symmetric part, halved.
+/// Half of the highest power of r of the symmetric part.
 pub(super) const SYMMETRIC: usize = 6;
 
-/// Power, irregularity and their like, of the surface, in nanometres.
+/// Power, irregularity and the related figures of the surface by ISO 10110-5, in nanometres.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Iso10110 {
     /// A: PV of the power.
     pub power_nm: f64,
-    /// Height of the power at the rim over the middle: above 0 where the rim stands proud.
+    /// Height of the power at the rim relative to the centre, positive if the rim is higher.
     pub power_rim_nm: f64,
     /// B: PV of the irregularity.
     pub irregularity_nm: f64,
-    /// C: PV of the part of the irregularity that is symmetric about the middle.
+    /// C: PV of the part of the irregularity that is symmetric about the centre.
     pub symmetric_nm: f64,
     /// Root mean square of the total.
     pub rms_total_nm: f64,
     /// Root mean square of the irregularity.
     pub rms_irregularity_nm: f64,
-    /// Root mean square of what is not symmetric.
+    /// Root mean square of the part that is not symmetric.
     pub rms_varying_nm: f64,
-    /// The wavelength named.
+    /// Wavelength in the notation.
     pub wavelength_nm: f64,
-    /// The indication that the surface just meets: every value rounded up, in nanometres.
+    /// Tightest indication that the surface meets: every value rounded up, in nanometres.
     pub notation: String,
 }
 
-/// Takes deviations apart as ISO 10110-5 does.
+/// Computes the figures of ISO 10110-5 of deviations.
 ///
-/// Frame: model; symmetry is meant about the middle of the aperture. Units: samples in millimetres.
+/// Frame: model; symmetry is about the centre of the aperture's bounds. Units: samples in millimetres.
 ///
 /// # Errors
-/// Fewer than four points, points on a line, numbers that are not finite, a wavelength that is none.
+/// Fewer than four points, points on a line, numbers that are not finite, and a wavelength that is not a finite number
+/// above 0.
 pub fn iso_10110(samples: &[Sample], aperture: &Aperture, wavelength_nm: f64) -> Result<Iso10110, FormError> {
     check(samples, 4)?;
     if !(wavelength_nm > 0.0 && wavelength_nm.is_finite()) {
@@ -64,7 +65,7 @@ pub fn iso_10110(samples: &[Sample], aperture: &Aperture, wavelength_nm: f64) ->
     };
     let total = without(&[Removed::Piston, Removed::Tilt], samples)?;
     let irregularity = without(&[Removed::Piston, Removed::Tilt, Removed::Power], samples)?;
-    // The coefficient of r^2, the origin of which does not matter beside piston and tilt.
+    // The coefficient of r^2. Its origin does not matter, because piston and tilt are fitted too.
     let power = solve(4, samples, |_, s, row| {
         let [x, y]: [f64; 2] = std::array::from_fn(|k| (s.at_mm[k] - middle[k]) / radius);
         row.copy_from_slice(&[1.0, x, y, x * x + y * y]);
@@ -90,8 +91,9 @@ pub fn iso_10110(samples: &[Sample], aperture: &Aperture, wavelength_nm: f64) ->
     Ok(found)
 }
 
-/// Fits P_0 to P_6 of 2 (r/R)^2 - 1, Legendre's polynomials, which are the Zernike terms without azimuth but for a factor; fewer where the
-/// points do not carry them. Returns the values at the samples.
+/// Fits the Legendre polynomials P_0 to P_6 of 2 (r/R)^2 - 1 and returns the values of the fit at the samples. These
+/// polynomials are the Zernike terms without azimuth, apart from a factor. Uses fewer terms if the points do not
+/// determine all.
 fn symmetric(samples: &[Sample], square: impl Fn(&Sample) -> f64 + Sync) -> Result<Vec<f64>, FormError> {
     let values = |s: &Sample| even_terms(square(s));
     let mut terms = (SYMMETRIC + 1).min(samples.len() / 4).max(1);
@@ -108,7 +110,7 @@ fn symmetric(samples: &[Sample], square: impl Fn(&Sample) -> f64 + Sync) -> Resu
     }
 }
 
-/// The values of the terms where (r/R)^2 is so much.
+/// Returns the values of the symmetric terms, given (r/R)^2.
 pub(super) fn even_terms(square: f64) -> [f64; SYMMETRIC + 1] {
     let t = 2.0 * square - 1.0;
     let mut row = [1.0; SYMMETRIC + 1];
@@ -131,15 +133,16 @@ fn notation(found: &Iso10110) -> String {
     iso_10110_notation([power_nm, irregularity_nm, symmetric_nm], rms_nm, found.wavelength_nm)
 }
 
-/// Returns the indication of ISO 10110-5 with A, B and C, and with RMSt, RMSi and RMSa, every value rounded up. Units: nanometres.
+/// Returns the indication of ISO 10110-5 with A, B and C, and with RMSt, RMSi and RMSa, every value rounded up. Units:
+/// nanometres.
 pub fn iso_10110_notation([a, b, c]: [f64; 3], [total, irregularity, varying]: [f64; 3], wavelength_nm: f64) -> String {
     let [a, b, c, total, irregularity, varying] = [a, b, c, total, irregularity, varying].map(up);
     format!("3/{a}({b}/{c}) RMSt<{total}; RMSi<{irregularity}; RMSa<{varying}; lambda={wavelength_nm}")
 }
 
-/// Writes a value in nanometres rounded up: to whole ones from 10 on, to hundredths below.
+/// Formats a value in nanometres, rounded up: to whole nanometres from 10 nm on, to hundredths below.
 fn up(value_nm: f64) -> String {
-    // What rounding leaves of a zero is no hundredth, and a zero has no sign.
+    // The rounding error of a zero must not become a hundredth, and a zero has no sign.
     let steps = if value_nm >= 10.0 { 1.0 } else { 100.0 };
     format!("{}", ((value_nm * steps - 1e-6).ceil().max(0.0) + 0.0) / steps)
 }

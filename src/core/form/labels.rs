@@ -1,4 +1,4 @@
-//! Figures with their labels: no number leaves without what was removed, its direction and its cut-off.
+//! Labels of figures: each number states the removed forms, its direction and its cut-off.
 
 use serde::Serialize;
 
@@ -6,48 +6,48 @@ use super::figures::Figures;
 use super::removed::Removed;
 use super::slope::Slope;
 
-/// The direction of all figures.
+/// Direction of all figures.
 pub const DIRECTION: &str = "along the outward normal of the nominal surface, positive where material stands proud";
 
-/// A figure with everything that one must know of it.
+/// Figure with its label.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Labelled {
-    /// What it is called.
+    /// Name of the figure.
     pub name: &'static str,
-    /// The number.
+    /// Value of the figure.
     pub value: f64,
-    /// Its unit.
+    /// Unit of the value.
     pub unit: &'static str,
-    /// What was removed before.
+    /// Forms removed before.
     pub removed: String,
-    /// Its direction.
+    /// Direction of the figure.
     pub direction: &'static str,
-    /// What the filter took out, or that there was none.
+    /// Part removed by the filter, or a note that there was no filter.
     pub cut_off: String,
-    /// How it was made, where its name does not tell.
+    /// Method of computation, if the name does not give it.
     pub made: String,
-    /// Where on the part, in the model frame, if it is of one place.
+    /// Position on the part in the model frame, in mm; `None` if the figure does not belong to one place.
     pub at_mm: Option<[f64; 2]>,
 }
 
-/// What was taken out of the deviations before any figure was made of them.
+/// Motions and forms removed from the deviations before any figure is computed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TakenOut {
-    /// The motions that the registration took out, in words.
+    /// Motions removed by the registration, in words.
     pub motion: String,
-    /// What the filter of the map took out, in words.
+    /// Part removed by the filter of the map, in words.
     pub filter: String,
 }
 
 impl TakenOut {
-    /// Returns what was removed, with forms beside the motion.
+    /// Returns the words for the motion and for the removed forms, separated by commas.
     pub fn removed(&self, forms: &[Removed]) -> String {
         let words = std::iter::once(self.motion.as_str()).chain(forms.iter().map(|form| form.word()));
         words.collect::<Vec<_>>().join(", ")
     }
 }
 
-/// The cut-off of figures that are made of the points.
+/// Cut-off of figures that are computed from the points.
 pub const EVERY_POINT: &str = "none: every point used";
 
 /// Returns the figures of points with their labels, in the order of a report.

@@ -1,14 +1,14 @@
-//! What is left on the part, in the field's figures: PV, PVr, RMS, stock left and undercut, slopes, polynomials, ISO 10110-5.
+//! Form figures of the deviations: PV, PVr, RMS, stock left and undercut, slopes, polynomials, ISO 10110-5.
 //!
 //! ```text
-//!  deviations (x, y, d) --+--> removed terms --> Figures    each with what was removed, its direction and its cut-off
+//!  deviations (x, y, d) --+--> removed terms --> Figures    each with removed forms, direction and cut-off
 //!                         +--> Fit              Zernike or Legendre coefficients, orthogonal on the true aperture
 //!  error map (on a grid) ----> Slope             over a stated integration length
 //! ```
 //!
-//! Pure: no file, no clock, no randomness. Frames: x and y of the model frame {M}. Units: millimetres and radians inside, nanometres
-//! and micrometres only where words are made. Signs: positive where material stands proud, along the outward normal. Figures are those of the
-//! surface and not of a wavefront, which a mirror doubles.
+//! Pure: no file, no clock, no randomness. Frames: x and y of the model frame {M}. Units: millimetres and radians
+//! inside, nanometres and micrometres only in text. Signs: positive where material is above the nominal surface, along
+//! the outward normal. The figures describe the surface. A wavefront reflected by a mirror has twice the error.
 
 mod basis;
 mod error;

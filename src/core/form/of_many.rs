@@ -1,50 +1,51 @@
-//! ISO 10110-5 of many forms at the same places: what depends on the places alone is made once.
+//! ISO 10110-5 figures of many forms at the same places. The part that depends only on the places is computed once.
 //!
-//! The fits of [`super::iso_10110`] are projections: f less its fit is f - Q Q'f, with Q the terms made orthogonal on the places. Q is made once, and a form
-//! takes some twenty sums over the places.
+//! The fits of [`super::iso_10110`] are projections: f minus its fit is f - Q Q'f, with Q the terms made orthogonal on
+//! the places. Q is computed once, and each form needs some twenty sums over the places.
 
 use nalgebra::DMatrix;
 
 use super::iso::{SYMMETRIC, even_terms};
 
-/// Fewer places tell no figure of an area.
+/// Fewest places for a figure of an area.
 const FEWEST: usize = 12;
-/// A term of which less than this share is new is not determined.
+/// Smallest share of a term that is independent of the terms before it. Below it the places do not determine the term.
 const NEW: f64 = 1e-7;
 
-/// The fits of ISO 10110-5 over some places.
+/// Fits of ISO 10110-5 over a set of places.
 pub struct IsoFits {
-    /// Piston, tilt and r^2, orthogonal, a row a place.
+    /// Piston, x and y tilt and r^2, orthogonal, each with one value per place.
     base: Vec<Vec<f64>>,
-    /// How much of r^2 / R^2 a unit of the last of them is, and the peak to valley of that over the places.
+    /// Coefficient of r^2 / R^2 for a unit of the last of these terms, and the peak to valley of r^2 / R^2 over the
+    /// places.
     power: f64,
     power_pv: f64,
-    /// The terms that are symmetric about the middle.
+    /// Terms that are symmetric about the centre.
     even: Vec<Vec<f64>>,
 }
 
-/// What ISO 10110-5 says of a form. Units: millimetres.
+/// Figures of ISO 10110-5 of a form. Units: millimetres.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct IsoOfForm {
     /// A: PV of the power.
     pub power_mm: f64,
-    /// Height of the power at the rim over the middle: above 0 where the rim stands proud.
+    /// Height of the power at the rim relative to the centre, positive if the rim is higher.
     pub power_rim_mm: f64,
     /// B: PV of the irregularity.
     pub irregularity_mm: f64,
-    /// C: PV of the part of the irregularity that is symmetric about the middle.
+    /// C: PV of the part of the irregularity that is symmetric about the centre.
     pub symmetric_mm: f64,
     /// Root mean square of the total.
     pub rms_total_mm: f64,
     /// Root mean square of the irregularity.
     pub rms_irregularity_mm: f64,
-    /// Root mean square of what is not symmetric.
+    /// Root mean square of the part that is not symmetric.
     pub rms_varying_mm: f64,
 }
 
 impl IsoFits {
-    /// Makes the fits over places; symmetry is meant about `middle_mm`, or about the middle of their bounds. None where the places are too few or
-    /// lie so that a fit is not determined.
+    /// Builds the fits over places. Symmetry is about `middle_mm`, or about the centre of the places' bounds. Returns
+    /// `None` if the places are too few or do not determine a fit.
     ///
     /// Frame: model. Units: millimetres.
     pub fn over(places: &[[f64; 2]], middle_mm: Option<[f64; 2]>) -> Option<Self> {
@@ -69,7 +70,7 @@ impl IsoFits {
         Some(Self { base, power: 1.0 / scales[3], power_pv: most - least, even })
     }
 
-    /// Takes a form apart: a value a place, in their order.
+    /// Computes the figures of a form, given as one value per place, in their order.
     pub fn of(&self, form: &[f64]) -> IsoOfForm {
         let n = form.len() as f64;
         let dot = |row: &[f64], with: &[f64]| row.iter().zip(with).map(|(a, b)| a * b).sum::<f64>();
@@ -102,7 +103,8 @@ impl IsoFits {
     }
 }
 
-/// Terms made orthogonal in their order, each with what is new of it; none where one of them is not determined.
+/// Returns the terms made orthogonal in their order, and the diagonal of R: the independent part of each term, with its
+/// sign. Returns `None` if a term is not determined.
 fn orthogonal(rows: &DMatrix<f64>) -> Option<(Vec<Vec<f64>>, Vec<f64>)> {
     let (q, r) = rows.clone().qr().unpack();
     let columns = q.column_iter().map(|column| column.iter().copied().collect()).collect();

@@ -1,4 +1,4 @@
-//! Simple forms that are taken off deviations before anything else.
+//! Simple forms that are removed from deviations before anything else.
 
 use serde::{Deserialize, Serialize};
 
@@ -27,7 +27,7 @@ pub enum Removed {
 }
 
 impl Removed {
-    /// Returns what it is called.
+    /// Returns the name of the form.
     pub fn word(self) -> &'static str {
         match self {
             Self::Piston => "piston",
@@ -40,7 +40,10 @@ impl Removed {
     }
 }
 
-/// Takes simple forms off by least squares, all at once.
+/// Fits simple forms by least squares, all at once, and returns the samples without them.
+///
+/// # Errors
+/// Too few points, points at one place, and forms that the points do not determine.
 pub(super) fn without(removed: &[Removed], samples: &[Sample]) -> Result<Vec<Sample>, FormError> {
     let [low, high] = bounds(samples.iter().map(|s| s.at_mm));
     let middle: [f64; 2] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
@@ -85,12 +88,12 @@ pub(super) fn without(removed: &[Removed], samples: &[Sample]) -> Result<Vec<Sam
     Ok(samples.iter().map(left).collect())
 }
 
-/// How many terms a form has.
+/// Returns the number of terms of a form.
 fn values_of(form: Removed) -> usize {
     if matches!(form, Removed::Tilt | Removed::Astigmatism | Removed::Coma) { 2 } else { 1 }
 }
 
-/// Returns the largest less the least value.
+/// Returns the largest minus the smallest value, or 0 if there are no values.
 pub(super) fn pv(values: impl Iterator<Item = f64>) -> f64 {
     let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
     if high >= low { high - low } else { 0.0 }

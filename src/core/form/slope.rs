@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::FormError;
 use crate::geometry::Grid;
 
-/// The slopes of a map over an integration length.
+/// Slopes of a map over an integration length.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Slope {
     /// Root mean square of the gradient's length.
@@ -14,19 +14,20 @@ pub struct Slope {
     pub rms_along_rad: [f64; 2],
     /// Largest length of the gradient.
     pub largest_rad: f64,
-    /// Length over which a slope was taken along x and along y, in millimetres: an even number of steps of the grid.
+    /// Integration length along x and along y, in millimetres: an even number of steps of the grid.
     pub integration_mm: [f64; 2],
-    /// At how many nodes it was taken.
+    /// Number of nodes with a slope.
     pub nodes: usize,
 }
 
-/// Returns the slopes of values on a grid, each the difference of two values an integration length apart, divided by it.
+/// Returns the slopes of values on a grid. Each is the difference of two values an integration length apart, divided by
+/// that length.
 ///
-/// Shapes: a value and whether it is valid for every node. Units: millimetres. The length is rounded to an even number of steps, two at
-/// least; a node counts where all four of its neighbours at half the length are valid.
+/// Shapes: a value and a valid flag for every node. Units: millimetres. The length is rounded to an even number of
+/// steps, at least two. A node counts if its four neighbours at half the length are all valid.
 ///
 /// # Errors
-/// A length that is none, and a map without such a node.
+/// A length that is not a finite number above 0, and a map without a node that counts.
 pub fn slope(grid: &Grid, values_mm: &[f64], valid: &[bool], integration_mm: f64) -> Result<Slope, FormError> {
     if !(integration_mm > 0.0 && integration_mm.is_finite()) {
         return Err(FormError::Integration { integration_mm });

@@ -1,44 +1,46 @@
-//! Slopes of many forms at the same scattered places: what depends on the places alone is made once.
+//! Slopes of many forms at the same scattered places. The part that depends only on the places is computed once.
 //!
-//! The slope at a place is that of the least-squares plane through all places within R of it. Such a plane flattens a wave by 1 - (k R)^2 / 12, and a difference
-//! over a length L by 1 - (k L)^2 / 24: R = L / sqrt 2 has the integration length L.
+//! The slope at a place is that of the least-squares plane through all places within R of it. This plane attenuates a
+//! wave by 1 - (k R)^2 / 12; a difference over a length L attenuates it by 1 - (k L)^2 / 24. So R = L / sqrt 2 has the
+//! integration length L.
 
 use nalgebra::{Matrix2, SymmetricEigen, Vector2};
 
 use crate::geometry::bounds;
 
-/// Fewer places tell no figure of an area; at fewer a slope is taken for none of the part.
+/// Fewest places for a figure of an area, and fewest nodes at which the slopes represent the part.
 const FEWEST: usize = 20;
 const FEWEST_NODES: usize = 6;
-/// Places at which a slope is taken, and places that each is taken from, at most.
+/// Most nodes (places with a slope), and most places that each slope is computed from.
 const MOST_NODES: usize = 1500;
 const MOST_AROUND: usize = 24;
-/// The shortest radius, in distances from place to place: as far as the corners of a square.
+/// Smallest radius, in mean distances between places: it reaches a little beyond the corners of a square.
 const SHORTEST: f64 = 1.5;
-/// A longer one is taken where less than this share of the places has a slope; it is no longer than this share of the part.
+/// Limits and step for the radius. It grows by `LONGER` while less than `SHARE` of the nodes has a slope, up to
+/// `LONGEST` of the smaller side of the part.
 const SHARE: f64 = 0.25;
 const LONGEST: f64 = 0.3;
 const LONGER: f64 = 1.25;
-/// Least variance of the places around along any direction, and how far their middle may be off, in shares of the radius: beyond that a
-/// place lies at an edge.
+/// Smallest variance of the surrounding places along any direction, in squared radii, and largest offset of their
+/// centroid, in radii. Outside these limits a place lies at an edge.
 const LEAST_VARIANCE: f64 = 0.08;
 const MOST_OFF: f64 = 0.25;
 
-/// How slopes are taken from values at some places.
+/// Weights that give the slopes from the values at a set of places.
 pub struct SlopesAt {
-    /// Length over which a slope is taken.
+    /// Integration length of the slopes, in mm.
     pub integration_mm: f64,
-    /// At how many places it is taken.
+    /// Number of nodes.
     pub nodes: usize,
-    /// Where the places of each node begin, and behind the last.
+    /// Start of each node in `weights`, and the end of the last.
     begins: Vec<usize>,
-    /// Which place counts how much for the slope along x and along y.
+    /// Index of a place, and its weights for the slope along x and along y.
     weights: Vec<(usize, [f64; 2])>,
 }
 
 impl SlopesAt {
-    /// Makes them over an integration length, or over one that is longer and as short as the places allow. None where the places are too few for
-    /// any.
+    /// Builds the weights for an integration length. If the places do not allow it, uses the shortest longer one that
+    /// they allow. Without a given length it uses the shortest possible. Returns `None` if the places allow no length.
     ///
     /// Frame: model. Units: millimetres.
     pub fn over(places: &[[f64; 2]], integration_mm: Option<f64>) -> Option<Self> {
@@ -54,7 +56,7 @@ impl SlopesAt {
         if !(radius_mm.is_finite() && radius_mm > 0.0) {
             return None;
         }
-        // Places along x, so that those that are near are a run of them.
+        // Sorted along x, so that the near places form one contiguous run.
         let mut order: Vec<usize> = (0..places.len()).collect();
         order.sort_by(|&a, &b| places[a][0].total_cmp(&places[b][0]).then(a.cmp(&b)));
         while radius_mm <= longest_mm {
@@ -80,7 +82,8 @@ impl SlopesAt {
         Self { integration_mm: radius_mm * 2f64.sqrt(), nodes: begins.len() - 1, begins, weights }
     }
 
-    /// Returns the root mean square and the largest of the slopes of a form, in radians: a value a place, in their order.
+    /// Returns the root mean square and the largest of the slopes of a form, in radians. The form has one value per
+    /// place, in their order.
     pub fn of(&self, form: &[f64]) -> [f64; 2] {
         let (mut squares, mut most) = (0.0, 0.0_f64);
         for ends in self.begins.windows(2) {
@@ -97,7 +100,8 @@ impl SlopesAt {
     }
 }
 
-/// How much each place around one counts for the slope of a plane through them; none where they do not lie all around.
+/// Returns the weight of each place around one for the slope of a plane through them; `None` if they do not lie all
+/// around it.
 fn plane(places: &[[f64; 2]], order: &[usize], of: usize, radius_mm: f64) -> Option<Vec<(usize, [f64; 2])>> {
     let [x, y] = places[of];
     let first = order.partition_point(|&k| places[k][0] < x - radius_mm);

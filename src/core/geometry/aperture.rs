@@ -1,17 +1,17 @@
-//! The outline of a part in the plane: where its surface counts.
+//! The outline of a part in the plane: the region in which its surface counts.
 //!
-//! An aperture is a closed set in the (x, y) plane of the surface's own frame: its boundary belongs to it. Lengths are
-//! millimetres. What is read from outside is checked once by [`Aperture::validate`]; the other functions rely on it.
+//! An aperture is a closed set in the (x, y) plane of the surface's own frame: it includes its boundary. Lengths are in
+//! millimetres. [`Aperture::validate`] checks an aperture from outside once; the other functions rely on it.
 
 use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Largest coordinate or size that is taken for a part, in millimetres.
+/// Largest accepted coordinate or size of a part, in millimetres.
 const LARGEST_MM: f64 = 1e6;
 
-/// Most corners of a polygon: its check compares every pair of edges.
+/// Maximum number of corners of a polygon: its check compares every pair of edges.
 const MOST_CORNERS: usize = 4000;
 
 /// The outline of a part in the (x, y) plane.
@@ -65,18 +65,18 @@ pub enum Aperture {
     },
 }
 
-/// Why a set of numbers is no outline. A key is written as in TOML; corners count from 1.
+/// Reason why a set of numbers is not an outline. A key is written as in TOML; corners count from 1.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum ApertureError {
-    /// A coordinate is NaN, infinite or absurd.
+    /// A coordinate is NaN, infinite or too large.
     #[error("`{key}` is {value_mm} mm; it must be a number between -{LARGEST_MM:e} and {LARGEST_MM:e} mm")]
     Coordinate { key: &'static str, value_mm: f64 },
-    /// A size is zero, negative, NaN or absurd.
+    /// A size is zero, negative, NaN or too large.
     #[error("`{key}` is {value_mm} mm; it must be greater than 0 and at most {LARGEST_MM:e} mm")]
     Size { key: &'static str, value_mm: f64 },
-    /// The hole of an annulus leaves nothing.
+    /// The hole of an annulus is negative or as large as the rim.
     #[error(
         "`inner_radius_mm` is {inner_mm} mm; it must be at least 0 and less than `outer_radius_mm`, which is {outer_mm} mm"
     )]
@@ -107,7 +107,7 @@ impl ApertureError {
 }
 
 impl Aperture {
-    /// Returns the rectangle between two corners, the least and the largest.
+    /// Returns the rectangle between two corners, the lower and the upper.
     pub(crate) fn between([low, high]: [[f64; 2]; 2]) -> Self {
         let centre_mm = [0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1])];
         Self::Rectangle { centre_mm, width_mm: high[0] - low[0], height_mm: high[1] - low[1] }
@@ -116,8 +116,8 @@ impl Aperture {
     /// Checks that the numbers describe an outline with an inside.
     ///
     /// # Errors
-    /// A coordinate or size that is not finite or absurdly large, a size that is not positive, a hole as large as the rim,
-    /// or a polygon that is no simple closed line of at least three corners.
+    /// Returns an error if a coordinate or size is not finite or is too large, if a size is not positive, if a hole is
+    /// as large as the rim, or if a polygon is not a simple closed line of at least three corners.
     pub fn validate(&self) -> Result<(), ApertureError> {
         match self {
             Self::Rectangle { centre_mm, width_mm, height_mm } => {
@@ -145,9 +145,9 @@ impl Aperture {
         }
     }
 
-    /// Tells whether a place lies in the aperture; the boundary does.
+    /// Returns true if a place lies in the aperture or on its boundary.
     ///
-    /// Units: millimetres. A NaN lies nowhere.
+    /// Units: millimetres. Returns false for NaN.
     pub fn contains(&self, x: f64, y: f64) -> bool {
         match self {
             Self::Rectangle { centre_mm: [cx, cy], width_mm, height_mm } => {
@@ -165,7 +165,7 @@ impl Aperture {
         }
     }
 
-    /// Returns how far a place lies outside the aperture: 0 within it, else the distance to its nearest point.
+    /// Returns the distance of a place outside the aperture to the nearest point of the aperture; 0 inside.
     ///
     /// Units: millimetres.
     pub fn distance_mm(&self, x: f64, y: f64) -> f64 {
@@ -187,7 +187,7 @@ impl Aperture {
         }
     }
 
-    /// Returns the smallest rectangle along the axes that holds the aperture: [[x least, y least], [x most, y most]].
+    /// Returns the smallest rectangle along the axes that contains the aperture: `[[x min, y min], [x max, y max]]`.
     ///
     /// Units: millimetres.
     pub fn bounds(&self) -> [[f64; 2]; 2] {
@@ -212,7 +212,7 @@ impl Aperture {
             Self::Annulus { inner_radius_mm: inner, outer_radius_mm: outer, .. } => {
                 PI * (outer - inner) * (outer + inner)
             }
-            // From one corner, so that a place far from the origin costs no digits.
+            // Areas are taken from one corner, so that a polygon far from the origin loses no digits.
             Self::Polygon { corners_mm } => {
                 let of_edge = |[p, q]: [[f64; 2]; 2]| 0.5 * orient2d(corners_mm[0], p, q);
                 edges(corners_mm).map(of_edge).sum::<f64>().abs()
@@ -220,9 +220,9 @@ impl Aperture {
         }
     }
 
-    /// Returns places along the whole boundary, at least `count` in all; corners are among them.
+    /// Returns places along the whole boundary, at least `count` in total, including the corners.
     ///
-    /// Units: millimetres. On a round boundary a place may lie outside by rounding.
+    /// Units: millimetres. On a round boundary a place can lie outside by rounding.
     pub fn outline_mm(&self, count: usize) -> Vec<[f64; 2]> {
         let around = |[x, y]: [f64; 2], a: f64, b: f64| {
             (0..count).map(move |i| {
@@ -246,7 +246,7 @@ impl Aperture {
 
     /// Returns the distance from the origin to the aperture's farthest point.
     ///
-    /// Units: millimetres. An ellipse off the origin is measured at 720 places, within 1e-5 of the distance.
+    /// Units: millimetres. An ellipse off the origin is evaluated at 720 places, which is within 1e-5 of the distance.
     pub fn reach_mm(&self) -> f64 {
         match self {
             Self::Circle { centre_mm: [x, y], radius_mm: r }
@@ -255,10 +255,10 @@ impl Aperture {
         }
     }
 
-    /// Returns fixed places all over the aperture and along its outline, some hundred of each.
+    /// Returns fixed places spread over the aperture and along its outline, some hundred of each.
     ///
-    /// Units: millimetres. Within the bounds they follow the additive recurrence of the plastic number, which leaves no gaps and
-    /// no lattice.
+    /// Units: millimetres. Inside, the places follow the additive recurrence of the plastic number, which leaves no
+    /// gaps and forms no lattice.
     pub(crate) fn places_mm(&self) -> Vec<[f64; 2]> {
         let [least, most] = self.bounds();
         let plastic = 1.324_717_957_244_746_f64;
@@ -321,7 +321,7 @@ fn edges(corners: &[[f64; 2]]) -> impl Iterator<Item = [[f64; 2]; 2]> + '_ {
     corners.iter().zip(corners.iter().cycle().skip(1)).map(|(p, q)| [*p, *q])
 }
 
-/// Returns places along the edges of a closed polygon, each corner and as many between on every edge.
+/// Returns places along the edges of a closed polygon: each corner, and equally many places between on every edge.
 fn along_edges(corners: &[[f64; 2]], count: usize) -> Vec<[f64; 2]> {
     let steps = count.div_ceil(corners.len()).max(1);
     let places = edges(corners).flat_map(|[p, q]| {
@@ -333,24 +333,24 @@ fn along_edges(corners: &[[f64; 2]], count: usize) -> Vec<[f64; 2]> {
     places.collect()
 }
 
-/// Tells whether the ray from a place towards +x crosses an edge; an edge holds its lower end only, so that no corner
-/// counts twice.
+/// Returns true if the ray from a place towards +x crosses an edge. An edge includes its lower end only, so that no
+/// corner counts twice.
 fn crosses_ray(p: [f64; 2], q: [f64; 2], x: f64, y: f64) -> bool {
     (p[1] > y) != (q[1] > y) && x < p[0] + (y - p[1]) / (q[1] - p[1]) * (q[0] - p[0])
 }
 
-/// Twice the signed area of a triangle.
+/// Returns twice the signed area of a triangle.
 fn orient2d(p: [f64; 2], q: [f64; 2], r: [f64; 2]) -> f64 {
     (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
 }
 
-/// Tells whether an edge runs back over the one before it.
+/// Returns true if an edge runs back over the edge before it.
 fn folds_back([p, q]: [[f64; 2]; 2], [_, r]: [[f64; 2]; 2]) -> bool {
     let forward = (q[0] - p[0]) * (r[0] - q[0]) + (q[1] - p[1]) * (r[1] - q[1]);
     orient2d(p, q, r) == 0.0 && forward < 0.0
 }
 
-/// Tells whether two segments cross or touch.
+/// Returns true if two segments cross or touch.
 fn segments_meet([a, b]: [[f64; 2]; 2], [c, d]: [[f64; 2]; 2]) -> bool {
     let (c_side, d_side, a_side, b_side) = (orient2d(a, b, c), orient2d(a, b, d), orient2d(c, d, a), orient2d(c, d, b));
     if c_side * d_side < 0.0 && a_side * b_side < 0.0 {
@@ -369,10 +369,11 @@ fn segment_distance([p, q]: [[f64; 2]; 2], x: f64, y: f64) -> f64 {
     (x - p[0] - t * ex).hypot(y - p[1] - t * ey)
 }
 
-/// Returns how far a place lies outside an ellipse about the origin.
+/// Returns the distance of a place outside an ellipse about the origin; 0 inside.
 ///
-/// The foot of the perpendicular is (a^2 x / (t + a^2), b^2 y / (t + b^2)) where t >= 0 puts it on the ellipse. That
-/// condition is convex and falls in t, so that Newton's steps from 0 come up to the root and never pass it.
+/// The foot of the perpendicular is (a^2 x / (t + a^2), b^2 y / (t + b^2)), with t >= 0 such that it lies on the
+/// ellipse. That condition is convex and decreases in t, so that Newton's steps from 0 approach the root from below and
+/// never pass it.
 fn ellipse_distance([a, b]: [f64; 2], x: f64, y: f64) -> f64 {
     if (x / a).hypot(y / b) <= 1.0 {
         return 0.0;
@@ -393,7 +394,7 @@ fn ellipse_distance([a, b]: [f64; 2], x: f64, y: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// An L: the square [0, 4]^2 without its upper right quarter.
+    /// Returns an L shape: the square with corners 0 and 4 without its upper right quarter.
     fn l_shape() -> Aperture {
         Aperture::Polygon { corners_mm: vec![[0.0, 0.0], [4.0, 0.0], [4.0, 2.0], [2.0, 2.0], [2.0, 4.0], [0.0, 4.0]] }
     }
@@ -413,7 +414,7 @@ mod tests {
         let areas: Vec<f64> = all_kinds().iter().map(Aperture::area_mm2).collect();
         let expected = [3.0, 4.0 * PI, 2.0 * PI, 5.25 * PI, 12.0];
         assert!(areas.iter().zip(expected).all(|(area, expected)| (area - expected).abs() < 1e-12), "{areas:?}");
-        // The other way around, and a kilometre away.
+        // The same polygon in the other turning sense, and a kilometre away.
         let Aperture::Polygon { corners_mm } = l_shape() else { panic!() };
         let corners_mm = corners_mm.into_iter().rev().map(|[x, y]| [x + 1e6, y - 1e6]).collect();
         assert_eq!(Aperture::Polygon { corners_mm }.area_mm2(), 12.0);
@@ -509,7 +510,7 @@ mod tests {
         assert!(matches!(polygon(&spike), Err(ApertureError::Crossing { .. })));
         let touching = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [2.0, 0.0], [0.0, 4.0]];
         assert!(matches!(polygon(&touching), Err(ApertureError::Crossing { .. })));
-        // Either sense of turning will do, and a corner in a straight side as well.
+        // Either turning sense is valid, and so is a corner in a straight side.
         assert_eq!(polygon(&[[0.0, 1.0], [1.0, 0.0], [0.5, 0.0], [0.0, 0.0]]), Ok(()));
     }
 

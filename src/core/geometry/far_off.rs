@@ -1,13 +1,14 @@
-//! A point that is no part of what the others are of.
+//! Detection of a single point far off the others.
 
 use super::Point;
 
-/// In distances that half of the points keep from their middle.
+/// Limit of the distance from the middle, in units of the median distance.
 const FAR: f64 = 50.0;
 
-/// Returns the point that is farthest from the middle of all, and how far, where it is many times as far as half of them are.
+/// Returns the index of the point that is farthest from the middle of all points, and its distance, if that distance is
+/// more than `FAR` times the median distance. The middle is the median of each coordinate.
 ///
-/// Units: millimetres. None of fewer than three points, or where half of them lie at one place.
+/// Units: millimetres. Returns `None` for fewer than three points, or if half of them coincide.
 pub(crate) fn far_off(points: &[Point]) -> Option<(usize, f64)> {
     if points.len() < 3 {
         return None;

@@ -1,25 +1,25 @@
-//! A regular grid over x and y that heights, maps and corrections are written on.
+//! A regular grid over x and y, for heights, maps and corrections.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Most nodes a grid may have: a correction is read back over a wire.
+/// Maximum number of nodes of a grid: a correction is read back over a wire.
 const MOST_NODES: f64 = 4e6;
 
-/// A regular grid over x and y of the model frame; nodes run row by row, x fastest.
+/// Regular grid over x and y of the model frame; nodes run row by row, x fastest.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Grid {
-    /// Nodes along x.
+    /// Number of nodes along x.
     pub columns: usize,
-    /// Nodes along y.
+    /// Number of nodes along y.
     pub rows: usize,
-    /// The first node, in millimetres.
+    /// Position of the first node, in millimetres.
     pub first_mm: [f64; 2],
-    /// Distance of the nodes, in millimetres.
+    /// Distance between nodes, along x and along y, in millimetres.
     pub spacing_mm: [f64; 2],
 }
 
-/// Why there is no such grid.
+/// Reason why a grid cannot be made.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -36,10 +36,11 @@ pub enum GridError {
 }
 
 impl Grid {
-    /// Lays a grid over the bounds of some places, its spacing at most the one wanted, its border on the bounds.
+    /// Builds a grid over the bounds of some places. Its spacing is at most `spacing_mm`, and its border lies on the
+    /// bounds.
     ///
     /// # Errors
-    /// A spacing that is not above 0 or makes too many nodes; no place.
+    /// Returns an error if the spacing is not above 0, if it makes too many nodes, or if there is no place.
     pub fn over(places_mm: impl Iterator<Item = [f64; 2]>, spacing_mm: f64) -> Result<Self, GridError> {
         let mut bounds: Option<[[f64; 2]; 2]> = None;
         for [x, y] in places_mm {
@@ -58,7 +59,7 @@ impl Grid {
             let [width_mm, depth_mm] = sizes;
             return Err(GridError::TooFine { spacing_mm, width_mm, depth_mm, nodes });
         }
-        // A single column or row keeps a spacing of its own, so that positions stay apart.
+        // A single column or row keeps the requested spacing, so that positions are distinct.
         let spacing = |size: f64, steps: f64| if size > 0.0 { size / steps } else { spacing_mm };
         Ok(Self {
             columns: steps[0] as usize + 1,
@@ -78,7 +79,7 @@ impl Grid {
         [self.columns, self.rows]
     }
 
-    /// Whether there is no node.
+    /// Returns true if there is no node.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -89,7 +90,8 @@ impl Grid {
         [self.first_mm[0] + i as f64 * self.spacing_mm[0], self.first_mm[1] + j as f64 * self.spacing_mm[1]]
     }
 
-    /// Whether it has nodes, not too many of them, at places that are numbers; for what was read from a file.
+    /// Returns true if the grid has nodes, not more than the maximum, at finite places; checks a grid that was read
+    /// from a file.
     pub fn is_sound(&self) -> bool {
         let nodes = self.columns as f64 * self.rows as f64;
         self.columns > 0
@@ -99,7 +101,7 @@ impl Grid {
             && self.spacing_mm.iter().all(|v| *v > 0.0 && v.is_finite())
     }
 
-    /// Returns the node nearest to a place; `None` more than half a cell beyond the border.
+    /// Returns the node nearest to a place; `None` if the place is more than half a cell beyond the border.
     pub fn nearest(&self, place_mm: [f64; 2]) -> Option<usize> {
         let along = |k: usize, nodes: usize| {
             let node = ((place_mm[k] - self.first_mm[k]) / self.spacing_mm[k]).round();
@@ -108,7 +110,7 @@ impl Grid {
         Some(along(1, self.rows)? * self.columns + along(0, self.columns)?)
     }
 
-    /// Returns values on another grid; where it is the same one, as they are.
+    /// Returns values on another grid, interpolated; if the grids are equal, the values are unchanged.
     pub fn resample(&self, values: &[f64], onto: &Self) -> Vec<f64> {
         if self == onto {
             return values.to_vec();
@@ -116,7 +118,8 @@ impl Grid {
         (0..onto.len()).map(|k| self.interpolate(values, onto.place_mm(k))).collect()
     }
 
-    /// Returns the cell that a place lies in, or the nearest one: along x and y its lower node and the share of the way to the next.
+    /// Returns the cell that a place lies in, or the nearest cell: along x and along y, its lower node and the fraction
+    /// of the way to the next node.
     pub fn cell(&self, place_mm: [f64; 2]) -> [(usize, f64); 2] {
         [0, 1].map(|k| {
             let nodes = self.counts()[k];
@@ -126,7 +129,8 @@ impl Grid {
         })
     }
 
-    /// Returns the value at a place between the nodes, bilinear; beyond the border that of the nearest place on it.
+    /// Returns the bilinear value at a place between the nodes; beyond the border, the value at the nearest place on
+    /// it.
     pub fn interpolate(&self, values: &[f64], place_mm: [f64; 2]) -> f64 {
         let [(i, u), (j, v)] = self.cell(place_mm);
         let at = |i: usize, j: usize| values[j.min(self.rows - 1) * self.columns + i.min(self.columns - 1)];

@@ -1,51 +1,54 @@
-//! Regular grids among points that come in any order.
+//! Recognition of regular grids among points in any order.
 
 use rayon::prelude::*;
 
 use super::Point;
 
-/// How far a point may stand from its node, in spacings: rounding in a file is far below, scatter far above.
+/// Largest distance of a point from its node, in spacings: rounding in a file is far below it, scattered points are far
+/// above.
 const NODE_TOLERANCE: f64 = 0.02;
 
-/// A node that no point fills.
+/// Marks a node that has no point.
 pub const NO_POINT: u32 = u32::MAX;
 
-/// A cloud seen as a grid over the xy plane: which point stands at each node.
+/// Cloud as a grid over the xy plane: the point at each node.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GridOrder {
     /// Number of nodes along x.
     pub columns: usize,
     /// Number of nodes along y.
     pub rows: usize,
-    /// Index of the point at each node, row by row with x fastest; [`NO_POINT`] where there is none.
+    /// Index of the point at each node, row by row with x fastest; [`NO_POINT`] if there is none.
     pub point_at: Vec<u32>,
     /// Number of nodes without a point.
     pub holes: usize,
 }
 
 impl GridOrder {
-    /// Whether the points already come row by row, x fastest, without a hole.
+    /// Returns true if the points already are row by row, x fastest, without a hole.
     pub(crate) fn is_in_order(&self) -> bool {
         self.holes == 0 && self.point_at.iter().enumerate().all(|(node, &point)| node as u32 == point)
     }
 }
 
-/// A cloud that comes row by row, x fastest, without a hole.
+/// Cloud whose points are row by row, x fastest, without a hole.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct GridInOrder {
     pub(crate) columns: usize,
     pub(crate) rows: usize,
-    /// The first node and the last, in x and y.
+    /// First and last node, in x and y.
     pub(crate) corners: [[f64; 2]; 2],
 }
 
-/// How far two points of one column may stand apart in x, as a share of the extent: below, it is rounding.
+/// Largest difference in x of two points of one column, as a share of the extent: a smaller one is rounding. It applies
+/// to y in a row too.
 const COLUMN_TOLERANCE: f64 = 5e-7;
 
-/// Recognises a whole regular grid whose points come row by row, x fastest, in one pass and without taking memory.
+/// Recognises a whole regular grid whose points are row by row, x fastest, in one pass and without a copy of the
+/// points.
 ///
-/// What it takes for a grid, [`recognise_grid`] does too; the other way round there are the grids in another order and those
-/// with holes.
+/// Every grid that it recognises, [`recognise_grid`] recognises too. That one also recognises grids in another order
+/// and grids with holes.
 pub(crate) fn grid_in_order(points: &[Point]) -> Option<GridInOrder> {
     let columns = 1 + points.windows(2).take_while(|pair| pair[1].x > pair[0].x).count();
     let rows = points.len() / columns;
@@ -61,7 +64,7 @@ pub(crate) fn grid_in_order(points: &[Point]) -> Option<GridInOrder> {
     let near = |from: f64, to: f64| COLUMN_TOLERANCE * (to - from);
     let (near_x, near_y) = (near(column[0], column[columns - 1]), near(row[0], row[rows - 1]));
     let holds = |(line, y): (&[Point], &f64)| {
-        // Without a way out in the middle: a line is short, and the compiler takes several points at a time.
+        // No early exit in the loop: a line is short, and so the compiler can process several points at a time.
         line.iter()
             .zip(&column)
             .fold(true, |all, (p, x)| all & ((p.x - x).abs() <= near_x) & ((p.y - y).abs() <= near_y) & p.z.is_finite())
@@ -73,7 +76,7 @@ pub(crate) fn grid_in_order(points: &[Point]) -> Option<GridInOrder> {
     })
 }
 
-/// Whether coordinates rise in equal steps.
+/// Returns true if the coordinates rise in equal steps.
 fn is_even(at: &[f64]) -> bool {
     let step = (at[at.len() - 1] - at[0]) / (at.len() - 1) as f64;
     step > 0.0
@@ -81,10 +84,10 @@ fn is_even(at: &[f64]) -> bool {
         && at.iter().enumerate().all(|(k, c)| (c - at[0] - k as f64 * step).abs() <= NODE_TOLERANCE * step)
 }
 
-/// Recognises a regular grid in x and y, whatever the order of the points and with nodes missing.
+/// Recognises a regular grid in x and y, whatever the order of the points and even if nodes are missing.
 ///
-/// Shapes: at least 3 nodes on each axis, at most one node in four filled by chance is no grid. Returns `None` for
-/// scattered points, for two points at one node, and for anything that is not finite.
+/// Shapes: at least 3 nodes on each axis, and at most 4 nodes per point: a sparser grid may be a coincidence. Returns
+/// `None` for scattered points, for two points at one node, and for coordinates that are not finite.
 pub fn recognise_grid(points: &[Point]) -> Option<GridOrder> {
     if points.len() < 9 || points.len() >= NO_POINT as usize {
         return None;
@@ -114,7 +117,8 @@ struct Axis {
 }
 
 impl Axis {
-    /// Finds the spacing as the least gap between sorted coordinates of a sample that no order of the points can fool.
+    /// Finds the spacing as the smallest gap between the sorted coordinates of a sample. The sample works for any order
+    /// of the points.
     fn find(points: &[Point], coordinate: impl Fn(&Point) -> f64 + Sync) -> Option<Self> {
         let (low, high) = points
             .par_chunks(8192)
@@ -138,18 +142,18 @@ impl Axis {
         (steps < 6e4).then_some(Self { first: low, per_mm: steps / extent, count: steps as usize + 1 })
     }
 
-    /// Returns the number of the node at a coordinate, if there is one.
+    /// Returns the index of the node at a coordinate; `None` if no node is within the tolerance.
     #[inline]
     fn node(&self, coordinate: f64) -> Option<usize> {
         let at = (coordinate - self.first) * self.per_mm;
-        // Never below zero, so truncation is the floor.
+        // `at` is never negative, so that truncation is the floor.
         let node = (at + 0.5) as u32;
         ((at - f64::from(node)).abs() <= NODE_TOLERANCE).then_some(node as usize)
     }
 }
 
-/// The first points and a scatter over all of them: a grid in order shows its spacing in the first, a shuffled one in the
-/// second.
+/// Returns the first points and a sample spread over all points. A grid in order shows its spacing in the first points,
+/// a shuffled grid in the spread sample.
 fn sampled(points: &[Point]) -> impl Iterator<Item = &Point> {
     const SAMPLE: usize = 4096;
     let n = points.len();
@@ -169,7 +173,7 @@ mod tests {
             .collect()
     }
 
-    /// A fixed shuffle: multiplication by a number coprime to the length.
+    /// Returns the points in a fixed shuffle: multiplication by a number coprime to the length.
     fn shuffled(points: &[Point]) -> Vec<Point> {
         let n = points.len();
         let step = (n / 3..).find(|s| num_gcd(*s, n) == 1).unwrap();
@@ -224,7 +228,7 @@ mod tests {
             p.y = (p.y * 1e4).round() / 1e4;
         }
         assert!(recognise_grid(&points).is_some() && grid_in_order(&points).is_some());
-        // A point out of its column, one out of its row, one missing, one that is no number.
+        // Spoiled grids: a point out of its column, one out of its row, one missing, one not finite.
         for spoil in [
             |p: &mut Vec<Point>| p[5000].x += 0.003,
             |p: &mut Vec<Point>| p[5000].y -= 0.003,

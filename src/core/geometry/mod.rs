@@ -1,6 +1,6 @@
-//! Poses, apertures and grids: the words every other room speaks in.
+//! Poses, apertures and grids: the basic types of all other modules.
 //!
-//! Pure: no file, no clock, no randomness. Lengths are millimetres, angles radians.
+//! Pure: no file, no clock, no randomness. Lengths are in millimetres, angles in radians.
 
 pub mod aperture;
 mod far_off;
@@ -26,7 +26,7 @@ pub type Point = nalgebra::Point3<f64>;
 /// A direction or a displacement in space.
 pub type Vector = nalgebra::Vector3<f64>;
 
-/// Returns the smallest rectangle along the axes that holds some places: [[x least, y least], [x most, y most]].
+/// Returns the smallest rectangle along the axes that contains some places: `[[x min, y min], [x max, y max]]`.
 pub(crate) fn bounds(places: impl Iterator<Item = [f64; 2]>) -> [[f64; 2]; 2] {
     places.fold([[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]], |[low, high], [x, y]| {
         [[low[0].min(x), low[1].min(y)], [high[0].max(x), high[1].max(y)]]

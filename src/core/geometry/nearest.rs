@@ -1,36 +1,36 @@
-//! Which of many points lie nearest to a place.
+//! Search for the points nearest to a place.
 
 use nabo::{CandidateContainer, KDTree, NotNan, Parameters};
 
 use super::Point;
 
-/// Points entered in a tree, to be asked for the nearest ones.
+/// Search tree of points, for queries of the nearest ones.
 #[derive(Debug)]
 pub(crate) struct Nearest(KDTree<f64, Entry>);
 
 impl Nearest {
-    /// Enters points; one that is not finite may be found anywhere.
+    /// Builds the tree of some points. A point that is not finite gets an arbitrary position.
     pub(crate) fn of(points: impl Iterator<Item = Point>) -> Self {
-        // With 16 in a leaf it is built sooner than with 8, and answers as fast.
+        // With 16 points in a leaf the tree is built faster than with 8, and a query takes the same time.
         Self(KDTree::new_with_bucket_size(&points.map(Entry::from).collect::<Vec<_>>(), 16))
     }
 
-    /// Returns the numbers of the points nearest to a place and the squares of their distances, the nearest first.
+    /// Returns the indices of the points nearest to a place and their squared distances, the nearest first.
     pub(crate) fn to(&self, p: &Point, count: u32) -> impl Iterator<Item = (usize, f64)> {
         let exact = Parameters { epsilon: 0.0, max_radius: f64::INFINITY, allow_self_match: true, sort_results: true };
-        // For some tens of neighbours a list is faster than the heap that the crate takes by itself.
+        // For some tens of neighbours a list is faster than the crate's default, a heap.
         let found = self.0.knn_advanced(count, &Entry::from(*p), CandidateContainer::Linear, &exact, None);
         found.into_iter().map(|n| (n.index as usize, *n.dist2))
     }
 }
 
-/// A point in the form that the tree takes.
+/// Point in the form that the tree needs.
 #[derive(Clone, Copy, Debug, Default)]
 struct Entry([NotNan<f64>; 3]);
 
 impl From<Point> for Entry {
     fn from(p: Point) -> Self {
-        /// Squares of larger coordinates would leave what a number can hold.
+        /// Limit of the coordinates: squares of larger ones would overflow.
         const LARGEST: f64 = 1e100;
         Self(<[f64; 3]>::from(p).map(|c| NotNan::new(c.clamp(-LARGEST, LARGEST)).unwrap_or_default()))
     }
@@ -56,7 +56,7 @@ mod tests {
     fn the_nearest_are_those_of_asking_every_point() {
         let at = |k: usize| [0.754_877_666, 0.569_840_291, 0.381_966_011].map(|step| (k as f64 * step).fract()).into();
         let mut points: Vec<Point> = (0..3000).map(at).collect();
-        // Some twice, and many at one place.
+        // Some points twice, and many at one place.
         points.extend_from_within(..40);
         points.extend([at(5000); 50]);
         let tree = Nearest::of(points.iter().copied());

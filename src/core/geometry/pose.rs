@@ -1,36 +1,37 @@
 //! Rigid poses: SE(3) in the parametrisation of the paper, eq. (8) to (10).
 //!
-//! **The conventions, said once.** A pose is named for what it does: `cmm_from_model` takes model coordinates to CMM
-//! coordinates and is the paper's g. A [`Twist`] is ordered [translation; rotation], eq. (9), and an update multiplies on the
-//! right: `g_next = g * Pose::exp(&m)`, eq. (10), so that a twist is written in the model frame.
+//! **Conventions.** The name of a pose says what it does: `cmm_from_model` transforms model coordinates to CMM
+//! coordinates and is the paper's g. A [`Twist`] has the order translation, rotation, eq. (9). An update multiplies on
+//! the right, `g_next = g * Pose::exp(&m)`, eq. (10), so that a twist is expressed in the model frame.
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector3, Vector6};
 use thiserror::Error;
 
 use super::{Point, Vector};
 
-/// Twist coordinates [v; omega]: translation in millimetres, then rotation in radians.
+/// Twist coordinates (v, omega): translation in millimetres, then rotation in radians.
 pub type Twist = Vector6<f64>;
 
-/// Below this angle the coefficients of the exponential are taken from their series: the closed forms lose half their
-/// digits to cancellation there, while four terms of the series are exact to the last bit.
+/// Angle below which the coefficients of the exponential come from their series. The closed forms lose half their
+/// digits to cancellation there; four terms of the series are exact to the last bit.
 const SERIES_BELOW_RAD: f64 = 0.02;
 
-/// How far a matrix read from outside may be from a rotation before it is refused rather than cleaned.
+/// Largest deviation from a rotation at which a matrix from outside is orthonormalised; a matrix with a larger one is
+/// rejected.
 const ROTATION_TOLERANCE: f64 = 1e-4;
 
-/// A rigid motion: a rotation followed by a translation.
+/// Rigid motion: a rotation followed by a translation.
 ///
 /// Units: the translation is in millimetres.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
-    /// The rotation matrix, row by column.
+    /// Rotation matrix, indexed by row and column.
     pub rotation: Matrix3<f64>,
-    /// The translation in millimetres, applied after the rotation.
+    /// Translation in millimetres, applied after the rotation.
     pub translation_mm: Vector,
 }
 
-/// Why sixteen numbers are not a rigid pose. Rows and columns count from 1.
+/// Reason why sixteen numbers are not a rigid pose. Rows and columns count from 1.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -41,7 +42,8 @@ pub enum PoseError {
     /// The last row is not 0 0 0 1.
     #[error("the last row of a pose must be 0 0 0 1, not {0:?}")]
     LastRow([f64; 4]),
-    /// The upper left block is not a rotation: the largest entry of R R^T - 1 is off, or the determinant, -1 for a mirror image.
+    /// The upper left block is not a rotation: the largest entry of R R^T - 1 is too large, or the determinant is
+    /// negative (-1 for a mirror image).
     #[error(
         "the upper left 3 x 3 block is not a rotation: it is off by {off:.3e} (limit {ROTATION_TOLERANCE:.0e}) and its \
          determinant is {determinant:.6}; scale, shear and mirror images are not rigid"
@@ -50,7 +52,7 @@ pub enum PoseError {
 }
 
 impl Pose {
-    /// The pose that moves nothing.
+    /// Returns the pose that moves nothing.
     pub fn identity() -> Self {
         Self { rotation: Matrix3::identity(), translation_mm: Vector::zeros() }
     }
@@ -70,7 +72,7 @@ impl Pose {
         }
     }
 
-    /// Returns the twist whose exponential this pose is; the angle lies in [0, pi].
+    /// Returns the twist whose exponential is this pose; the angle lies in the interval from 0 to pi.
     pub fn log(&self) -> Twist {
         let omega = rotation_logarithm(&self.rotation);
         let [a, b, _] = exponential_coefficients(omega.norm());
@@ -86,7 +88,7 @@ impl Pose {
         Twist::new(v.x, v.y, v.z, omega.x, omega.y, omega.z)
     }
 
-    /// Returns the pose that undoes this one.
+    /// Returns the inverse pose.
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.transpose();
         Self { rotation, translation_mm: -(rotation * self.translation_mm) }
@@ -98,15 +100,16 @@ impl Pose {
         Point::from(self.rotation * p.coords + self.translation_mm)
     }
 
-    /// Turns a direction.
+    /// Rotates a direction.
     #[inline]
     pub fn direction(&self, v: &Vector) -> Vector {
         self.rotation * v
     }
 
-    /// Returns the same pose with the rotation made orthonormal again, against the drift of repeated products.
+    /// Returns the same pose with its rotation orthonormalised, against the drift of repeated products.
     ///
-    /// One Newton step towards the nearest rotation: exact to rounding for a matrix that is off by less than 1e-8.
+    /// The method is one Newton step towards the nearest rotation: exact to rounding for a matrix that is off by less
+    /// than 1e-8.
     pub fn orthonormalised(&self) -> Self {
         let gram = self.rotation.transpose() * self.rotation;
         Self { rotation: self.rotation * (Matrix3::identity() * 1.5 - gram * 0.5), translation_mm: self.translation_mm }
@@ -117,7 +120,7 @@ impl Pose {
         rotation_logarithm(&self.rotation).norm()
     }
 
-    /// Returns the homogeneous matrix, four rows of four.
+    /// Returns the homogeneous matrix, four rows of four entries.
     pub fn to_rows(&self) -> [[f64; 4]; 4] {
         let (r, t) = (&self.rotation, &self.translation_mm);
         [
@@ -128,10 +131,11 @@ impl Pose {
         ]
     }
 
-    /// Reads a homogeneous matrix, four rows of four, and makes its rotation orthonormal to rounding.
+    /// Reads a homogeneous matrix, four rows of four entries, and makes its rotation orthonormal to rounding.
     ///
     /// # Errors
-    /// An entry that is not finite, a last row other than 0 0 0 1, or a block that is no rotation to 1e-4.
+    /// Returns an error if an entry is not finite, if the last row is not 0 0 0 1, or if the upper left block is not a
+    /// rotation within 1e-4.
     pub fn from_rows(rows: [[f64; 4]; 4]) -> Result<Self, PoseError> {
         for (row, entries) in rows.iter().enumerate() {
             if let Some(column) = entries.iter().position(|v| !v.is_finite()) {
@@ -178,7 +182,7 @@ fn exponential_coefficients(theta: f64) -> [f64; 3] {
     [theta.sin() / theta, 2.0 * half_sine * half_sine / t2, (theta - theta.sin()) / (t2 * theta)]
 }
 
-/// Returns the rotation vector of a rotation matrix; by way of the quaternion, which is well conditioned up to pi.
+/// Returns the rotation vector of a rotation matrix. It uses the quaternion, which is well conditioned up to pi.
 fn rotation_logarithm(rotation: &Matrix3<f64>) -> Vector {
     let q = UnitQuaternion::from_rotation_matrix(&nalgebra::Rotation3::from_matrix_unchecked(*rotation));
     let (w, v) = (q.w.abs(), q.imag() * if q.w < 0.0 { -1.0 } else { 1.0 });
@@ -191,7 +195,7 @@ mod tests {
     use super::*;
     use std::f64::consts::PI;
 
-    /// Twists at zero, at every scale where a branch changes, and up to half a turn.
+    /// Returns twists at zero, at every scale where a branch changes, and up to half a turn.
     fn twists() -> Vec<Twist> {
         let axis = Vector::new(0.36, -0.48, 0.8);
         let angles = [0.0, 1e-300, 1e-16, 1e-8, 1e-4, 0.0199, 0.0201, 0.3, 1.0, 3.0, PI - 1e-7];
@@ -217,7 +221,7 @@ mod tests {
         for m in twists() {
             let back = Pose::exp(&m).log();
             let scale = m.amax().max(1.0);
-            // Near half a turn the angle itself is conditioned like the square root of rounding.
+            // Near half a turn the angle itself is only as accurate as the square root of the rounding error.
             let tolerance = if m.fixed_rows::<3>(3).norm() > 3.1 { 1e-8 } else { 4e-15 };
             assert!((back - m).amax() <= tolerance * scale, "{m} came back as {back}");
         }

@@ -1,8 +1,9 @@
-//! The rigid motion that lays one set of points on another, pair by pair.
+//! Rigid fit: the motion that maps one set of points onto another, pair by pair.
 //!
-//! A tracker that was moved between two stations sees the same few reference points from each; the motion that carries what it sees
-//! to where these points should be brings the stations into one frame. The fit is Kabsch's: centroids, the 3 x 3 cross-covariance,
-//! its singular value decomposition, and a determinant that tells a rotation from a mirror image.
+//! A tracker that is moved between two stations sees the same few reference points from each. The motion from the
+//! observed points to their reference positions brings the stations into one frame. The fit is Kabsch's: centroids, the
+//! 3 x 3 cross-covariance, its singular value decomposition, and a determinant that distinguishes a rotation from a
+//! mirror image.
 //!
 //! Units: millimetres.
 
@@ -11,45 +12,47 @@ use thiserror::Error;
 
 use super::{Point, Pose, Vector};
 
-/// Points whose spread across their line is less than this share of that along it do not fix the rotation about it.
+/// Smallest ratio of the spread across a line to the spread along it; with a smaller ratio the points do not fix the
+/// rotation about the line.
 const LEAST_WIDTH_SHARE: f64 = 1e-3;
-/// Only points whose spread out of their plane is more than this share of the largest one can tell a mirror image.
+/// Smallest ratio of the spread out of a plane to the largest spread; with a smaller ratio the points cannot reveal a
+/// mirror image.
 const LEAST_DEPTH_SHARE: f64 = 1e-2;
 
-/// What a rigid fit found.
+/// Result of a rigid fit.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RigidFit {
-    /// Takes the first set to the second.
+    /// Pose that maps the first set onto the second.
     pub pose: Pose,
-    /// What is left of each pair, in the order given: the target less the moved point.
+    /// Residual of each pair, in the given order: the target minus the moved point.
     pub residuals_mm: Vec<Vector>,
     /// Root mean square of the lengths of the residuals.
     pub rms_mm: f64,
 }
 
 impl RigidFit {
-    /// Returns the index of the pair that fits worst and by how much it is off.
+    /// Returns the index of the pair with the largest residual, and the length of that residual in millimetres.
     pub fn worst(&self) -> (usize, f64) {
         let lengths = self.residuals_mm.iter().map(Vector3::norm).enumerate();
         lengths.fold((0, 0.0), |worst, next| if next.1 > worst.1 { next } else { worst })
     }
 }
 
-/// Why two sets of points have no rigid fit. An index counts from 0.
+/// Reason why two sets of points have no rigid fit. An index counts from 0.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum RigidError {
-    /// The sets are not pairs.
+    /// The sets have different lengths.
     #[error("{from} points cannot be laid on {to}; give every point its partner")]
     Counts { from: usize, to: usize },
-    /// Fewer points than fix a pose.
+    /// Too few points to fix a pose.
     #[error("{points} pairs of points do not fix a pose, at least 3 are needed; measure more reference points")]
     TooFew { points: usize },
     /// A coordinate is NaN or infinite.
     #[error("pair {} of the points holds a coordinate that is not finite; remove it", index + 1)]
     NotFinite { index: usize },
-    /// All points on a line.
+    /// All points lie on a line.
     #[error(
         "the points lie on one line: their width is {share:.1e} of their length, at least {LEAST_WIDTH_SHARE:.0e} is needed to fix \
          the rotation about it; add a reference point off the line"
@@ -63,13 +66,14 @@ pub enum RigidError {
     Mirrored { rms_mm: f64, mirrored_rms_mm: f64 },
 }
 
-/// Returns the rigid motion that lays `from` on `to` with the least sum of squared distances.
+/// Returns the rigid motion that maps `from` onto `to` with the smallest sum of squared distances.
 ///
-/// Shapes: two lists of equal length, pair by pair, three pairs or more. Units: millimetres. Kabsch (1976), Umeyama (1991).
+/// Shapes: two lists of equal length, pair by pair, with at least three pairs. Units: millimetres. Kabsch (1976),
+/// Umeyama (1991).
 ///
 /// # Errors
-/// Lists of different lengths, fewer than three pairs, coordinates that are not finite, points on one line, and sets of which one
-/// is the mirror image of the other.
+/// Returns an error if the lists have different lengths or fewer than three pairs, if a coordinate is not finite, if
+/// the points of a set lie on one line, or if one set is the mirror image of the other.
 pub fn fit_rigid(from: &[Point], to: &[Point]) -> Result<RigidFit, RigidError> {
     check(from, to)?;
     let (a, b) = (centroid(from), centroid(to));
@@ -172,7 +176,7 @@ mod tests {
         let fit = fit_rigid(&from, &to).unwrap();
         let (worst, off_mm) = fit.worst();
         assert!(worst == 3 && off_mm > 0.5 && off_mm < 4.0, "{worst}: {off_mm}");
-        // The best fit is a minimum: a small turn or shift about it makes it worse.
+        // The best fit is a minimum: a small rotation or shift about it increases the rms.
         for k in 0..6 {
             let mut twist = Twist::zeros();
             twist[k] = if k < 3 { 1e-3 } else { 1e-6 };
@@ -189,9 +193,9 @@ mod tests {
         assert!(
             matches!(fit_rigid(&from, &to), Err(RigidError::Mirrored { mirrored_rms_mm, .. }) if mirrored_rms_mm < 1e-9)
         );
-        // Three points lie in a plane, and there a mirror image is a rotation too.
+        // Three points lie in a plane, where a mirror image is also a rotation.
         assert!(fit_rigid(&from[..3], &to[..3]).unwrap().rms_mm < 1e-9);
-        // Noise out of the plane is no mirror image.
+        // Noise out of the plane is not a mirror image.
         let noise = |s: f64| points(&[[0.0, 0.0, s], [1e3, 0.0, -s], [0.0, 1e3, -s], [1e3, 1e3, s]]);
         assert!(fit_rigid(&noise(0.1), &noise(-0.1)).is_ok());
     }

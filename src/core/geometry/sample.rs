@@ -1,16 +1,16 @@
-//! A deviation of a part from its nominal surface, and where it is.
+//! Deviation of a part from its nominal surface, with its position.
 
-/// One deviation and where it was measured.
+/// One deviation and the place where it was measured.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sample {
     /// x and y of the contact point in the model frame, in millimetres.
     pub at_mm: [f64; 2],
-    /// Positive where material stands proud, in millimetres.
+    /// Deviation in millimetres; positive where there is too much material.
     pub deviation_mm: f64,
 }
 
 impl Sample {
-    /// Whether all of its numbers are finite.
+    /// Returns true if all numbers are finite.
     pub fn is_finite(&self) -> bool {
         (self.at_mm[0] + self.at_mm[1] + self.deviation_mm).is_finite()
     }

@@ -1,25 +1,25 @@
-//! A part that is measured warm is larger than it will be.
+//! Thermal expansion: a part that is measured warm is larger than at 20 degrees Celsius.
 
 use crate::geometry::Point;
 
-/// The temperature at which a length is what it is said to be (ISO 1).
+/// Reference temperature of a length (ISO 1), in degrees Celsius.
 pub const REFERENCE_C: f64 = 20.0;
 
-/// How the part and the scales that measure it grow with their temperature; both have the one that is told.
+/// Thermal expansion of the part and of the scales that measure it. Both have the reported temperature.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Expansion {
     /// Expansion of the part, per kelvin.
     pub part_per_k: f64,
-    /// Its standard uncertainty.
+    /// Standard uncertainty of the expansion of the part, per kelvin.
     pub part_sigma_per_k: f64,
-    /// Expansion of the scales that the machine does not correct by itself, per kelvin.
+    /// Expansion of the scales that the machine does not correct itself, per kelvin.
     pub scales_per_k: f64,
-    /// Standard uncertainty of the temperature that is told, in kelvins.
+    /// Standard uncertainty of the reported temperature, in kelvins.
     pub temperature_sigma_k: f64,
 }
 
 impl Expansion {
-    /// Returns what a length of 1 is measured as at a temperature in degrees Celsius.
+    /// Returns the measured value of a length of 1 at a temperature in degrees Celsius.
     pub fn measured(&self, temperature_c: f64) -> f64 {
         1.0 + (self.part_per_k - self.scales_per_k) * (temperature_c - REFERENCE_C)
     }
@@ -30,10 +30,11 @@ impl Expansion {
         by_temperature.hypot(self.part_sigma_per_k * (temperature_c - REFERENCE_C))
     }
 
-    /// Takes points of a part at a temperature to where they would be at 20 degrees Celsius, about their middle.
+    /// Returns points of a part at a temperature as they would be at 20 degrees Celsius, scaled about their centroid.
     ///
-    /// Frame: any. A centre of the probe comes as near as that to the surface too, so the radius that belongs to it is that of the ball
-    /// divided by [`Expansion::measured`]; what the ball itself grows by is in the radius that was found on the sphere.
+    /// Frame: any. The scaling also moves a probe centre nearer to the surface by the same factor, so its radius is the
+    /// radius of the ball divided by [`Expansion::measured`]. The expansion of the ball itself is already in the radius
+    /// that was found on the reference sphere.
     pub fn at_reference(&self, points: &[Point], temperature_c: f64) -> Vec<Point> {
         let n = points.len().max(1) as f64;
         let middle = Point::from(points.iter().map(|p| p.coords).sum::<crate::geometry::Vector>() / n);
@@ -51,7 +52,7 @@ mod tests {
 
     #[test]
     fn by_hand() {
-        // 3.5e-6 a kelvin more than the scales, ten kelvins: 3.5 um on 100 mm.
+        // 3.5e-6 per kelvin more than the scales, over ten kelvins: 3.5 um on 100 mm.
         assert!((STEEL.measured(30.0) - 1.000_035).abs() < 1e-12);
         assert!((STEEL.sigma(30.0) - (1.75e-6_f64).hypot(1e-5)).abs() < 1e-18);
         assert!(STEEL.measured(20.0) == 1.0 && (STEEL.sigma(20.0) - 1.75e-6).abs() < 1e-18);

@@ -1,13 +1,13 @@
-//! What to measure, and can the probe be trusted?
+//! Measuring: the targets of the probe, its real radius, and the temperature of the part.
 //!
 //! ```text
-//!  nominal, pattern --targets--> where the probe shall touch, in the model frame
-//!  centres on the reference sphere --fit_sphere--> the radius the probe really has
-//!  points of a warm part --Expansion--> where they would be at 20 degrees Celsius
+//!  nominal, pattern --targets--> where the probe touches, in the model frame
+//!  centres on the reference sphere --fit_sphere--> the real radius of the probe
+//!  points of a warm part --Expansion--> the same points at 20 degrees Celsius
 //! ```
 //!
-//! Pure: no file, no clock, no randomness. Units: millimetres. Frames: targets are in the model frame {M}, centres on the
-//! sphere in the CMM frame {W}.
+//! Pure: no file, no clock, no randomness. Units: millimetres. Frames: targets are in the model frame {M}, and centres
+//! on the sphere are in the CMM frame {W}.
 
 mod expansion;
 mod pattern;

@@ -1,4 +1,4 @@
-//! Where the probe shall touch the part.
+//! Targets: the places where the probe touches the part.
 
 use std::f64::consts::{PI, TAU};
 
@@ -7,38 +7,38 @@ use thiserror::Error;
 use crate::geometry::{Point, Vector};
 use crate::surface::{Nominal, OffsetSurface, Place, Side};
 
-/// More targets than a machine measures in a week.
+/// Maximum number of targets: more than a machine measures in a week.
 const MOST_TARGETS: f64 = 1e7;
-/// A place beyond the edge by no more than this, in millimetres, is on it: rounding.
+/// Largest distance beyond the edge, in millimetres, that counts as on the part: it is rounding.
 const ON_PART_MM: f64 = 1e-6;
-/// Turns after which a place is taken not to be on the surface.
+/// Maximum number of iterations; after that a place counts as not on the surface.
 const MOST_TURNS: usize = 50;
 
-/// A place to touch: a point of the nominal surface and its outward unit normal, in the model frame.
+/// Place to touch: a point of the nominal surface and its outward unit normal, in the model frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Target {
-    /// The nominal contact point in millimetres.
+    /// Nominal contact point, in millimetres.
     pub point: Point,
     /// Unit normal towards the probe's side.
     pub normal: Vector,
 }
 
-/// How targets are laid over x and y of the model frame.
+/// Layout of the targets over x and y of the model frame.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Layout {
-    /// A grid with this spacing in millimetres, run to and fro.
+    /// Grid with this spacing in millimetres; every second row runs backwards.
     GridSpacing(f64),
-    /// A grid of so many columns and rows, run to and fro.
+    /// Grid of this number of columns and rows; every second row runs backwards.
     GridPoints([u32; 2]),
-    /// A spiral from the middle with this distance of the turns and of the points, in millimetres.
+    /// Spiral from the middle with this distance between turns and between points, in millimetres.
     SpiralSpacing(f64),
-    /// A spiral from the middle of about so many points.
+    /// Spiral from the middle with about this number of points.
     SpiralPoints(u32),
-    /// At the points of the nominal surface nearest to these.
+    /// The points of the nominal surface nearest to these.
     Points(Vec<Point>),
 }
 
-/// Why there are no targets.
+/// Reason why there are no targets.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -54,12 +54,12 @@ pub enum PatternError {
     NoneOnPart { asked: usize, margin_mm: f64 },
 }
 
-/// Lays targets over the part, `margin_mm` inside its edge, in the order in which they are measured.
+/// Returns targets on the part, `margin_mm` inside its edge, in the order of measurement.
 ///
-/// Frames: the model frame. Units: millimetres. A place that is not on the part, or too near its edge, is left out.
+/// Frame: model. Units: millimetres. Places that are not on the part, or too near its edge, are omitted.
 ///
 /// # Errors
-/// A spacing that is not above 0, too many places, and none on the part.
+/// Returns an error if the spacing is not above 0, if there are too many places, or if none lies on the part.
 pub fn targets(nominal: &Nominal, side: Side, layout: &Layout, margin_mm: f64) -> Result<Vec<Target>, PatternError> {
     let surface = OffsetSurface::new(nominal, 0.0, side).expect("a radius of 0 is good");
     let bounds = bounds(nominal);
@@ -78,9 +78,10 @@ pub fn targets(nominal: &Nominal, side: Side, layout: &Layout, margin_mm: f64) -
     Ok(found)
 }
 
-/// Lays targets on the upper half of a reference sphere, evenly, for a probe that comes from above: centres in the frame of `centre`.
+/// Returns targets spread evenly over the upper half of a reference sphere, for a probe that comes from above. They are
+/// in the frame of `centre`, in millimetres.
 pub fn sphere_targets(centre: Point, radius_mm: f64, count: usize) -> Vec<Target> {
-    // Equal areas from the pole down to 80 degrees, turned by the golden angle each.
+    // Equal areas from the pole down to 80 degrees, each turned by the golden angle.
     let lowest = 80f64.to_radians().cos();
     (0..count)
         .map(|k| {
@@ -100,7 +101,7 @@ enum Wanted {
 
 fn bounds(nominal: &Nominal) -> [[f64; 2]; 2] {
     let of_points = crate::geometry::bounds(nominal.points().map(|p| [p.x, p.y]));
-    // A nominal sampled a ring beyond its aperture must not put targets there.
+    // A nominal can be sampled one ring beyond its aperture; targets must not lie there.
     match nominal.outline() {
         Some(outline) => {
             let [low, high] = outline.bounds();
@@ -126,7 +127,7 @@ fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result
         Ok((0..columns * rows)
             .map(|k| {
                 let (i, j) = (k % columns, k / columns);
-                // Every other row is run backwards, so that the probe need not fly back.
+                // Every second row runs backwards, so that the probe need not travel back.
                 let i = if j % 2 == 0 { i } else { columns - 1 - i };
                 Wanted::Over([middle[0] + at(i, columns, width), middle[1] + at(j, rows, depth)])
             })
@@ -146,7 +147,7 @@ fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result
         }
         Layout::GridPoints([columns, rows]) => grid(f64::from((*columns).max(1)), f64::from((*rows).max(1))),
         Layout::SpiralSpacing(spacing) => spiral(check(*spacing)?, middle, [width, depth]),
-        // A spiral covers the whole disc around the rectangle with one point for each square of its spacing.
+        // The spiral has one point for each square of its spacing within the rectangle.
         Layout::SpiralPoints(count) => {
             let area = (width * depth).max(1e-9);
             spiral((area / f64::from((*count).max(1))).sqrt(), middle, [width, depth])
@@ -161,7 +162,7 @@ fn spiral(spacing: f64, middle: [f64; 2], [width, depth]: [f64; 2]) -> Result<Ve
     if count > MOST_TARGETS {
         return Err(PatternError::TooMany { count });
     }
-    // Archimedes' spiral r = spacing * turns; an arc of one spacing from point to point.
+    // Archimedes' spiral r = spacing * turns, with an arc of one spacing from point to point.
     let (mut angle, mut found) = (0.0f64, Vec::new());
     loop {
         let r = spacing * angle / TAU;
@@ -177,13 +178,13 @@ fn spiral(spacing: f64, middle: [f64; 2], [width, depth]: [f64; 2]) -> Result<Ve
     }
 }
 
-/// A walk over the surface from target to target.
+/// Walk over the surface from target to target.
 struct Walk<'a> {
     surface: OffsetSurface<'a>,
     place: Place,
-    /// Height of the last target, where the next is looked for first.
+    /// Height of the last target, at which the search for the next begins.
     z: f64,
-    /// On a straight line through the part of this length no surface is higher or lower.
+    /// Diagonal of the bounds in x and y: limit of one step in height.
     size_mm: f64,
 }
 
@@ -193,7 +194,8 @@ impl<'a> Walk<'a> {
         Self { surface, place: Place::UNKNOWN, z, size_mm: (high[0] - low[0]).hypot(high[1] - low[1]) }
     }
 
-    /// Finds the point of the surface over x and y by Newton's method on the height: the tangent plane at the foot is cut.
+    /// Finds the point of the surface over x and y by Newton's method on the height: each step intersects the vertical
+    /// line with the tangent plane at the foot.
     fn over(&mut self, [x, y]: [f64; 2]) -> Option<Target> {
         let mut p = Point::new(x, y, self.z);
         for _ in 0..MOST_TURNS {
@@ -222,13 +224,13 @@ impl<'a> Walk<'a> {
         (foot.beyond_mm <= ON_PART_MM && near).then_some(target)
     }
 
-    /// Whether the surface goes on for the margin in every direction.
+    /// Returns true if the surface continues for the margin in every direction.
     fn is_inside(&self, target: &Target, margin_mm: f64) -> bool {
         let outline = self.surface.nominal().outline();
         let (u, _) = frame(&target.normal);
         let v = target.normal.cross(&u);
         let around = (0..8).map(|k| (f64::from(k) * TAU / 8.0).sin_cos());
-        // Rounding must not cost the points that lie exactly on the margin.
+        // The margin is reduced slightly, so that rounding does not exclude points exactly on it.
         let margin_mm = margin_mm * (1.0 - 1e-9);
         outline.is_none_or(|o| o.contains(target.point.x, target.point.y))
             && (margin_mm == 0.0
@@ -239,7 +241,7 @@ impl<'a> Walk<'a> {
     }
 }
 
-/// Two directions across a normal; the first as near to x as may be.
+/// Returns two unit vectors perpendicular to a normal; the first is close to x unless the normal is.
 fn frame(normal: &Vector) -> (Vector, Vector) {
     let x = if normal.x.abs() < 0.9 { Vector::x() } else { Vector::y() };
     let u = (x - normal * normal.dot(&x)).normalize();
@@ -251,7 +253,7 @@ mod tests {
     use super::*;
     use crate::surface::Projection;
 
-    /// A dome z = -(x^2 + y^2) / 200 over 40 x 20 mm, a point every half millimetre.
+    /// Returns a dome z = -(x^2 + y^2) / 200 over 40 x 20 mm, with a point every 0.5 mm.
     fn dome() -> Nominal {
         let points = (0..81 * 41).map(|k| [f64::from(k % 81) * 0.5 - 20.0, f64::from(k / 81) * 0.5 - 10.0]);
         let points = points.map(|[x, y]| Point::new(x, y, -(x * x + y * y) / 200.0)).collect();

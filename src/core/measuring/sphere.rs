@@ -1,24 +1,24 @@
-//! The sphere that fits the centres of a probe on a reference sphere: it tells the radius that the probe really has.
+//! Fit of a sphere to the centres of a probe on a reference sphere; it gives the real radius of the probe.
 
 use nalgebra::{Matrix4, Vector4};
 use thiserror::Error;
 
 use crate::geometry::Point;
 
-/// A sphere fitted to points.
+/// Sphere fitted to points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SphereFit {
-    /// Its centre, in the frame of the points.
+    /// Centre, in the frame of the points.
     pub centre: Point,
-    /// Its radius in millimetres.
+    /// Radius, in millimetres.
     pub radius_mm: f64,
     /// Standard uncertainty of the radius from the residuals, in millimetres.
     pub radius_sigma_mm: f64,
-    /// Rms distance of the points from it, in millimetres.
+    /// Rms distance of the points from the sphere, in millimetres.
     pub rms_mm: f64,
 }
 
-/// Why there is no sphere.
+/// Reason why a sphere cannot be fitted.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -33,13 +33,14 @@ pub enum SphereFitError {
     Degenerate,
 }
 
-/// One more than there are unknowns, so that the fit can be judged.
+/// Minimum number of points: one more than the unknowns, so that the fit can be judged.
 const LEAST: usize = 5;
 
-/// Fits a sphere by least squares of the distances from it (Gauss-Newton from the algebraic fit).
+/// Fits a sphere by least squares of the distances from it, by Gauss-Newton starting from the algebraic fit.
 ///
 /// # Errors
-/// Fewer than five points, points on a plane, points that are not finite.
+/// Returns an error if there are fewer than five points, if the points lie on a plane, or if a coordinate is not
+/// finite.
 pub fn fit_sphere(points: &[Point]) -> Result<SphereFit, SphereFitError> {
     if points.len() < LEAST {
         return Err(SphereFitError::TooFew { points: points.len() });
@@ -69,7 +70,8 @@ pub fn fit_sphere(points: &[Point]) -> Result<SphereFit, SphereFitError> {
     if finite && radius > 0.0 { Ok(fit) } else { Err(SphereFitError::Degenerate) }
 }
 
-/// Solves |p|^2 = 2 p.c + (r^2 - |c|^2), which is linear, about the middle of the points.
+/// Returns centre and radius of the algebraic fit: solves |p|^2 = 2 p.c + (r^2 - |c|^2), which is linear, about the
+/// centroid of the points.
 fn algebraic(points: &[Point], middle: &nalgebra::Vector3<f64>) -> Option<(nalgebra::Vector3<f64>, f64)> {
     let (mut normal, mut right) = (Matrix4::zeros(), Vector4::zeros());
     let size = points.iter().map(|p| (p.coords - middle).norm()).fold(0.0, f64::max);
@@ -115,7 +117,7 @@ mod tests {
 
     #[test]
     fn noise_shows_in_the_uncertainty() {
-        // Residuals of +-1 um in turn.
+        // Residuals alternate between +1 um and -1 um.
         let sign = |k: usize| if k.is_multiple_of(2) { 1e-3 } else { -1e-3 };
         let targets = sphere_targets(Point::origin(), 14.0, 40);
         let points: Vec<Point> = targets.iter().enumerate().map(|(k, t)| t.point + t.normal * sign(k)).collect();

@@ -1,45 +1,52 @@
-//! Cosines over a rectangle that is wider than the part, and low polynomials over the part: a field of any covariance is a sum of them.
+//! Basis functions of the field: cosines over a rectangle larger than the part, and low polynomials over the part.
+//!
+//! A Gaussian field of any stationary covariance is approximately a weighted sum of the cosines:
 //!
 //! ```text
 //!  phi_ab(x, y) = c_a c_b cos(pi a u / L_u) cos(pi b v / L_v) / sqrt(L_u L_v)        c_0 = 1, else c = sqrt 2
 //!  f = sum z_ab sqrt(S(w_ab)) phi_ab        z independent and standard normal, w_ab = pi (a / L_u, b / L_v)
 //! ```
 //!
-//! S is the spectral density of the covariance (Solin and Sarkka 2020). A cosine is level where it meets the edge of the rectangle; so the rectangle
-//! begins well before the part. u and v lie along and across the lay of the field.
+//! S is the spectral density of the covariance (Solin and Sarkka 2020). The coordinates u and v run along and across
+//! the anisotropy of the field. The slope of each cosine is zero at the edge of the rectangle. Therefore the rectangle
+//! extends beyond the part on every side.
 //!
-//! A field whose range is longer than the part still bends at the edge of the rectangle, where no cosine does, and is highest in the corners. Products of
-//! Legendre's polynomials beside the cosines have as much of its variance as these: a smooth long field is a polynomial over the part.
+//! A field whose range is longer than the part still has a slope at the edge of the rectangle, where no cosine has one.
+//! Its error is largest in the corners. A smooth field with a long range is nearly a polynomial over the part.
+//! Therefore products of Legendre polynomials are added to the cosines, with as much variance in total as the field
+//! has.
 
 use faer::Mat;
 
 use super::{Anisotropy, Smoothness};
 
-/// By how much the rectangle is wider than the part on either side, as a share of the longer side of the part.
+/// Margin of the rectangle on each side of the part, as a share of the longer side of the part.
 const WIDER: f64 = 0.15;
 
-/// The cosines of the longest waves over a rectangle, and polynomials before them.
+/// Cosines of the lowest wavenumbers over a rectangle, preceded by polynomials over the part.
 pub(super) struct Basis {
     lay: Anisotropy,
     corner_mm: [f64; 2],
     lengths_mm: [f64; 2],
-    /// The middle of the part and half its lengths, between which the polynomials are laid.
+    /// Centre and half lengths of the rectangle around the part, on which the polynomials are defined.
     middle_mm: [f64; 2],
     halves_mm: [f64; 2],
     degree: usize,
-    /// The degrees of each polynomial along and across.
+    /// Degrees of each polynomial along and across.
     degrees: Vec<[usize; 2]>,
-    /// a and b of each cosine.
+    /// Orders a and b of each cosine.
     orders: Vec<[usize; 2]>,
-    /// One more than the highest order along either axis.
+    /// Highest order along each axis, plus one.
     counts: [usize; 2],
-    /// The square of each wave's number in the plane in which the field is alike in all directions, in 1 / mm^2.
+    /// Squared wavenumber of each cosine, in 1 / mm^2, in the coordinates in which the field is isotropic. Ascending.
     squared_wavenumbers: Vec<f64>,
 }
 
 impl Basis {
-    /// Takes so many cosines over some places, those first of which a field with this lay has most, and the polynomials up to a degree. What is
-    /// level or tilted is a motion of the part and none of them.
+    /// Returns the basis over the given places: the polynomials up to `degree` and `count` cosines.
+    ///
+    /// The cosines are those with the largest variance in a field of this anisotropy, in descending order. The
+    /// polynomials begin at degree 2, because a constant and a tilt are rigid motions of the part.
     pub(super) fn over(places: &[[f64; 2]], lay: Anisotropy, count: usize, degree: usize) -> Self {
         let spans = [0, 1].map(|axis| {
             let of = places.iter().map(|&place| rotated(lay, place)[axis]);
@@ -51,7 +58,8 @@ impl Basis {
         let lengths_mm = spans.map(|[low, high]| high - low + 2.0 * wider_mm);
         let root = lay.stretch.sqrt();
         let steps = [root / lengths_mm[0], 1.0 / (root * lengths_mm[1])].map(|step| step * std::f64::consts::PI);
-        // A quarter of an ellipse has this area; a wave more than it has is always among these.
+        // The quarter ellipse with these half axes has the area of `count` unit cells, so it contains at least `count`
+        // waves.
         let longest = (4.0 * count as f64 * steps[0] * steps[1] / std::f64::consts::PI).sqrt();
         let most = steps.map(|step| (longest / step) as usize + 2);
         let number2 = |[a, b]: [usize; 2]| (a as f64 * steps[0]).powi(2) + (b as f64 * steps[1]).powi(2);
@@ -61,7 +69,7 @@ impl Basis {
         let counts = [0, 1].map(|axis| orders.iter().map(|order| order[axis] + 1).max().unwrap_or(1));
         let numbers2 = orders.iter().map(|&order| number2(order)).collect();
         let middle_mm = spans.map(|[low, high]| 0.5 * (low + high));
-        // Points on a line have a width for numbers' sake.
+        // If the points lie on a line, a minimum width avoids a division by zero.
         let halves_mm = spans.map(|[low, high]| (0.5 * (high - low)).max(0.01 * wider_mm));
         let degrees = (2..=degree).flat_map(|whole| (0..=whole).map(move |b| [whole - b, b])).collect();
         Self {
@@ -78,22 +86,26 @@ impl Basis {
         }
     }
 
-    /// How many polynomials and cosines these are.
+    /// Returns the number of basis functions: polynomials and cosines.
     pub(super) fn len(&self) -> usize {
         self.degrees.len() + self.orders.len()
     }
 
-    /// How many of these, the first ones, are polynomials.
+    /// Returns the number of polynomials. They come first in the basis.
     pub(super) fn count_of_polynomials(&self) -> usize {
         self.degrees.len()
     }
 
-    /// Half the length of the shortest wave.
+    /// Returns half the wavelength of the shortest cosine, in mm.
     pub(super) fn min_half_wavelength_mm(&self) -> f64 {
         std::f64::consts::PI / self.squared_wavenumbers.last().copied().unwrap_or(0.0).sqrt()
     }
 
-    /// The standard deviation of each coefficient in a field of strength 1, and the share of the field's variance that is in shorter ones.
+    /// Returns the standard deviation of each coefficient, and the share of the variance that the basis leaves out.
+    ///
+    /// Both are for a field of variance 1. The share is that of the waves shorter than the shortest cosine. The
+    /// polynomials have variance only if the field is differentiable and its range is at least the longer side of the
+    /// part.
     pub(super) fn standard_deviations(&self, smoothness: Smoothness, range_mm: f64) -> (Vec<f64>, f64) {
         let strength = |number2: &f64| spectral_density_mm2(smoothness, range_mm, *number2).sqrt();
         let last2 = self.squared_wavenumbers.last().copied().unwrap_or(0.0);
@@ -108,7 +120,7 @@ impl Basis {
         )
     }
 
-    /// Every polynomial and cosine at some places: a row a place, a column each.
+    /// Evaluates every basis function at the places: one row for each place, one column for each polynomial and cosine.
     pub(super) fn at(&self, places: &[[f64; 2]]) -> Mat<f64> {
         let at_mm = [0, 1].map(|axis| places.iter().map(|&place| rotated(self.lay, place)[axis]).collect::<Vec<f64>>());
         let polynomials = [0, 1].map(|axis| self.polynomials(axis, &at_mm[axis]));
@@ -123,7 +135,8 @@ impl Basis {
         waves
     }
 
-    /// The cosines along an axis at some distances: a vector an order, a number a distance.
+    /// Evaluates the cosines along an axis at the given coordinates: one vector for each order, one value for each
+    /// coordinate.
     fn cosines(&self, axis: usize, at_mm: &[f64]) -> Vec<Vec<f64>> {
         let length_mm = self.lengths_mm[axis];
         let scale = |order: usize| if order == 0 { 1.0 } else { 2.0_f64.sqrt() } / length_mm.sqrt();
@@ -133,7 +146,8 @@ impl Basis {
         (0..self.counts[axis]).map(of).collect()
     }
 
-    /// Legendre's polynomials along an axis at some distances, each of the mean square of a cosine: a vector a degree, a number a distance.
+    /// Evaluates the Legendre polynomials along an axis at the given coordinates: one vector for each degree, one value
+    /// for each coordinate. Each is scaled to the mean square of a cosine, 1 / L.
     fn polynomials(&self, axis: usize, at_mm: &[f64]) -> Vec<Vec<f64>> {
         let root = self.lengths_mm[axis].sqrt().recip();
         let places: Vec<f64> = at_mm.iter().map(|at| (at - self.middle_mm[axis]) / self.halves_mm[axis]).collect();
@@ -150,7 +164,10 @@ impl Basis {
         all
     }
 
-    /// The waves along either axis of a grid, by which [`Self::on_grid`] tells fields there.
+    /// Evaluates the basis functions along each axis of a grid, as [`Self::on_grid`] needs them.
+    ///
+    /// One row for each node along the axis. The columns are the polynomials from degree 0, then the cosines from order
+    /// 0.
     pub(super) fn grid(&self, grid: &BasisGrid) -> [Mat<f64>; 2] {
         [0, 1].map(|axis| {
             let at_mm: Vec<f64> =
@@ -160,7 +177,7 @@ impl Basis {
         })
     }
 
-    /// A field by its coefficients at all nodes of a grid: u by v.
+    /// Evaluates the field with these coefficients at all nodes of a grid: one row for each u, one column for each v.
     pub(super) fn on_grid(&self, [along, across]: &[Mat<f64>; 2], coefficients: &[f64]) -> Mat<f64> {
         let mut square = Mat::<f64>::zeros(along.ncols(), across.ncols());
         let (polynomials, cosines) = coefficients.split_at(self.degrees.len().min(coefficients.len()));
@@ -170,13 +187,13 @@ impl Basis {
         along * &square * across.transpose()
     }
 
-    /// Takes a place to the axes along and across the lay.
+    /// Rotates a place to the axes u and v along and across the anisotropy.
     pub(super) fn rotated(&self, place: [f64; 2]) -> [f64; 2] {
         rotated(self.lay, place)
     }
 }
 
-/// A square grid along the axes of the waves.
+/// Square grid along the axes u and v of the basis.
 #[derive(Clone, Debug)]
 pub(super) struct BasisGrid {
     pub(super) corner_mm: [f64; 2],
@@ -189,8 +206,10 @@ fn rotated(lay: Anisotropy, [x, y]: [f64; 2]) -> [f64; 2] {
     [c * x + s * y, c * y - s * x]
 }
 
-/// The spectral density of a field of strength 1: of exp(-2 (r / range)^2), and of Matern's with kappa^2 = 8 nu / range^2, which is
-/// 4 pi nu kappa^(2 nu) / (kappa^2 + w^2)^(nu + 1) (Rasmussen and Williams 2006, 4.15).
+/// Returns the spectral density of a field of variance 1, in mm^2.
+///
+/// The covariance is exp(-2 (r / range)^2), or Matern's with kappa^2 = 8 nu / range^2. The density of the latter is 4
+/// pi nu kappa^(2 nu) / (kappa^2 + w^2)^(nu + 1) (Rasmussen and Williams 2006, 4.15).
 fn spectral_density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
     let matern = |nu: f64| {
         let kappa2 = 8.0 * nu / (range_mm * range_mm);
@@ -205,7 +224,7 @@ fn spectral_density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> 
     }
 }
 
-/// The share of the variance in waves of a larger number: the integral of the density over the plane outside of a circle.
+/// Returns the share of the variance in waves of a larger wavenumber: the integral of the density outside a circle.
 fn truncated_share(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
     let matern = |nu: f64| {
         let kappa2 = 8.0 * nu / (range_mm * range_mm);
@@ -225,7 +244,7 @@ mod tests {
 
     const PART: [[f64; 2]; 2] = [[-30.0, -20.0], [30.0, 20.0]];
 
-    /// The covariance of two places that the waves make.
+    /// Returns the covariance of two places under the basis.
     fn covariance(waves: &Basis, field: &Field, places: [[f64; 2]; 2]) -> f64 {
         let (strengths, _) = waves.standard_deviations(field.smoothness, field.range_mm);
         let at = waves.at(&places);
@@ -273,7 +292,8 @@ mod tests {
                 assert!((mean * 78.0 * 58.0 - expected).abs() < 2e-3, "{a} {b}: {mean}");
             }
         }
-        // At (30, -20) the product of the polynomials of degree 2 is 1, and so 5 by their mean squares.
+        // At (30, -20) the product of the two polynomials of degree 2 is 1. Scaled to the mean square of a cosine it is
+        // 5.
         let two_by_two = waves.degrees.iter().position(|degrees| *degrees == [2, 2]).unwrap();
         let corner = waves.at(&[[30.0, -20.0]])[(0, two_by_two)];
         assert!((corner - 5.0 / (78.0_f64 * 58.0).sqrt()).abs() < 1e-12, "{corner}");

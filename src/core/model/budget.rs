@@ -1,7 +1,8 @@
-//! What the uncertainty of the figures comes from, source by source.
+//! Uncertainty budget of the figures, source by source.
 //!
-//! Near the forms that may have been a figure is a sum over places, each with its mean slope. The variance of that sum is parted exactly, by the
-//! most probable field; the uncertainty of the figure itself, as the drawn forms have it, is shared out in that proportion.
+//! Near the sampled forms, a figure is approximated by a sum over places of the form times its mean derivative there.
+//! The variance of that sum is decomposed exactly, for the most probable field. The uncertainty of the figure itself,
+//! from the sampled forms, is divided in that proportion.
 
 use faer::linalg::solvers::{Llt, Solve};
 use faer::{Mat, Side};
@@ -12,41 +13,43 @@ use super::hypotheses::FieldHypotheses;
 use super::machine_uncertainty::UncertaintySource;
 use super::posterior::Posterior;
 
-/// What one source makes of the standard uncertainty of the figures: the squares of all add up.
+/// Contribution of one source to the standard uncertainties of the figures; the squares of all contributions add up.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct BudgetEntry {
-    /// The source.
+    /// Source of the contribution.
     pub source: UncertaintySource,
-    /// Whether anything tells how large it is; where nothing does, it is taken for 0.
+    /// True if the size of the source is known; if not, it counts as 0.
     pub is_stated: bool,
-    /// Of the root mean square.
+    /// Contribution to the standard uncertainty of the root mean square, in mm.
     pub rms_mm: f64,
-    /// Of the peak to valley without the outermost 0.1 % at either end.
+    /// Contribution to that of PV 99.8 % (without the outermost 0.1 % at either end), in mm.
     pub pv_99_8_mm: f64,
 }
 
-/// Forms that may have been, a column each, with their places and the motions that are taken off there.
+/// Forms sampled from the posterior, a column each, with their places and the motions that a best fit removes there.
 pub(super) struct SampledFigures<'a> {
     pub(super) forms: &'a DMatrix<f64>,
     pub(super) places: &'a [[f64; 2]],
     pub(super) effects: &'a DMatrix<f64>,
-    /// What each of the stated effects has had ground into the part there, after its own best fit; nothing before the first correction.
+    /// Form that each random effect has ground into the part, after its own best fit: a row per place, a column per
+    /// effect. `None` before the first correction.
     pub(super) ground_in: Option<DMatrix<f64>>,
 }
 
-/// The parts of a variance.
+/// Components of a variance.
 struct Parts {
-    /// The points by themselves.
+    /// Noise of the points.
     scatter: f64,
-    /// The field between them.
+    /// Field between the points.
     form: f64,
-    /// The motions that nobody knows.
+    /// Unknown motions of the part.
     pose: f64,
-    /// Each effect that is stated.
+    /// Each random effect.
     stated: Vec<f64>,
 }
 
-/// Parts the standard uncertainties of root mean square and peak to valley; nothing where they cannot be.
+/// Decomposes the standard uncertainties of root mean square and PV 99.8 %. Returns one entry per source; empty if the
+/// decomposition fails.
 pub(super) fn decompose(
     (observed, sources): (&Observed, &[UncertaintySource]),
     (fields, posterior): (&FieldHypotheses, &Posterior),
@@ -78,11 +81,12 @@ pub(super) fn decompose(
     UncertaintySource::ALL.iter().enumerate().map(one).collect()
 }
 
-/// Tells what the uncertainty of a sum a'f over places comes from: the variance of the field is that of sigma^2 D z with z of variance 1, and the
-/// coordinates of the points have it as B z.
+/// Decomposes the variance of a sum a'f over places. The coefficients of the field are sigma D z, with z of variance 1;
+/// the coordinates of the points are sigma B z.
 ///
-/// With the motions known the sum is told by w'd, of whose error the scatter makes s^2 w'w, an effect that is stated (w'e)^2, and the field what
-/// is left; that the motions are not known adds the rest.
+/// If the motions are known, w'd estimates the sum. In the variance of its error, the noise has the part s^2 w'w, a
+/// random effect (w'e)^2, and the field the remainder. The increase of the variance when the motions are unknown is the
+/// part of the pose.
 fn parts(
     observed: &Observed,
     fields: &FieldHypotheses,
@@ -97,7 +101,8 @@ fn parts(
     let own = Mat::from_fn(node.standard_deviations.len(), 1, |k, _| sums[(0, k)] * node.standard_deviations[k]);
     let rows = fields.with_effects(node);
     let known = rows.nrows() - fields.effects();
-    // The stated effects in the coordinates, behind the motions, and the part of them that no wave shows.
+    // The random effects in the coordinates, then in those of the motions, and then the part of them that no wave
+    // shows.
     let (coordinates, products) = fields.coordinates(&observed.random_effects);
     let of_effects = fields.of_effects(&observed.random_effects);
     let stated = observed.random_effects.ncols();
@@ -110,7 +115,7 @@ fn parts(
         k if k < rows.nrows() => of_effects[(k - known, e)],
         k => beside[(k - rows.nrows(), e)],
     };
-    // All coordinates, or all but those of the motions.
+    // Returns the weights, and the variance they explain, from all coordinates or from all but those of the motions.
     let by =
         |chosen: &[usize]| {
             let some = Mat::from_fn(chosen.len(), own.nrows(), |r, c| {
@@ -137,10 +142,12 @@ fn parts(
     Some(Parts { scatter, form, pose: (explained - explained_free).max(0.0), stated })
 }
 
-/// By how much root mean square and peak to valley rise with each place, on the average of the forms, and by the mean of the squares with what
-/// was ground in, column by column; what a motion does to them is nothing.
+/// Computes the derivatives of root mean square and PV 99.8 % with respect to the form at each place, as means over the
+/// sampled forms. Also returns, for each column of `ground_in`, the mean square of the derivative along it. Components
+/// along the motions are removed, because a best fit removes the motions.
 ///
-/// What was ground in makes a form whether it adds to the others or not: its slope is as often up as down, and its square is not 0.
+/// An effect that was ground in is itself a form: its derivative is as often positive as negative over the samples, so
+/// the mean is 0, but the mean square is not.
 fn slopes(drawn: &SampledFigures) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
     let (n, count) = drawn.forms.shape();
     let mut slopes = [DVector::zeros(n), DVector::zeros(n)];

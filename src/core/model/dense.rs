@@ -1,10 +1,18 @@
-//! The model by one set of parameters and the covariance of every pair of points.
+//! Exact posterior for one set of hyperparameters, with the covariance of every pair of points.
 //!
-//! With K = k(x_i, x_j) + s^2 R, where R is 1 and, between points of a path on which the probe drifts, the drift to the power of their steps
-//! (an autoregression of the first order), the effects b by generalised least squares, b = (H'K^-1 H)^-1 H'K^-1 d, and what is left told by kriging
-//! (Rasmussen and Williams 2006, 2.7, with a vague prior of b): mean h'b + k'K^-1 (d - H b), variance
-//! k(x, x) - k'K^-1 k + r'(H'K^-1 H)^-1 r with r = h - H'K^-1 k. Effects E that are stated stand beside those of H and have a variance of 1, so their
-//! part of H'K^-1 H has 1 added to its diagonal; that is the same as E E' in K.
+//! The covariance of the points is K = k(x_i, x_j) + s^2 R. R is the identity for independent noise. If the noise of
+//! the probe is autocorrelated along a path, R is the autocorrelation to the power of the number of steps between two
+//! points (an autoregression of the first order).
+//!
+//! The fixed effects b follow by generalised least squares, b = (H'K^-1 H)^-1 H'K^-1 d, and the field by kriging
+//! (Rasmussen and Williams 2006, 2.7, with a vague prior of b). With r = h - H'K^-1 k:
+//!
+//! ```text
+//!  mean = h'b + k'K^-1 (d - H b)        variance = k(x, x) - k'K^-1 k + r'(H'K^-1 H)^-1 r
+//! ```
+//!
+//! Random effects E are further columns after those of H and have a variance of 1. So 1 is added to the diagonal of
+//! their part of H'K^-1 H. This is equivalent to E E' in K.
 
 use faer::linalg::solvers::{Llt, Solve};
 use faer::{Mat, Side};
@@ -12,16 +20,16 @@ use nalgebra::{DMatrix, DVector};
 
 use super::{Hyperparameters, ModelError, Observed};
 
-/// What the model says of a place.
+/// Prediction of the field at a place.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Prediction {
-    /// The field, the most probable value.
+    /// Posterior mean of the field, which is also its most probable value.
     pub mean_mm: f64,
-    /// Its standard uncertainty; the scatter of a further point is not in it.
+    /// Standard uncertainty of the field; it does not contain the noise of a further point.
     pub sigma_mm: f64,
 }
 
-/// A model that knows some points.
+/// Posterior of field and effects, given observed points and one set of hyperparameters.
 pub struct DensePosterior {
     hyperparameters: Hyperparameters,
     places: Vec<[f64; 2]>,
@@ -30,22 +38,24 @@ pub struct DensePosterior {
     weights: Vec<f64>,
     /// K^-1 H.
     effects: Mat<f64>,
-    /// The effects, and their covariance.
+    /// The estimated effects b, and their covariance.
     found: DVector<f64>,
     covariance: DMatrix<f64>,
     likelihood: f64,
 }
 
 impl DensePosterior {
-    /// Fits the effects and the field to what was measured; takes time as the cube of the number of points.
+    /// Fits the effects and the field to the observed points. The cost is cubic in the number of points.
     ///
     /// # Errors
-    /// Rows that do not belong together, numbers that are none, parameters that are not above 0, effects that cannot be told apart.
+    /// Returns an error if the numbers of rows differ, a number is not finite, a hyperparameter is not above 0, or the
+    /// points cannot tell the effects apart.
     pub fn fit(observed: &Observed, hyperparameters: Hyperparameters) -> Result<Self, ModelError> {
         Self::with(observed, hyperparameters, |_, _| 0.0)
     }
 
-    /// The same with what else pairs of observed points have in common, which no other place has a part of.
+    /// Fits like [`Self::fit`], with a further covariance `shared_mm2` of each pair of observed points, by their
+    /// indices. The places of a prediction have no part in it.
     pub(super) fn with(
         observed: &Observed,
         hyperparameters: Hyperparameters,
@@ -75,24 +85,25 @@ impl DensePosterior {
         })
     }
 
-    /// Returns the logarithm of the likelihood of what was measured, whatever the effects are (restricted likelihood, Patterson and
-    /// Thompson 1971): by it parameters are compared.
+    /// Returns the logarithm of the likelihood of the observed deviations, integrated over the fixed effects
+    /// (restricted likelihood, Patterson and Thompson 1971). It serves to compare hyperparameters.
     pub fn log_likelihood(&self) -> f64 {
         self.likelihood
     }
 
-    /// The squares of the whitened residuals, d'K^-1 (d - H b).
+    /// Returns the sum of squares of the whitened residuals, d'K^-1 (d - H b).
     pub(super) fn whitened_squares(&self, observed: &Observed) -> f64 {
         observed.deviations_mm.iter().zip(&self.weights).map(|(d, w)| d * w).sum()
     }
 
-    /// Returns the effects and their covariance, those that are stated behind the others: with the motions of the part as effects, where its nominal frame is, and how well
-    /// that is known beside a field that nobody knows either.
+    /// Returns the estimated effects and their covariance: the fixed effects first, then the random effects. If the
+    /// fixed effects are the motions of the part, they give the pose of its nominal frame, and the covariance includes
+    /// the uncertainty due to the unknown field.
     pub fn estimated_effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
         (&self.found, &self.covariance)
     }
 
-    /// Tells the field at some places, the effects taken off.
+    /// Predicts the field at places, without the effects.
     pub fn predict(&self, places: &[[f64; 2]]) -> Vec<Prediction> {
         let p = self.found.len();
         let across = self.hyperparameters.field.pairs().across(&self.places, places);
@@ -110,7 +121,8 @@ impl DensePosterior {
             .collect()
     }
 
-    /// The same, with the covariance of every pair of the places.
+    /// Predicts the field at places like [`Self::predict`]; returns the means in mm, and the covariance of every pair
+    /// of places in mm^2.
     pub(super) fn predict_together(&self, places: &[[f64; 2]]) -> (Vec<f64>, Mat<f64>) {
         let p = self.found.len();
         let pairs = self.hyperparameters.field.pairs();
@@ -125,14 +137,14 @@ impl DensePosterior {
     }
 }
 
-/// What the covariance of points makes of what was measured.
+/// Products of the inverse covariance of the points with effects and deviations.
 struct Solved {
-    /// H, and behind it E.
+    /// Columns of H, followed by those of E.
     effects: DMatrix<f64>,
     factor: Llt<f64>,
-    /// K^-1 of these, and behind them K^-1 d.
+    /// K^-1 times these columns, followed by the column K^-1 d.
     solved: Mat<f64>,
-    /// H'K^-1 H and H'K^-1 d with E behind H, K without E.
+    /// H'K^-1 H and H'K^-1 d, with the columns of E appended to H; K does not contain E.
     gram: DMatrix<f64>,
     towards: DVector<f64>,
     log_det: f64,
@@ -153,7 +165,7 @@ impl Solved {
         let pairs = hyperparameters.field.pairs();
         let mut covariance = Mat::zeros(n, n);
         for c in 0..n {
-            // Only the lower triangle is read.
+            // The factorization reads only the lower triangle.
             let column = &mut covariance.col_as_slice_mut(c)[c..];
             pairs.column(places[c], &places[c..], column);
             column.iter_mut().zip(c..).for_each(|(v, r)| *v += shared_mm2(r, c));
@@ -182,19 +194,23 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Takes in that effects behind the first, which nobody knows, have a variance of 1.
+/// Adds the prior precision 1 of the random effects to the diagonal; the first `vague` columns are fixed effects and
+/// get none.
 fn with_stated(mut gram: DMatrix<f64>, vague: usize) -> DMatrix<f64> {
     (vague..gram.nrows()).for_each(|k| gram[(k, k)] += 1.0);
     gram
 }
 
-/// The factor of H'K^-1 H; none where a direction of it is nothing beside the others.
+/// Returns the Cholesky factor of H'K^-1 H.
+///
+/// # Errors
+/// Returns [`ModelError::EffectsAlike`] if the matrix, scaled to a unit diagonal, is singular within 1e-12.
 pub(super) fn checked_cholesky(gram: DMatrix<f64>) -> Result<nalgebra::Cholesky<f64, nalgebra::Dyn>, ModelError> {
     const LEAST: f64 = 1e-12;
     if gram.nrows() == 0 {
         return gram.cholesky().ok_or(ModelError::EffectsAlike);
     }
-    // Effects have units of their own: what counts is how alike they are.
+    // Effects have different units, so the test scales them: only their correlation counts.
     let scales = DVector::from_iterator(gram.nrows(), gram.diagonal().iter().map(|v| v.sqrt()));
     let alike = DMatrix::from_fn(gram.nrows(), gram.ncols(), |a, b| gram[(a, b)] / (scales[a] * scales[b]));
     let least = alike.symmetric_eigenvalues().iter().copied().fold(f64::INFINITY, f64::min);
@@ -214,7 +230,7 @@ mod tests {
 
     #[test]
     fn of_one_point_it_is_what_is_worked_out_by_hand() {
-        // k = 4, s^2 = 0.25: mean = 4 / 4.25 * 3, variance = 4 - 16 / 4.25.
+        // By hand, k = 4 and s^2 = 0.25: mean = 4 / 4.25 * 3, variance = 4 - 16 / 4.25.
         let model = DensePosterior::fit(&Observed::without_effects(vec![[1.0, 2.0]], vec![3.0]), HYPER).unwrap();
         let [at, far] = model.predict(&[[1.0, 2.0], [1e4, 0.0]])[..] else { panic!() };
         assert!((at.mean_mm - 12.0 / 4.25).abs() < 1e-14 && (at.sigma_mm.powi(2) - (4.0 - 16.0 / 4.25)).abs() < 1e-14);
@@ -225,7 +241,7 @@ mod tests {
 
     #[test]
     fn what_is_stated_of_one_point_is_what_is_worked_out_by_hand() {
-        // k = 4, s^2 = 0.25, e^2 = 2.25: of the 3 that were found the field has 4 / 6.5.
+        // By hand, k = 4, s^2 = 0.25 and e^2 = 2.25: the field gets the share 4 / 6.5 of the deviation 3.
         let stated = DMatrix::from_element(1, 1, 1.5);
         let model = DensePosterior::fit(
             &Observed { random_effects: stated, ..Observed::without_effects(vec![[1.0, 2.0]], vec![3.0]) },
@@ -242,7 +258,8 @@ mod tests {
 
     #[test]
     fn of_two_points_of_a_path_it_is_what_is_worked_out_by_hand() {
-        // No step of the field between them: K = [4.25 4.125; 4.125 4.25] by a drift of a half, and so the sum has 16.75 for 12 of the field.
+        // Both points lie at one place, so the field is the same at both. With a noise autocorrelation of 0.5, K =
+        // [4.25 4.125; 4.125 4.25]; its elements sum to 16.75.
         let drifting = Hyperparameters { noise_autocorrelation: 0.5, ..HYPER };
         let at = |path: [f64; 2]| Observed {
             path: path.to_vec(),
@@ -253,7 +270,7 @@ mod tests {
         // mean = 4 (w1 + w2), w1 + w2 = (3 + 1) / (4.25 + 4.125); variance = 4 - 16 * 2 / 8.375.
         assert!((told.mean_mm - 4.0 * 4.0 / 8.375).abs() < 1e-13, "{told:?}");
         assert!((told.sigma_mm.powi(2) - (4.0 - 32.0 / 8.375)).abs() < 1e-13, "{told:?}");
-        // Far apart on the path they scatter on their own.
+        // Far apart on the path, the noise of the two points is independent.
         let apart = DensePosterior::fit(&at([7.0, 900.0]), drifting).unwrap();
         let alone = DensePosterior::fit(&at([7.0, 8.0]), HYPER).unwrap();
         assert!((apart.log_likelihood() - alone.log_likelihood()).abs() < 1e-13);
@@ -281,13 +298,14 @@ mod tests {
             ..Observed::without_effects(places.clone(), Vec::new())
         };
         let [a, b] = [still, moved].map(|d| DensePosterior::fit(&with(d), HYPER).unwrap());
-        // What is planted comes back on top of what the field itself has along it.
+        // The fit returns the planted effects in addition to the component that the field itself has along them.
         assert!((b.estimated_effects().0 - a.estimated_effects().0 - &planted).norm() < 1e-9);
         let asked = [[30.0, 20.0], [70.0, 10.0]];
         for (p, q) in a.predict(&asked).into_iter().zip(b.predict(&asked)) {
             assert!((p.mean_mm - q.mean_mm).abs() < 1e-9 && (p.sigma_mm - q.sigma_mm).abs() < 1e-12);
         }
-        // The place of a part with a field of 2 mm and a range of a third of it is known to much worse than its points scatter.
+        // With a field of 2 mm, and a range of a third of the part, the uncertainty of the part's height is much larger
+        // than that due to the noise of its points.
         let height = a.estimated_effects().1[(0, 0)].sqrt();
         assert!(height > 10.0 * 0.5 / 120.0_f64.sqrt(), "{height}");
     }

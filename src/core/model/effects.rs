@@ -1,4 +1,4 @@
-//! Effects that nobody knows, told beside a field that nobody knows either.
+//! Estimates of unknown effects in the presence of an unknown field.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -6,29 +6,32 @@ use super::hypotheses::{FieldHypotheses, NoiseKind};
 use super::posterior::Posterior;
 use super::{DensePosterior, ModelError, Observed, Prior, Smoothness};
 
-/// Points whose every pair is worked with, at most: what tells an effect of the whole part is wide, and more of them tell no more.
+/// Maximum number of points, as the model uses every pair of them. Effects on the whole part are wide, so more points
+/// give no more information.
 const MOST_TOGETHER: usize = 600;
 
-/// A field that is less likely than this share of the most likely one counts for nothing.
+/// Minimum probability of a field, as a share of that of the most probable one; others are ignored.
 const FEW: f64 = 1e-3;
 
-/// Effects with their covariance.
+/// Estimated effects with their covariance.
 #[derive(Clone, Debug)]
 pub struct EffectEstimates {
-    /// Each in units of its column.
+    /// Estimate of each effect, in units of its column.
     pub values: DVector<f64>,
-    /// Their covariance, in which is what the field may have made of them.
+    /// Covariance of the estimates, including the uncertainty due to the field.
     pub covariance: DMatrix<f64>,
 }
 
 impl EffectEstimates {
-    /// Tells the effects by generalised least squares (Aitken 1935), b = (H'K^-1 H)^-1 H'K^-1 d with the covariance (H'K^-1 H)^-1.
+    /// Estimates the effects by generalised least squares (Aitken 1935), b = (H'K^-1 H)^-1 H'K^-1 d with the covariance
+    /// (H'K^-1 H)^-1.
     ///
-    /// K is that of the fields that the points speak for whatever the effects are, each as much as it is spoken for: the
-    /// covariance is the mean of theirs, and of how far their values lie apart.
+    /// K is the covariance of one field. The result is the average over the fields, weighted with their posterior
+    /// probabilities, which do not depend on the effects. Its covariance is the mean of theirs, plus the covariance of
+    /// their estimates.
     ///
     /// # Errors
-    /// Too few points, columns that are alike, rows that do not belong together.
+    /// Returns an error if there are too few points, columns are collinear, or the numbers of rows differ.
     pub fn estimate(observed: &Observed, priors: &Prior) -> Result<Self, ModelError> {
         priors.check()?;
         let n = observed.places.len();
@@ -36,7 +39,7 @@ impl EffectEstimates {
         let chosen: Vec<usize> = (0..most).map(|k| k * n / most.max(1)).collect();
         let some = observed.subset(&chosen);
         let fields = FieldHypotheses::over(&some, NoiseKind::PLAIN)?;
-        // A smooth field tells a rough form wrongly: the rougher ones are careful.
+        // A smooth field is overconfident if the form is rough; rougher fields are conservative.
         let rough = |smoothness| smoothness == Smoothness::Once;
         let mut likely = Posterior::of(&fields, &some, Some(priors), None).weighted_hyperparameters(rough);
         likely.retain(|(_, weight)| *weight > FEW);

@@ -1,8 +1,8 @@
-//! Why a model cannot be had.
+//! Errors of the model.
 
 use thiserror::Error;
 
-/// Why a model cannot be had. A point counts from 0.
+/// Reason why a model cannot be fitted. Points count from 0.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]

@@ -1,45 +1,46 @@
-//! A random field in the plane: how strong it is, how wide, how smooth, and along what lay.
+//! Random field in the plane: its strength, range, smoothness and anisotropy.
 
 use faer::Mat;
 
 use super::ModelError;
 use super::matern::Curve;
 
-/// A random field whose mean is 0.
+/// Random field with mean 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Field {
     /// Standard deviation of the field about 0.
     pub sigma_mm: f64,
-    /// The distance at which it has all but forgotten itself: correlation 0.14. Where it has a lay, the geometric mean of those along and across it.
+    /// Distance at which the correlation has fallen to 0.14. If the field has a lay, the geometric mean of the ranges
+    /// along and across it.
     pub range_mm: f64,
-    /// How smooth it is.
+    /// Smoothness of the field.
     pub smoothness: Smoothness,
-    /// The direction along which it is wider.
+    /// Direction along which the field is wider.
     pub lay: Anisotropy,
 }
 
-/// How smooth a field is: the nu of its Matern covariance, or how often it can be differentiated.
+/// Smoothness of a field: the nu of its Matern covariance, or how many times it can be differentiated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Smoothness {
-    /// nu = 1/2, exp(-2 r / range), the roughest: nowhere.
+    /// nu = 1/2, exp(-2 r / range): the roughest, nowhere differentiable.
     Never,
-    /// nu = 2: once.
+    /// nu = 2: differentiable once.
     Once,
-    /// nu without end, exp(-2 (r / range)^2): as often as one likes.
+    /// nu = infinity, exp(-2 (r / range)^2): differentiable any number of times.
     Endless,
 }
 
-/// The direction along which a field is wider than across, as the tracks of a wheel make it.
+/// Direction along which a field is wider than across, as the tracks of a wheel make it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Anisotropy {
-    /// The direction, a unit vector.
+    /// Direction, a unit vector.
     pub along: [f64; 2],
-    /// How many times as wide it is along as across; 1 where all directions are alike.
+    /// Ratio of the range along to the range across; 1 if all directions are alike.
     pub stretch: f64,
 }
 
 impl Smoothness {
-    /// Returns its word.
+    /// Returns the name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Never => "never",
@@ -50,15 +51,15 @@ impl Smoothness {
 }
 
 impl Anisotropy {
-    /// All directions are alike.
+    /// Isotropic: all directions are alike.
     pub const NONE: Self = Self { along: [1.0, 0.0], stretch: 1.0 };
 
-    /// A lay by its angle from x.
+    /// Creates an anisotropy from its angle to the x axis and its stretch.
     pub fn at(angle_rad: f64, stretch: f64) -> Self {
         Self { along: [angle_rad.cos(), angle_rad.sin()], stretch }
     }
 
-    /// Returns its angle from x, above -90 degrees and 90 at most; none where all directions are alike.
+    /// Returns the angle to the x axis, in rad, above -90° and at most 90°; `None` if all directions are alike.
     pub fn angle_rad(&self) -> Option<f64> {
         let [c, s] = self.along;
         let angle = if c > 0.0 || c == 0.0 && s > 0.0 { s.atan2(c) } else { (-s).atan2(-c) };
@@ -67,7 +68,7 @@ impl Anisotropy {
 }
 
 impl Field {
-    /// A field that is the same in all directions and can be differentiated once.
+    /// Creates an isotropic field that can be differentiated once.
     pub const fn new(sigma_mm: f64, range_mm: f64) -> Self {
         Self { sigma_mm, range_mm, smoothness: Smoothness::Once, lay: Anisotropy::NONE }
     }
@@ -77,13 +78,13 @@ impl Field {
         self.pairs().covariance_mm2(a, b)
     }
 
-    /// What the covariance of every pair of places is told by: for who asks for many.
+    /// Prepares the covariance for many pairs of places.
     pub(super) fn pairs(&self) -> Pairs {
         let [x, y] = [[1.0, 0.0], [0.0, 1.0]].map(|axis| self.straightened(axis).map(|v| v / self.range_mm));
         Pairs { x, y, variance_mm2: self.sigma_mm * self.sigma_mm, curve: Curve::of(self.smoothness) }
     }
 
-    /// Takes the plane to one in which the field is alike in all directions; an area stays as large as it is.
+    /// Maps a place into the plane in which the field is isotropic; the map preserves areas.
     pub(super) fn straightened(&self, at: [f64; 2]) -> [f64; 2] {
         let Anisotropy { along: [c, s], stretch } = self.lay;
         if stretch == 1.0 {
@@ -93,7 +94,10 @@ impl Field {
         [(c * at[0] + s * at[1]) / root, (c * at[1] - s * at[0]) * root]
     }
 
-    /// Says what makes this no field.
+    /// Checks that strength, range and lay are possible.
+    ///
+    /// # Errors
+    /// Returns [`ModelError::Hyper`] or [`ModelError::Lay`] with the wrong value.
     pub(super) fn check(&self) -> Result<(), ModelError> {
         for (what, value) in [("field", self.sigma_mm), ("range", self.range_mm)] {
             if !(value.is_finite() && value > 0.0) {
@@ -106,10 +110,10 @@ impl Field {
     }
 }
 
-/// A field, as it is asked for pairs of places.
+/// Field, prepared for the covariance of many pairs of places.
 #[derive(Clone, Copy)]
 pub(super) struct Pairs {
-    /// Where the axes go in the plane in which the field is alike in all directions and has a range of 1.
+    /// Images of the axes in the plane in which the field is isotropic and has a range of 1.
     x: [f64; 2],
     y: [f64; 2],
     variance_mm2: f64,
@@ -124,12 +128,12 @@ impl Pairs {
         self.variance_mm2 * self.curve.at(u * u + v * v)
     }
 
-    /// Writes the covariances of a place with others.
+    /// Writes the covariances of one place with others into `into`.
     pub(super) fn column(&self, at: [f64; 2], places: &[[f64; 2]], into: &mut [f64]) {
         into.iter_mut().zip(places).for_each(|(into, place)| *into = self.covariance_mm2(at, *place));
     }
 
-    /// The covariances of some places, a row each, with others, a column each.
+    /// Returns the covariances of some places, a row each, with others, a column each.
     pub(super) fn across(&self, rows: &[[f64; 2]], columns: &[[f64; 2]]) -> Mat<f64> {
         let mut across = Mat::zeros(rows.len(), columns.len());
         columns.iter().enumerate().for_each(|(c, at)| self.column(*at, rows, across.col_as_slice_mut(c)));
@@ -146,7 +150,7 @@ mod tests {
         let field = Field { lay: Anisotropy::at(0.5, 4.0), ..Field::new(2.0, 30.0) };
         let at = |r: f64, angle: f64| field.covariance_mm2([1.0, 1.0], [1.0 + r * angle.cos(), 1.0 + r * angle.sin()]);
         let alike = Field::new(2.0, 30.0).covariance_mm2([0.0; 2], [20.0, 0.0]);
-        // 4 times as wide along as across: twice and half of the mean.
+        // The range along is 4 times that across: twice the mean along, half of it across.
         assert!((at(40.0, 0.5) - alike).abs() < 1e-12, "{} {alike}", at(40.0, 0.5));
         assert!((at(10.0, 0.5 + std::f64::consts::FRAC_PI_2) - alike).abs() < 1e-12);
         assert_eq!(field.covariance_mm2([3.0, 4.0], [3.0, 4.0]), 4.0);

@@ -1,7 +1,7 @@
-//! The figures of drawn forms that are made of an area: slopes, and power, irregularity and their like after ISO 10110-5.
+//! Figures of sampled forms that belong to an area: slopes, and power, irregularity and related figures of ISO 10110-5.
 //!
-//! Each form has its own; over all forms they are a median and the interval that holds 95 % of them. What depends on the places alone is made once:
-//! [`IsoFits`], [`SlopesAt`].
+//! Each sampled form has figures of its own. The median over all forms and the interval that contains 95 % of them are
+//! the result. Everything that depends on the places alone is computed once: [`IsoFits`], [`SlopesAt`].
 
 use nalgebra::DMatrix;
 use rayon::prelude::*;
@@ -10,61 +10,63 @@ use serde::Serialize;
 use super::{Interval, ModelInputs};
 use crate::form::{IsoFits, IsoOfForm, SlopesAt};
 
-/// What figures of an area go by.
+/// Options for the figures of an area.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct AreaOptions {
-    /// The middle that symmetry is meant about, x and y of the model frame; without one the middle of the bounds of the places.
+    /// Centre of symmetry, x and y of the model frame; `None` for the centre of the bounds of the places.
     pub middle_mm: Option<[f64; 2]>,
-    /// The length over which slopes are taken; it is longer where the places are too far apart for it, and without one as short as they allow.
+    /// Length over which slopes are taken; it is increased if the places are too far apart for it. `None` for the
+    /// shortest length that the places allow.
     pub integration_mm: Option<f64>,
 }
 
-/// The slopes of the smooth form, its pose and the scatter of the probe in their uncertainty. What is too narrow to be told from scatter has a height and no slope
-/// that could be told, and is not in them.
+/// Slopes of the smooth form; their uncertainty includes those of its pose and of the noise of the probe. Form that is
+/// too narrow to be distinguished from noise has a height but no measurable slope, so it is not included.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct SlopeFigures {
-    /// Root mean square of the gradient's length.
+    /// Root mean square of the length of the gradient.
     pub rms: AngleInterval,
-    /// Largest length of the gradient.
+    /// Maximum length of the gradient.
     pub largest: AngleInterval,
-    /// Length over which a slope was taken.
+    /// Length over which the slopes were taken.
     pub integration_mm: f64,
-    /// At how many places it was taken; at edges it is not.
+    /// Number of places at which a slope was taken; edges have none.
     pub places: usize,
 }
 
-/// A median, and the interval that holds the slope with a probability of 95 %.
+/// Median of a slope, and its 95 % credible interval.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct AngleInterval {
-    /// As probably above as below.
+    /// Median: the slope is above and below it with equal probability.
     pub median_rad: f64,
-    /// Below it with a probability of 2.5 %.
+    /// Lower end: the slope is below it with a probability of 2.5 %.
     pub low_rad: f64,
-    /// Above it with a probability of 2.5 %.
+    /// Upper end: the slope is above it with a probability of 2.5 %.
     pub high_rad: f64,
 }
 
-/// ISO 10110-5 of the form, as [`crate::form::Iso10110`] has it of points.
+/// Figures of ISO 10110-5 of the form; [`crate::form::Iso10110`] has the same figures of points.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct IsoFigures {
-    /// A: PV of the power. It begins at 0 where the power may have either sign.
+    /// A: PV of the power. The interval begins at 0 if the sign of the power is uncertain.
     pub power: Interval,
-    /// Height of the power at the rim over the middle: above 0 where the rim stands proud.
+    /// Height of the power at the rim over the centre: above 0 if the rim is higher.
     pub power_rim: Interval,
     /// B: PV of the irregularity.
     pub irregularity: Interval,
-    /// C: PV of the part of the irregularity that is symmetric about the middle.
+    /// C: PV of the part of the irregularity that is symmetric about the centre.
     pub symmetric: Interval,
     /// RMSt: root mean square of the total.
     pub rms_total: Interval,
     /// RMSi: root mean square of the irregularity.
     pub rms_irregularity: Interval,
-    /// RMSa: root mean square of what is not symmetric.
+    /// RMSa: root mean square of the asymmetric part.
     pub rms_varying: Interval,
 }
 
 impl SlopeFigures {
-    /// Of smooth forms, a column each, and of those that tell extremes from above.
+    /// Computes the figures of smooth forms, a column each: the first matrix is for the figures, the second one raises
+    /// the upper ends of the maximum.
     pub(super) fn of(slopes: &SlopesAt, forms: &[DMatrix<f64>; 2], (is_seen, inputs): (bool, &ModelInputs)) -> Self {
         let found = forms.each_ref().map(|forms| each(forms, |form| slopes.of(form)));
         let [rms, largest] = [0, 1].map(|k| {
@@ -77,7 +79,8 @@ impl SlopeFigures {
 }
 
 impl IsoFigures {
-    /// Of forms, a column each, and of those that tell extremes from above.
+    /// Computes the figures of forms, a column each: the first matrix is for the figures, the second one raises the
+    /// upper ends of extremes.
     pub(super) fn of(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool, inputs: &ModelInputs) -> Self {
         let found = forms.each_ref().map(|forms| each(forms, |form| fits.of(form)));
         let values = |k: usize, of: fn(&IsoOfForm) -> f64| found[k].iter().map(of).collect::<Vec<f64>>();
@@ -101,7 +104,7 @@ impl IsoFigures {
     }
 }
 
-/// What is made of each column, in their order.
+/// Applies `make` to each column and returns the results in their order.
 fn each<T: Send>(forms: &DMatrix<f64>, make: impl Fn(&[f64]) -> T + Send + Sync) -> Vec<T> {
     forms.as_slice().par_chunks(forms.nrows().max(1)).map(make).collect()
 }

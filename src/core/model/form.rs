@@ -1,9 +1,10 @@
-//! What a registered measurement says of the form of a part, and of where its nominal frame is.
+//! Form of a part and position of its nominal frame, estimated from a registered measurement.
 //!
-//! The registration put the part where the deviations are smallest. What the part's own form did to that is told by the model: the motions
-//! that the registration was free to make are its effects, the form is its field. The figures are those of the form after its own
-//! best fit, over fields drawn from what the measurement leaves possible ([`super::posterior`]); so the scatter of the probe is taken off them, and
-//! the pose is in their uncertainty.
+//! The registration places the part where the deviations are smallest. The form of the part influences that pose. The
+//! model accounts for it: the motions that the registration was free to make are the fixed effects, and the form is the
+//! field. The figures are those of the form after its own best fit, over samples of the posterior
+//! ([`super::posterior`]). Therefore they do not contain the noise of the probe, and their uncertainty contains that of
+//! the pose.
 
 use faer::Mat;
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SymmetricEigen, Vector6};
@@ -23,108 +24,117 @@ use crate::form::{IsoFits, SlopesAt};
 use crate::geometry::{Nearest, Point, Vector};
 use crate::registration::{Deviation, LEAST_SIGMA_MM, PointStatus, Registration, robust_sigma};
 
-/// What a registered measurement says of the form of a part.
+/// Posterior of the form of a part, from a registered measurement.
 #[derive(Clone, Debug)]
 pub struct Form {
-    /// How strong and how wide the form is, and how far the probe scatters.
+    /// Standard deviation and range of the form, and noise of the probe.
     pub hyperparameters: Hyperparameters,
-    /// Covariance of the pose as the place of the nominal frame: of the twist [v; omega] in the model frame, as that of the registration,
-    /// which is how well the same pose would be found again. Units mm^2, mm rad, rad^2. Directions that were held have no variance.
+    /// Covariance of the pose as the place of the nominal frame: of the twist [v; omega] in the model frame. It has the
+    /// layout of the covariance of the registration. The latter describes only how well the same pose would be found
+    /// again. Units mm^2, mm rad, rad^2. Locked directions have zero variance.
     pub frame_covariance: Matrix6<f64>,
-    /// The form after its own best fit, at every point that was used, in the order given; of a scan with more than 6,000 points at as many of
-    /// them.
+    /// Form after its own best fit at every used point, in the given order. A scan of more than 6,000 points is reduced
+    /// to as many, evenly spaced.
     pub points: Vec<FormPoint>,
-    /// The figures of the form.
+    /// Figures of the form.
     pub figures: FormFigures,
-    /// Power, irregularity and their like; none where the points are too few for them.
+    /// ISO 10110-5 figures (power, irregularity and others); None if there are too few points for them.
     pub iso: Option<IsoFigures>,
-    /// The slopes of the smooth form; none where the points are too few for them.
+    /// Slopes of the smooth form; None if there are too few points for them.
     pub slope: Option<SlopeFigures>,
-    /// How well the smooth form is known: the RMS of its standard uncertainty over all places.
+    /// RMS of the standard uncertainty of the smooth form over all places, in mm.
     pub known_mm: f64,
-    /// What the standard uncertainties of the figures come from, source by source; empty where they cannot be parted.
+    /// Sources of the standard uncertainties of the figures; empty if these cannot be decomposed.
     pub budget: Vec<BudgetEntry>,
-    /// What the points alone tell of the parameters, whatever was expected of them: it teaches of the parts that follow. None where no form is seen.
+    /// Hyperparameters from the points alone, without the given prior. They are used to learn the prior of later parts.
+    /// None if no form is detectable.
     pub hyperparameters_without_prior: Option<Hyperparameters>,
-    /// Whether the points show a form at all. Where they do not, the figures are known from above alone, and their intervals begin at 0.
+    /// True if the points show a form. If false, only upper bounds of the figures are given, and their intervals begin
+    /// at 0.
     pub is_seen: bool,
-    /// How many degrees of freedom the fit leaves the points that the fields are told by.
+    /// Degrees of freedom that the fit leaves to the points from which the field is estimated.
     pub degrees_of_freedom: f64,
-    /// Whether these are too few to tell the form from the scatter: the upper ends are those of a form that is all of what was found then.
+    /// True if the degrees of freedom are too few to separate the form from the noise, and the noise of the probe is
+    /// unknown. The upper bounds then assume that the deviations are entirely form.
     pub is_of_few: bool,
 }
 
-/// The form at a measured point.
+/// Form at a measured point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FormPoint {
-    /// Where, in the model frame.
+    /// Position in the model frame, in mm.
     pub at_mm: [f64; 2],
-    /// The form there and its standard uncertainty.
+    /// Form at the point and its standard uncertainty.
     pub form: Prediction,
-    /// Standard uncertainty of what of it is smooth: what a correction can be made by.
+    /// Standard uncertainty of the smooth part of the form, which a correction can use.
     pub smooth_sigma_mm: f64,
 }
 
-/// Figures with what the measurement leaves possible of each.
+/// Figures of the form with their credible intervals.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FormFigures {
     /// Root mean square.
     pub rms: Interval,
-    /// Largest less least at the places of the form: of a whole pattern the touched points.
+    /// Peak to valley over the places of the form. For a whole pattern these are the touched points.
     pub pv: Interval,
-    /// The same of the aperture, the places between them in it: without the outermost 0.1 % at either end, but none of the touched places is left
-    /// out.
+    /// PV 99.8 %: peak to valley over the aperture, including the places between. The outermost 0.1 % at either end are
+    /// left out, but never a touched place.
     pub pv_most_points: Interval,
 }
 
-/// A median, and the interval that holds the value with a probability of 95 %.
+/// Median and 95 % credible interval of a figure.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Interval {
-    /// As probably above as below.
+    /// Median.
     pub median_mm: f64,
-    /// Below it with a probability of 2.5 %.
+    /// 2.5 % quantile.
     pub low_mm: f64,
-    /// Above it with a probability of 2.5 %.
+    /// 97.5 % quantile.
     pub high_mm: f64,
-    /// Below it with the probability of [`ModelInputs::look_risk`]: for who looks more than once.
+    /// Lower bound for repeated looks at a growing measurement: the quantile of the probability
+    /// [`ModelInputs::look_risk`].
     #[serde(skip)]
     pub least_mm: f64,
-    /// Above it with that probability.
+    /// Upper bound for repeated looks: the quantile of the probability 1 - [`ModelInputs::look_risk`].
     #[serde(skip)]
     pub most_mm: f64,
-    /// Below it with the probability of [`ModelInputs::probability`]: for who judges.
+    /// Bound for acceptance: the quantile of the probability [`ModelInputs::probability`].
     #[serde(skip)]
     pub accepted_mm: f64,
-    /// Below each of them with one of [`Interval::PROBABILITIES`].
+    /// Quantiles of the probabilities [`Interval::PROBABILITIES`].
     #[serde(skip)]
     pub quantiles_mm: [f64; 15],
 }
 
-/// Fields that are drawn, and places at which they are looked at, at most.
+/// Number of samples of the posterior.
 const SAMPLES: usize = 1000;
-/// Fields of one kind that are drawn, where one kind is looked at: the smooth ones for the lower ends, the rough ones for the upper ones where these are at
-/// least so probable.
+/// Number of samples of one kind of field: the smooth fields for the lower bounds, the rough fields for the upper
+/// bounds.
 const FEWER: usize = 250;
+/// Minimum probability at which a possibility counts: that the field is rough, or that isolated points are neighbours
+/// by chance.
 const MAY_BE: f64 = 0.025;
+/// Maximum number of places at which the samples are evaluated.
 const MOST_PLACES: usize = 6000;
-/// Drawn fields that are worked on at a time.
+/// Number of samples that are processed at a time.
 const A_TIME: usize = 50;
-/// By how much more a form has to be spoken for than none, in the logarithm of the likelihood of the best one: without a form it is so in one part of a hundred.
+/// Minimum logarithm of the likelihood ratio of the best field and no field for a form to count as detected. Without a
+/// form one part in a hundred exceeds it.
 const EVIDENCE: f64 = 3.0;
-/// A point further from the field than this many robust sigmas is none that scattered.
+/// Limit of the distance from the field, in robust sigmas: a larger distance is not noise.
 const STANDS_OUT: f64 = 6.0;
-/// Where more than this share of the points stood out, they would not be apart from the form: it has no other.
+/// Maximum share of points that can stand out from the field. If more stand out, they are part of the form itself.
 const MOST_APART: f64 = 0.1;
-/// Where the fit leaves fewer degrees of freedom, no field tells the scatter from the form.
+/// Minimum degrees of freedom for a field to separate the noise from the form.
 const FEW_FREE: f64 = 20.0;
-/// A direction whose variance is less than this share of the largest was held.
+/// Share of the largest variance below which a direction counts as locked.
 const HELD: f64 = 1e-13;
 
 impl Form {
-    /// Fits the model to a registration: its deviations over x and y of the model frame.
+    /// Fits the model to the deviations of a registration, over x and y of the model frame, and returns the form.
     ///
     /// # Errors
-    /// Too few points, and points that leave nothing to tell the form by.
+    /// Too few points, or points from which the form cannot be estimated.
     pub fn estimate(registration: &Registration, inputs: &ModelInputs) -> Result<Self, ModelError> {
         let seen = FittedModel::of(registration, inputs, true)?;
         let posterior = seen.posterior(inputs);
@@ -154,14 +164,14 @@ impl Form {
         Ok(Self { slope, ..seen.form(inputs, &posterior, (&drawn, [&least, &most]), ground_in, true) })
     }
 
-    /// Tells the form at places of the part that need not have been touched: points of the nominal surface with their normals, in the model
-    /// frame. The figures are those of all of them.
+    /// Estimates the form at given places of the part, touched or not, and returns it with the figures of all of them.
     ///
-    /// What is too narrow for the distance of the points is told from the scatter of the probe by [`ModelInputs::probe_scatter_mm`] alone. As
-    /// nothing says how wide it is, every place has one of its own.
+    /// The places are points of the nominal surface with their normals, in the model frame. Form that is narrower than
+    /// the spacing of the points is separated from the noise of the probe by [`ModelInputs::probe_noise_mm`] alone. Its
+    /// width is unknown, so every place has an independent value of it.
     ///
     /// # Errors
-    /// Those of [`Form::of`].
+    /// Those of [`Form::estimate`].
     pub fn estimate_at(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -170,7 +180,8 @@ impl Form {
         Self::estimate_with(registration, inputs, places, true)
     }
 
-    /// The same; where not all is asked for without slopes, ISO figures and the budget, which cost most where few points were touched.
+    /// Estimates the form as [`Form::estimate_at`] does. If `is_whole` is false, it omits slopes, ISO figures and the
+    /// budget, which cost most if few points were touched.
     pub(super) fn estimate_with(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -181,7 +192,7 @@ impl Form {
         let posterior = seen.posterior(inputs);
         let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
         let effects = seen.motions.rows(places.iter().copied());
-        // Many more places than touches are close enough to each other.
+        // If there are many more places than touches, the places are close enough to each other.
         let is_between = places.len() < 2 * seen.kept.len();
         let at = places.iter().map(plane).collect();
         let drawn = seen.drawn(posterior.samples(HypothesisSet::All, SAMPLES, 1), at, effects, is_between);
@@ -195,36 +206,37 @@ impl Form {
     }
 }
 
-/// A registration as the model sees it, with what speaks for which parameters.
+/// Registration in the terms of the model, with the field hypotheses.
 struct FittedModel {
     motions: Motions,
-    /// What was observed at all points that were used.
+    /// Observations at all used points.
     all: Observed,
-    /// Those of them that no field explains, ascending: what stands there is form all the same.
+    /// Indices of the points that no field explains, ascending. They count as form nevertheless.
     apart: Vec<usize>,
-    /// Those of these that touches beside them agree with.
+    /// Those of them that neighbouring touches confirm.
     agreed: Vec<usize>,
-    /// Whether so many stand alone that two of them are neighbours by chance.
+    /// True if there are so many isolated points that two of them can be neighbours by chance.
     is_chance: bool,
-    /// The rest of them, and what was observed at those.
+    /// Indices of the other points, and the observations there.
     kept: Vec<usize>,
     observed: Observed,
-    /// What is stated of all points together.
+    /// Effects of the machine, its probe, the temperature and the datum on all points together.
     stated: MachineEffects,
-    /// What of that has been ground into the part, at all points: nothing before the first correction.
+    /// Columns of these effects that are ground into the part, at all used points; None before the first correction.
     ground_in: Option<DMatrix<f64>>,
     fields: FieldHypotheses,
 }
 
 impl FittedModel {
-    /// Lays the fields, without the points that none of them explains.
+    /// Builds the hypotheses without the points that no field explains.
     fn of(registration: &Registration, inputs: &ModelInputs, at_points: bool) -> Result<Self, ModelError> {
-        /// Each round tells the parameters anew, and without the tallest of a defect its flanks stand out.
+        /// Number of rounds. Each round estimates the hyperparameters again. Without the tallest points of a defect,
+        /// its flanks stand out.
         const ROUNDS: usize = 3;
         if let Some(priors) = &inputs.priors {
             priors.check()?;
         }
-        /// So many touches lie around one.
+        /// Number of touches around one.
         const AROUND: f64 = 8.0;
         let mut seen = Self::with_all_in_the_fit(registration, inputs, at_points)?;
         for _ in 0..ROUNDS {
@@ -237,7 +249,7 @@ impl FittedModel {
             apart.sort_unstable();
             let kept: Vec<usize> = (0..seen.all.places.len()).filter(|k| apart.binary_search(k).is_err()).collect();
             let observed = seen.all.subset(&kept);
-            // What is left may be too few to tell anything; then it is told with them.
+            // The remaining points can be too few for the model. Then these points stay in it.
             let Ok(fields) = FieldHypotheses::over(&observed, seen.fields.kind) else { break };
             seen = Self { apart, kept, observed, fields, ..seen };
         }
@@ -251,7 +263,8 @@ impl FittedModel {
         Posterior::of(&self.fields, &self.observed, inputs.priors.as_ref(), probe(inputs))
     }
 
-    /// Forms at some places, in the frame of the registration: with the motions that take each to what was found.
+    /// Evaluates the samples at the places, in the frame of the registration. Each sample contains the motion that fits
+    /// it best to the observations.
     fn drawn(
         &self,
         draws: PosteriorSamples,
@@ -272,9 +285,9 @@ impl FittedModel {
         SampledForms::by(&self.fields, draws, (places, effects), &moved, is_between)
     }
 
-    /// The points that are further from the field than its scatter lets any of them be, of all that were used.
+    /// Returns the points whose residual from the field is too large for noise, as indices of all used points.
     fn unexplained(&self, inputs: &ModelInputs) -> Vec<usize> {
-        /// Of fewer points nobody knows what is usual.
+        /// Minimum number of points: with fewer, the usual residual is unknown.
         const FEWEST: usize = 40;
         let Observed { places, deviations_mm, fixed_effects: effects, random_effects: stated, .. } = &self.observed;
         if places.len() < FEWEST {
@@ -287,20 +300,21 @@ impl FittedModel {
         let left = |k: usize| deviations_mm[k] - told[k] - moved[k];
         let residuals_mm = best_fitted(DMatrix::from_fn(places.len(), 1, |k, _| left(k)), effects);
         let (middle_mm, sigma_mm) = robust_sigma(residuals_mm.iter().copied());
-        // Where a field goes through every point, what is left of them is no scatter.
+        // If a field passes through every point, the residuals do not show the noise.
         let scatter_mm = posterior.mean_hyperparameters().noise_sigma_mm;
         let limit_mm = STANDS_OUT * sigma_mm.max(0.5 * scatter_mm).max(LEAST_SIGMA_MM);
         let stands_out = |k: &usize| (residuals_mm[*k] - middle_mm).abs() > limit_mm;
         self.of_all(&(0..places.len()).filter(stands_out).collect::<Vec<_>>())
     }
 
-    /// The numbers among all that were used of some that were kept.
+    /// Converts indices of the points in the model to indices of all used points.
     fn of_all(&self, chosen: &[usize]) -> Vec<usize> {
         chosen.iter().map(|&k| self.kept[k]).collect()
     }
 
-    /// Puts points that no field explains into what is drawn, each with the height that was found there but for the scatter of a touch:
-    /// in their order among the points, or in place of the nearest of other places.
+    /// Adds points that no field explains to the samples, each with its measured deviation minus the noise of a touch.
+    /// At measured points they are inserted in the order of the points. At other places each replaces the nearest
+    /// place.
     fn with_those(&self, apart: &[usize], drawn: SampledForms, inputs: &ModelInputs) -> SampledForms {
         let (rows, at_points) = (drawn.places.len(), !drawn.chosen.is_empty());
         let chosen = self.of_all(&drawn.chosen);
@@ -308,7 +322,7 @@ impl FittedModel {
         if apart.is_empty() {
             return drawn;
         }
-        // Of the points of a scan as large a share as of the others, the tallest of them.
+        // A reduced scan keeps the same share of these points as of the others, the tallest first.
         let count = apart.len();
         let mut apart = apart.to_vec();
         if at_points {
@@ -320,7 +334,7 @@ impl FittedModel {
         if at_points { drawn.beside(found) } else { drawn.replaced_by(&found) }
     }
 
-    /// What some of the points found, as often as forms are drawn.
+    /// Returns samples of the form at the points, from their deviations: one column for each given sample.
     fn touched_at(&self, points: &[usize], drawn: &SampledForms, inputs: &ModelInputs) -> SampledForms {
         let stated = self.all.random_effects.select_rows(points) * &drawn.stated;
         let of_probe = |mm: f64| probe(inputs).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
@@ -328,7 +342,8 @@ impl FittedModel {
         for c in 0..drawn.scatter_mm.len() {
             let mut normals = Normals::new(6, c as u64);
             let scatter_mm = of_probe(drawn.scatter_mm[c]);
-            // The tallest touch of a defect is one that scattered upwards: where extremes are told from below, all of them do.
+            // The tallest touch of a defect probably has positive noise. Therefore the second samples, which bound the
+            // extremes, use one noise for all touches.
             let alike_mm = scatter_mm * normals.next();
             for (r, &k) in points.iter().enumerate() {
                 let found_mm = self.all.deviations_mm[k] - stated[(r, c)];
@@ -352,7 +367,8 @@ impl FittedModel {
         found.without(self.ground_in.as_ref().map(|columns| columns.select_rows(points)).as_ref())
     }
 
-    /// Lays the fields over the points that the pose was fitted to. The others are far from the surface, and no field.
+    /// Builds the hypotheses over the points that the pose was fitted to. The other points are far from the surface,
+    /// and no field describes them.
     fn with_all_in_the_fit(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -389,14 +405,15 @@ impl FittedModel {
         })
     }
 
-    /// The slopes of what is drawn, before anything is added that has none.
+    /// Computes the slopes of the samples, before form without a slope is added to them.
     fn slope(&self, inputs: &ModelInputs, posterior: &Posterior, drawn: &SampledForms) -> Option<SlopeFigures> {
         let slopes = SlopesAt::over(&drawn.places, inputs.area.integration_mm)?;
         let smooth = [0, 1].map(|k| best_fitted(drawn.forms[k].clone(), &drawn.effects));
         Some(SlopeFigures::of(&slopes, &smooth, (is_seen(posterior), inputs)))
     }
 
-    /// The form by what is drawn, without its slopes; `ground_in` is what of it each of the stated effects may have made there.
+    /// Builds the form from the samples, without slopes. `ground_in` has the columns of the effects that are ground
+    /// into the part, at the places of the samples.
     fn form(
         &self,
         inputs: &ModelInputs,
@@ -408,7 +425,7 @@ impl FittedModel {
         let ground_into_kept = self.ground_in.as_ref().map(|columns| columns.select_rows(&self.kept));
         let alike = ground_into_kept.as_ref().unwrap_or(&self.observed.random_effects);
         let covariance = of_the_fit(&self.observed, (&self.fields, posterior), alike);
-        // What stands apart is seen, whatever the rest shows.
+        // Points apart from the field are detected, whatever the others show.
         let is_seen = is_seen(posterior) || !self.apart.is_empty();
         let figures = drawn.figures(is_seen, ends, inputs);
         let budget = if is_whole { self.budget(inputs, posterior, drawn, ground_in, &figures) } else { Vec::new() };
@@ -460,16 +477,18 @@ impl FittedModel {
     }
 }
 
-/// Whether the points show a form at all.
+/// Returns true if the points show a form.
 fn is_seen(posterior: &Posterior) -> bool {
     posterior.evidence > EVIDENCE
 }
 
-/// Takes all of the scatter for that of the probe, where it may be: by this a form is told from below.
+/// Returns the inputs for the lower bounds of the form: if the noise is consistent with that of the probe, all of it
+/// counts as noise of the probe.
 ///
-/// A reference sphere that was touched some twenty times tells the scatter of the probe to 15 %. What the points scatter by more need be no form.
+/// A reference sphere with some twenty touches determines the noise of the probe to 15 %. The excess of the noise over
+/// that value is not necessarily form.
 fn least_form(posterior: &Posterior, inputs: &ModelInputs) -> ModelInputs {
-    /// A probe that scatters by so many standard uncertainties more than was found is none.
+    /// Maximum excess of the noise over that of the probe, in standard uncertainties, that is still consistent with it.
     const MAY_SCATTER: f64 = 2.0;
     match probe(inputs) {
         Some([probe_mm, u]) if posterior.mean_hyperparameters().noise_sigma_mm < probe_mm * (MAY_SCATTER * u).exp() => {
@@ -479,12 +498,12 @@ fn least_form(posterior: &Posterior, inputs: &ModelInputs) -> ModelInputs {
     }
 }
 
-/// Whether the points are too few to tell the form from a scatter that nothing else tells.
+/// Returns true if the points are too few to separate the form from the noise, and the noise of the probe is unknown.
 fn is_of_few(posterior: &Posterior, inputs: &ModelInputs) -> bool {
     posterior.degrees_of_freedom() < FEW_FREE && probe(inputs).is_none()
 }
 
-/// What is known of the scatter of the probe itself.
+/// Returns the prior of the noise of the probe; None if it is unknown.
 fn probe(inputs: &ModelInputs) -> NoisePrior {
     (inputs.probe_noise_mm[0] > 0.0).then_some(inputs.probe_noise_mm)
 }
@@ -493,7 +512,7 @@ fn mean(of: &[f64]) -> f64 {
     of.iter().sum::<f64>() / of.len().max(1) as f64
 }
 
-/// Whether points follow each other like those of a path that is gone along: most are near the one before.
+/// Returns true if the points follow a path: the median step is at most a few spacings of the points.
 fn is_path(places: &[[f64; 2]]) -> bool {
     const NEAR: f64 = 3.0;
     let apart_mm = |pair: &[[f64; 2]]| (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1]);
@@ -510,38 +529,41 @@ fn plane((point, _): &(Point, Vector)) -> [f64; 2] {
     [point.x, point.y]
 }
 
-/// Some of so many, evenly.
+/// Returns at most [`MOST_PLACES`] indices below `of`, evenly spaced.
 fn thinned(of: usize) -> impl Iterator<Item = usize> {
     let most = of.min(MOST_PLACES);
     (0..most).map(move |k| k * of / most)
 }
 
-/// What the points cannot tell of themselves.
+/// Inputs of the model that the measured points cannot show.
 #[derive(Clone, Copy, Debug)]
 pub struct ModelInputs {
-    /// What is known of form and scatter beforehand; without it what every part of its size is like.
+    /// Prior of range and noise ratio. If None, a prior from the Fisher information of the variance ratio is used.
     pub priors: Option<Prior>,
-    /// What the machine does to all points together, as its cell file states it.
+    /// Uncertainty of the machine that is common to all points, from its cell file.
     pub machine: MachineUncertainty,
-    /// Standard uncertainty of the radius of the probe as it was found: it moves every point along its normal alike.
+    /// Standard uncertainty of the calibrated radius of the probe, in mm. It moves every point along its normal by the
+    /// same amount.
     pub radius_sigma_mm: f64,
-    /// Standard uncertainty of all lengths, as a share of them: that of temperature and expansion.
+    /// Relative standard uncertainty of all lengths, from temperature and expansion.
     pub scale_sigma: f64,
-    /// Standard uncertainties of where the part was held, where the registration was not free to move it: along x, y and z of the model in
-    /// millimetres, and of its turns about them through the middle of the points in radians. 0 in what is taken for known, or was found.
-    /// Nothing where the registration held nothing.
+    /// Standard uncertainties of the pose in the directions that the registration locked: along x, y and z of the model
+    /// in mm, and of the turns about them through the centroid of the points in rad. 0 in directions that are known
+    /// exactly or that the registration found. None if the registration locked no direction.
     pub datum: Option<[f64; 6]>,
-    /// Whether the part was corrected by what the same machine found of it where it is held: then all that is stated is ground into it, and the
-    /// points show it no more.
+    /// True if the part was corrected by a measurement of the same machine in the same clamping. Then all effects of
+    /// uncertain size (machine, probe, temperature, datum) are ground into the part, and the points no longer show
+    /// them.
     pub is_corrected: bool,
-    /// How far the probe itself scatters, and to what share of that it is known: what points scatter by more is form, too narrow to be told
-    /// otherwise. 0 where nothing tells; all of the scatter is the probe's then.
+    /// Noise of the probe itself: its standard deviation in mm, and the relative standard uncertainty of that. Noise
+    /// beyond it is form that is too narrow to be resolved. If the first is 0, the value is unknown: all noise then
+    /// counts as the probe's.
     pub probe_noise_mm: [f64; 2],
-    /// With what probability a figure may be beyond either of the bounds [`Interval::least_mm`] and [`Interval::most_mm`].
+    /// Probability that a figure is beyond each of the bounds [`Interval::least_mm`] and [`Interval::most_mm`].
     pub look_risk: f64,
-    /// With what probability a figure must be within its limit to be accepted.
+    /// Probability of being within the limit that a figure needs for acceptance.
     pub probability: f64,
-    /// What the figures of an area go by.
+    /// Options of the figures over an area.
     pub area: AreaOptions,
 }
 
@@ -562,8 +584,10 @@ impl Default for ModelInputs {
     }
 }
 
-/// The covariance of the motions as the registration finds them, by least squares of deviations that a form makes alike: A+ (K + s^2) A+'
-/// with A+ = (H'H)^-1 H' (Aitken 1935), and of what adds to all points alike. K is the mean of those of all fields that it may be.
+/// Returns the covariance of the motions as the registration finds them.
+///
+/// This is the covariance of least squares with correlated deviations: A+ (K + s^2) A+' with A+ = (H'H)^-1 H' (Aitken
+/// 1935). K is the mean of the covariances of all fields. The covariance of the effects common to all points is added.
 fn of_the_fit(
     observed: &Observed,
     (fields, posterior): (&FieldHypotheses, &Posterior),
@@ -571,7 +595,7 @@ fn of_the_fit(
 ) -> DMatrix<f64> {
     let rows = &observed.fixed_effects;
     let inverse = inverse_of_products(rows);
-    // A+, a row a point.
+    // A+, one row for each point.
     let weights = rows * &inverse;
     let (covered, scatter2) = posterior.mean_covariance(&fields.sums(&weights));
     let drift = fields.kind.autocorrelation;
@@ -579,36 +603,36 @@ fn of_the_fit(
     inverse * (scatter2 * (1.0 + drift) / (1.0 - drift)) + covered + &of_alike * of_alike.transpose()
 }
 
-/// (H'H)^-1 of the effects H.
+/// Returns (H'H)^-1 of the effects H.
 fn inverse_of_products(effects: &DMatrix<f64>) -> DMatrix<f64> {
     let inverse = effects.tr_mul(effects).pseudo_inverse(f64::EPSILON);
     inverse.unwrap_or_else(|_| DMatrix::zeros(effects.ncols(), effects.ncols()))
 }
 
-/// Forms that may have been, a column each, at some places.
+/// Samples of the form at a set of places, one column for each sample.
 struct SampledForms {
-    /// The forms, and those by fields that follow the points more closely: by these the upper ends of extremes are told.
+    /// Samples by the posterior, and by fields of the second variance. The second bounds the extremes.
     forms: [DMatrix<f64>; 2],
-    /// Where the points are few: forms that are all of what was found, but for the scatter.
+    /// Samples that take the deviations entirely as form, apart from the noise; only if there are few points.
     all: Option<DMatrix<f64>>,
     places: Vec<[f64; 2]>,
     effects: DMatrix<f64>,
-    /// Which of the points the places are, where they are points.
+    /// Indices of the points that are the places; empty if the places are not measured points.
     chosen: Vec<usize>,
-    /// Which of the places were not touched, where they are no points.
+    /// Indices of the places that were not touched; empty if the places are measured points.
     untouched: Vec<usize>,
-    /// Standard uncertainty of what is told of each place, as far as it is smooth.
+    /// Standard uncertainty of the smooth form at each place.
     smooth_sigma_mm: Vec<f64>,
-    /// The scatter of each form, and what of either kind is in waves too short to be told.
+    /// Noise of each sample, and for each variance the standard deviation of waves shorter than those of the basis.
     scatter_mm: Vec<f64>,
     narrow_mm: [Vec<f64>; 2],
-    /// How much of what is stated each has beside it.
+    /// Random effects of each sample, in standard uncertainties.
     stated: DMatrix<f64>,
-    /// The same forms between the places.
+    /// The same samples between the places.
     between: Option<IntermediateForms>,
 }
 
-/// Forms between places.
+/// Samples of the form between the places.
 struct IntermediateForms {
     between: IntermediateNodes,
     forms: [DMatrix<f64>; 2],
@@ -616,7 +640,7 @@ struct IntermediateForms {
 }
 
 impl SampledForms {
-    /// At some places, each with so much of the motions there, and where it is asked for between them.
+    /// Evaluates the samples at the places, adds the motions `moved`, and does the same between the places if asked to.
     fn by(
         fields: &FieldHypotheses,
         draws: PosteriorSamples,
@@ -672,7 +696,8 @@ impl SampledForms {
         }
     }
 
-    /// Leaves the fields that follow the points more closely to the places that were touched: of others they say no more than that they may be anything.
+    /// Keeps the second variance at the touched places only. Elsewhere such fields are nearly unconstrained, so the
+    /// samples of the posterior replace them.
     fn rough_where_touched(mut self, touched: &[[f64; 2]]) -> Self {
         let at = |&[x, y]: &[f64; 2]| Point::new(x, y, 0.0);
         let near2 = (0.5 * spacing_mm(&self.places)).powi(2);
@@ -685,7 +710,8 @@ impl SampledForms {
         self
     }
 
-    /// Tells how well the smooth form is known. What is stated moves the part too, and so do motions at other places: neither is form.
+    /// Sets the standard uncertainty of the smooth form. The random effects also move the part, and so do motions at
+    /// other places. Neither is form, so in these cases the best fit is removed first.
     fn known_as(self, observed: &Observed) -> Self {
         let at_points = !self.chosen.is_empty();
         let smooth_sigma_mm = match at_points && observed.random_effects.ncols() == 0 {
@@ -695,12 +721,13 @@ impl SampledForms {
         Self { smooth_sigma_mm, ..self }
     }
 
-    /// Takes in what of the scatter is too narrow a form to be told from it.
+    /// Adds to the samples the share of the noise that is form too narrow to be resolved.
     ///
-    /// What a smooth form leaves of the observations is the scatter of the probe and, as far as it is more than that, form. That share of what is left at a point is form; how much more or less is as uncertain as
-    /// the scatter of the probe lets it be.
+    /// The residuals of a smooth form are the noise of the probe and, beyond that, form. This share of the residual at
+    /// a point is added. Its uncertainty follows from the noise of the probe.
     fn with_the_scatter(mut self, observed: &Observed, posterior: &Posterior, inputs: &ModelInputs) -> Self {
-        // Motions are left of the observations as well, and what is stated: neither is scatter. Between the touches the forms have all of their motions.
+        // The residuals also contain motions and random effects. Neither is noise. Between the touches the samples keep
+        // all of their motions.
         let seen = observed.subset(&self.chosen);
         let effects = seen.all_effects();
         let base = if effects.ncols() > 0 { effects.qr().q() } else { effects };
@@ -711,7 +738,8 @@ impl SampledForms {
             let free = posterior.degrees_of_freedom().max(1.0);
             for (c, mut form) in all.column_iter_mut().enumerate() {
                 let mut normals = Normals::new(7, c as u64);
-                // So few points may by chance have found less than the form has elsewhere: its variance is told like that of a sample.
+                // So few points can by chance show less than the form has elsewhere: a chi-squared number samples the
+                // variance.
                 let chi2: f64 = (0..free as usize).map(|_| normals.next().powi(2)).sum();
                 let larger = (found.len() as f64 / chi2.max(f64::MIN_POSITIVE)).sqrt().max(1.0);
                 let scatter_mm = self.scatter_mm[c];
@@ -741,7 +769,8 @@ impl SampledForms {
         self
     }
 
-    /// Adds what is too narrow to be told at places that were not touched: what the scatter is more than that of the probe, and short waves.
+    /// Adds form that is too narrow to be resolved to places that were not touched: the excess of the noise over that
+    /// of the probe, and short waves.
     fn with_what_is_narrow(mut self, inputs: &ModelInputs) -> Self {
         let Self { forms, scatter_mm, narrow_mm, .. } = &mut self;
         forms
@@ -762,10 +791,10 @@ impl SampledForms {
         }
     }
 
-    /// Takes off what was ground in: each column as often as a normal number says.
+    /// Subtracts the effects that are ground in: each column times a standard normal number.
     ///
-    /// A part that was corrected by what a machine found of it has the machine's errors as its form, d = (f - E t) + E t + e, and the points
-    /// show neither: t is as little known as before anything was measured.
+    /// A part that was corrected by a measurement has the errors of the machine as its form, d = (f - E t) + E t + e.
+    /// The points do not show t. It is as uncertain as before any measurement.
     fn without(mut self, ground_in: Option<&DMatrix<f64>>) -> Self {
         let Some(columns) = ground_in.filter(|columns| columns.ncols() > 0) else { return self };
         let take = |forms: &mut DMatrix<f64>, columns: &DMatrix<f64>| {
@@ -784,7 +813,7 @@ impl SampledForms {
         self
     }
 
-    /// Both, in the order of the points.
+    /// Joins the samples of both, in the order of the points.
     fn beside(self, other: Self) -> Self {
         let chosen = [&self.chosen[..], &other.chosen].concat();
         let mut order: Vec<usize> = (0..chosen.len()).collect();
@@ -808,7 +837,7 @@ impl SampledForms {
         }
     }
 
-    /// With what others found in the rows of the places that are nearest to theirs.
+    /// Replaces the rows of the places that are nearest to those of `other` by its rows.
     fn replaced_by(mut self, other: &Self) -> Self {
         let square = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2);
         for (r, place) in other.places.iter().enumerate() {
@@ -825,7 +854,7 @@ impl SampledForms {
         self
     }
 
-    /// Each form after its own best fit to the places.
+    /// Subtracts from each sample its own best fit to the places.
     fn after_best_fit(mut self) -> Self {
         if self.effects.ncols() == 0 {
             return self;
@@ -843,7 +872,8 @@ impl SampledForms {
         });
         if let Some(IntermediateForms { forms, effects, .. }) = &mut self.between {
             for (forms, taken) in forms.iter_mut().zip(&taken) {
-                // What the registration was free to do is seen by the points: the factor has an inverse.
+                // The points determine every motion that the registration was free to make, so the factor is
+                // invertible.
                 if let Some(moved) = upper.solve_upper_triangular(taken) {
                     *forms -= &*effects * moved;
                 }
@@ -864,19 +894,19 @@ impl SampledForms {
         self.places.iter().enumerate().map(of).collect()
     }
 
-    /// The RMS over all places of how well the smooth form is known.
+    /// Returns the RMS over all places of the standard uncertainty of the smooth form, in mm.
     fn known_mm(&self) -> f64 {
         let squares: f64 = self.smooth_sigma_mm.iter().map(|sigma| sigma * sigma).sum();
         (squares / self.smooth_sigma_mm.len().max(1) as f64).sqrt()
     }
 
-    /// The figures of each form at the places alone: RMS by the fields as they are, extremes by the others.
+    /// Returns the figures of each sample at the places alone: RMS by the first variance, extremes by the second.
     fn told_by(&self) -> Vec<[f64; 3]> {
         let [plain, other] = self.forms.each_ref().map(|forms| self.figures_of(forms, None));
         plain.iter().zip(&other).map(|([rms, ..], [_, pv, most])| [*rms, *pv, *most]).collect()
     }
 
-    /// The figures; where no form is seen they are known from above alone.
+    /// Returns the figures with their intervals. If no form is detectable, only upper bounds are given.
     fn figures(&self, is_seen: bool, [least, most]: [&[[f64; 3]]; 2], inputs: &ModelInputs) -> FormFigures {
         let [plain, rough] =
             [0, 1].map(|k| self.figures_of(&self.forms[k], self.between.as_ref().map(|of| &of.forms[0])));
@@ -890,7 +920,7 @@ impl SampledForms {
         FormFigures { rms: interval(0), pv: interval(1), pv_most_points: interval(2) }
     }
 
-    /// Root mean square, peak to valley, and that of the aperture, of each form.
+    /// Returns the root mean square, the peak to valley and that of the aperture for each sample.
     fn figures_of(&self, forms: &DMatrix<f64>, between: Option<&DMatrix<f64>>) -> Vec<[f64; 3]> {
         let rows = forms.nrows();
         let mut is_touched = vec![true; rows];
@@ -898,7 +928,7 @@ impl SampledForms {
         let of = |(c, form): (usize, &[f64])| {
             let squares: f64 = form.iter().map(|v| v * v).sum();
             let [low, high] = ends(form.iter().copied());
-            // The outermost of all places are left out, but none that was touched.
+            // The outermost of all places are left out, but never a touched place.
             let touched = form.iter().zip(&is_touched).filter_map(|(value, is)| is.then_some(*value));
             let mut others: Vec<f64> = self.untouched.iter().map(|&row| form[row]).collect();
             between.iter().for_each(|between| others.extend(between.column(c).iter()));
@@ -919,7 +949,7 @@ fn ends(of: impl Iterator<Item = f64>) -> [f64; 2] {
     of.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
 }
 
-/// Adds to every place of each form what is too narrow to be told there.
+/// Adds to every place of each sample form that is too narrow to be resolved.
 fn add_narrow(forms: &mut DMatrix<f64>, (scatter_mm, narrow_mm): (&[f64], &[f64]), inputs: &ModelInputs, stream: u64) {
     let rows = forms.nrows();
     let of = |(c, form): (usize, &mut [f64])| {
@@ -932,15 +962,15 @@ fn add_narrow(forms: &mut DMatrix<f64>, (scatter_mm, narrow_mm): (&[f64], &[f64]
     forms.as_mut_slice().par_chunks_mut(rows.max(1)).enumerate().for_each(of);
 }
 
-/// The scatter of the probe and what beside it is too narrow a form, each as it may be. Where nothing tells how
-/// far the probe scatters all of the scatter is its own.
+/// Samples the noise of the probe, and returns it with the standard deviation of the form that is too narrow. If the
+/// noise of the probe is unknown, all noise counts as the probe's.
 fn parted(scatter_mm: f64, narrow_mm: f64, inputs: &ModelInputs, normals: &mut Normals) -> [f64; 2] {
     let Some([probe_mm, probe_u]) = probe(inputs) else { return [scatter_mm, narrow_mm] };
     let own_mm = (probe_mm * (probe_u * normals.next()).exp()).min(scatter_mm);
     [own_mm, (scatter_mm.powi(2) - own_mm.powi(2)).max(0.0).sqrt().hypot(narrow_mm)]
 }
 
-/// Each form after its own best fit.
+/// Subtracts from each form its own best fit.
 fn best_fitted(mut forms: DMatrix<f64>, effects: &DMatrix<f64>) -> DMatrix<f64> {
     if effects.ncols() > 0 {
         let base = effects.clone().qr().q();
@@ -950,23 +980,25 @@ fn best_fitted(mut forms: DMatrix<f64>, effects: &DMatrix<f64>) -> DMatrix<f64> 
     forms
 }
 
-/// The standard deviation of each row.
+/// Returns the standard deviation of each row.
 fn spread_mm(forms: &DMatrix<f64>) -> Vec<f64> {
     forms.row_iter().map(|row| row.variance().sqrt()).collect()
 }
 
 impl Interval {
-    /// The probabilities of the quantiles by which a figure is recorded.
+    /// Probabilities of the quantiles that are recorded for a figure.
     pub const PROBABILITIES: [f64; 15] =
         [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999];
 
-    /// Returns the standard uncertainty: its width over that of a normal figure.
+    /// Returns the standard uncertainty: the width of the 95 % interval over that of a standard normal variable.
     pub fn standard_mm(&self) -> f64 {
         const WIDTH: f64 = 2.0 * 1.96;
         (self.high_mm - self.low_mm) / WIDTH
     }
 
-    /// Of values that are equally probable; from below by others where those are lower, from above by whichever of others are higher.
+    /// Builds the interval of equally probable values. Below the median each quantile is the lower of its own and that
+    /// of `lower`. Above the median it is the highest of its own and those of `higher`. Without `has_low`, the
+    /// quantiles below the median are 0.
     pub(super) fn of(
         mut values: Vec<f64>,
         (mut lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
@@ -1004,11 +1036,11 @@ impl Interval {
     }
 }
 
-/// The motions that the registration was free to make, about the middle of the points and in units of their size.
+/// Motions that the registration was free to make, about the centroid of the points and in units of their size.
 pub(super) struct Motions {
     centre: Point,
     size_mm: f64,
-    /// A column a motion.
+    /// One column for each motion.
     free: DMatrix<f64>,
 }
 
@@ -1026,7 +1058,7 @@ impl Motions {
         Self { centre, size_mm, free }
     }
 
-    /// Deviations of which the motions move them all.
+    /// Returns the observations of the used points, with the motions as fixed effects.
     pub(super) fn observed(&self, used: &[&Deviation]) -> Observed {
         Observed {
             places: used.iter().map(|d| [d.point.x, d.point.y]).collect(),
@@ -1037,7 +1069,10 @@ impl Motions {
         }
     }
 
-    /// What is stated of all points together, about their middle.
+    /// Returns the effects of machine and datum on all points together, about their centroid.
+    ///
+    /// # Errors
+    /// [`ModelError::Stated`] if a stated uncertainty is not valid.
     pub(super) fn stated(
         &self,
         registration: &Registration,
@@ -1052,7 +1087,7 @@ impl Motions {
         Ok(MachineEffects::new(inputs.machine, of_others, self.centre, model_from_machine).held(datum))
     }
 
-    /// What a unit of each motion adds to the distance of each point from the surface.
+    /// Returns the change of the distance of each point from the surface for a unit of each motion.
     pub(super) fn rows(&self, points: impl Iterator<Item = (Point, Vector)>) -> DMatrix<f64> {
         let rows: Vec<[f64; 6]> = points
             .map(|(point, normal)| {
@@ -1063,17 +1098,18 @@ impl Motions {
         DMatrix::from_fn(rows.len(), 6, |r, c| rows[r][c]) * &self.free
     }
 
-    /// The covariance of the twist about the origin, of that of the free motions.
+    /// Converts the covariance of the free motions to that of the twist about the origin.
     fn to_twist(&self, covariance: &DMatrix<f64>) -> Matrix6<f64> {
         let whole = &self.free * covariance * self.free.transpose();
         let whole = Matrix6::from_fn(|r, c| whole[(r, c)]);
-        // A motion is always one of a part that is there: the matrix has an inverse.
+        // The size is positive, so the matrix is invertible.
         let back = about(self.centre, self.size_mm).try_inverse().unwrap_or_else(Matrix6::identity);
         back * whole * back.transpose()
     }
 }
 
-/// Takes a twist about the origin to the motion of a centre and, in millimetres at the size, the turn about it.
+/// Returns the matrix that converts a twist about the origin to the motion of a centre and the turn about it, the
+/// latter in mm at the distance `size_mm`.
 fn about(centre: Point, size_mm: f64) -> Matrix6<f64> {
     let mut about = Matrix6::identity();
     // v + omega x c

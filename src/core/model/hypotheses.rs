@@ -1,16 +1,24 @@
-//! The fields that a form may be, over the points of a measurement: everything that does not depend on what was found there.
+//! Hypotheses of the field over the points of a measurement: everything that does not depend on the deviations.
 //!
 //! ```text
-//!  W d = W H b + W E t + W f + e        e of variance s^2, W takes off what a touch has of the scatter of the one before it
-//!  R K R = U diag(l) U'                 R = 1 - Q Q', Q an orthonormal base of W H; K of W f by the waves of one node
+//!  W d = W H b + W E t + W f + e        e of variance s^2; W subtracts what noise shares with the touch before
+//!  R K R = U diag(l) U'                 R = 1 - Q Q', Q an orthonormal base of W H; K: covariance of W f for one node
 //! ```
 //!
-//! A node is a smoothness and a range. After this one eigenproblem of it every strength is O(n): with v = U'R W d, the strength tau in
-//! variances of the scatter and l scaled so that tau is the square of the form's RMS after the best fit, -2 ln p = sum ln(1 + l tau) + (n - p) ln sum v^2 / (1 + l tau),
-//! the scatter integrated out with the density 1 / s^2.
+//! A node is one smoothness and one range. After one eigenproblem for the node, each variance ratio costs O(n):
 //!
-//! The waves are as many as can be told apart by the points, by a Cholesky factor with pivots of their products. A field has shorter ones too: those are as good
-//! as independent from point to point, and add to every l alike.
+//! ```text
+//!  v = U'R W d
+//!  -2 ln p = sum ln(1 + l tau) + (n - p) ln sum v^2 / (1 + l tau)
+//! ```
+//!
+//! Here tau is the variance ratio of field and noise. The eigenvalues l are scaled so that tau is the mean square of
+//! the form after the best fit, in units of the variance of the noise. The noise s is integrated out with the prior
+//! density 1 / s^2.
+//!
+//! Points up to [`MOST_WHOLE`] are used one by one. For more points, a pivoted Cholesky factor of the products of the
+//! basis functions keeps only what the points can distinguish. A field also has waves shorter than those of the basis.
+//! These are nearly independent from point to point, and add the same amount to every l.
 
 use std::f64::consts::LN_2;
 
@@ -23,33 +31,40 @@ use rayon::prelude::*;
 use super::basis::Basis;
 use super::{Anisotropy, ModelError, Observed, Smoothness, spacing_mm};
 
-/// Kinds of field, from rough to smooth.
+/// Smoothnesses of the hypotheses, from rough to smooth.
 pub(super) const KINDS: [Smoothness; 3] = [Smoothness::Never, Smoothness::Once, Smoothness::Endless];
-/// Ranges of each kind: so many, from so many distances of the points to so many sizes of the part.
+/// Number of ranges for each smoothness.
 const RANGES: usize = 9;
+/// Shortest range, in spacings of the points.
 const LEAST_RANGE: f64 = 2.5;
+/// Longest range, in sizes of the part (root mean square distance of the points from their centroid).
 const MOST_RANGE: f64 = 5.0;
-/// A range holds no less than so many of the half of the shortest wave.
+/// Shortest range, in half wavelengths of the shortest cosine.
 const WAVES_A_RANGE: f64 = 2.0;
-/// Strengths, in variances of the scatter: so many, in equal steps of their logarithm.
+/// Number of variance ratios (field to noise), in equal steps of their logarithm.
 const STRENGTHS: usize = 33;
+/// Lowest and highest variance ratio.
 const STRENGTH: [f64; 2] = [1e-3, 1e5];
-/// Waves at most, of few points and of many.
+/// Maximum number of cosines: for at most [`MOST_WHOLE`] points, and for more.
 const MOST_WAVES: [usize; 2] = [1000, 600];
-/// Waves a point, at least where the points are few.
+/// Number of cosines for each point, within the limits of the total number.
 const WAVES_A_POINT: f64 = 5.0;
+/// Minimum number of cosines.
 const FEWEST_WAVES: usize = 150;
-/// Points that are worked with one by one, at most; of more what their waves have in common.
+/// Maximum number of points that are used one by one. More points are reduced to the products of the basis functions.
 const MOST_WHOLE: usize = 600;
-/// Degree of the polynomials that many points are told by beside the waves. Few points take them for what wears a wheel or moves a part.
+/// Degree of the polynomials that are added to the cosines if there are more than [`MOST_WHOLE`] points. Few points
+/// cannot distinguish these polynomials from wheel wear or from a motion of the part.
 const DEGREE: usize = 4;
-/// A wave that has this share of the strongest adds nothing, nor what is told apart by this share of the variance.
+/// Relative limit of the standard deviation: a node drops the basis functions after the last one above this share of
+/// the largest.
 const NOTHING: f64 = 1e-4;
+/// Relative limit of the remaining variance: the factor stops at pivots below this share of the largest.
 const NOT_APART: f64 = 1e-5;
-/// Rows that are worked on at a time.
+/// Number of rows that are processed at a time.
 const ROWS: usize = 1024;
 
-/// How the scatter goes on from a point to the next one, and along what lay fields are wider.
+/// Correlation of the noise from one point to the next, and anisotropy of the field.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct NoiseKind {
     pub(super) lay: Anisotropy,
@@ -60,77 +75,80 @@ impl NoiseKind {
     pub(super) const PLAIN: Self = Self { lay: Anisotropy::NONE, autocorrelation: 0.0 };
 }
 
-/// Fields over the points of a measurement.
+/// Hypotheses of the field over the points of a measurement.
 pub(super) struct FieldHypotheses {
     pub(super) kind: NoiseKind,
     pub(super) basis: Basis,
     places: Vec<[f64; 2]>,
-    /// The shares of a point's row and of that of the point before that make its row beside a scatter that is independent.
+    /// Coefficients of the whitening: the factor of the point's own row, and that of the row before, which is
+    /// subtracted.
     whitening: Vec<[f64; 2]>,
-    /// Q.
+    /// Orthonormal base Q of the whitened fixed effects.
     base: DMatrix<f64>,
-    /// n - p.
+    /// Degrees of freedom n - p.
     pub(super) degrees_of_freedom: f64,
-    /// ln |W| - 1/2 ln |H'W'W H|: what makes likelihoods with a drift and without one those of the same points.
+    /// Term ln |W| - 1/2 ln |H'W'W H|, which makes likelihoods with and without noise autocorrelation comparable.
     pub(super) log_whitened: f64,
     reduced: Reduced,
-    /// Q'W phi: what the best fit takes of the waves.
+    /// Products Q'W phi: the part of the basis functions that the best fit removes.
     taken: Mat<f64>,
     pub(super) hypotheses: Vec<FieldHypothesis>,
 }
 
-/// What the waves are at the points, in as few coordinates as tell them apart.
+/// Basis functions at the points, in the smallest number of coordinates that distinguishes them.
 struct Reduced {
-    /// A row a coordinate, a column a wave.
+    /// One row for each coordinate, one column for each basis function.
     rows: Mat<f64>,
-    /// The waves by whose products the coordinates are made; none where each point is one.
+    /// Basis functions at the pivots that define the coordinates; None if each point is a coordinate.
     pivots: Option<Vec<usize>>,
 }
 
-/// A smoothness and a range.
+/// Node: one smoothness and one range, with the solution of its eigenproblem.
 pub(super) struct FieldHypothesis {
     pub(super) smoothness: Smoothness,
     pub(super) range_mm: f64,
-    /// Standard deviations of the first waves, in a field of strength 1.
+    /// Standard deviations of the coefficients of the first basis functions, in a field of variance 1.
     pub(super) standard_deviations: Vec<f64>,
-    /// The variance of a point that is in shorter waves.
+    /// Variance of a point in waves shorter than those of the basis, in a field of variance 1.
     pub(super) truncated_variance: f64,
-    /// What makes tau s^2 the variance of the field.
+    /// Factor by which tau s^2 is multiplied to give the variance of the field.
     pub(super) scale: f64,
-    /// Eigenvalues of the waves, unscaled, and U in the coordinates.
+    /// Eigenvalues l before scaling and without the truncated variance.
     pub(super) eigenvalues: Vec<f64>,
+    /// Eigenvectors U in the coordinates.
     pub(super) eigenvectors: Mat<f64>,
-    /// The logarithm of what is known of each strength beforehand.
+    /// Logarithm of the prior of each variance ratio.
     pub(super) prior: Vec<f64>,
 }
 
-/// All strengths.
+/// Returns all variance ratios, in ascending order.
 pub(super) fn variance_ratios() -> impl Iterator<Item = f64> {
     let [least, most] = STRENGTH.map(f64::ln);
     (0..STRENGTHS).map(move |k| (least + (most - least) * k as f64 / (STRENGTHS - 1) as f64).exp())
 }
 
 impl FieldHypotheses {
-    /// Lays the fields of every node over the points.
+    /// Solves the eigenproblem of every node over the points.
     ///
     /// # Errors
-    /// Rows that do not belong together, too few points, effects that cannot be told apart.
+    /// Inconsistent shapes, numbers that are not finite, too few points, or linearly dependent fixed effects.
     pub(super) fn over(observed: &Observed, kind: NoiseKind) -> Result<Self, ModelError> {
         let mut fields = Self::bare(observed, kind)?;
         let ranges_mm = fields.ranges_mm(RANGES);
-        // Rough fields hardly differ from one range to the next, and take longest.
+        // Rough fields hardly differ from one range to the next, and cost most: every second range is enough.
         let is_laid = |k: usize, smoothness: Smoothness| smoothness != Smoothness::Never || k.is_multiple_of(2);
         let all = ranges_mm.enumerate().flat_map(|(k, range_mm)| KINDS.map(|smoothness| (k, smoothness, range_mm)));
         let all: Vec<_> =
             all.filter(|of| is_laid(of.0, of.1)).map(|(_, smoothness, range_mm)| (smoothness, range_mm)).collect();
         fields.hypotheses = fields.laid(&all);
-        // One of two stands for both.
+        // Each rough node represents two ranges, so its prior doubles.
         let rough = fields.hypotheses.iter_mut().filter(|node| node.smoothness == Smoothness::Never);
         rough.for_each(|node| node.prior.iter_mut().for_each(|of| *of += LN_2));
         Ok(fields)
     }
 
-    /// So many ranges, in equal steps of their logarithm: from what the points and the waves tell apart to more than the part.
+    /// Returns `count` ranges in equal steps of their logarithm, from the shortest that the points and the basis
+    /// resolve to more than the size of the part.
     fn ranges_mm(&self, count: usize) -> impl Iterator<Item = f64> + use<> {
         let least_mm =
             (LEAST_RANGE * spacing_mm(&self.places)).max(WAVES_A_RANGE * self.basis.min_half_wavelength_mm());
@@ -139,7 +157,7 @@ impl FieldHypotheses {
         (0..count).map(move |k| least_mm * (ratio * k as f64).exp())
     }
 
-    /// Lays the fields of some nodes only.
+    /// Solves the eigenproblems of the given nodes only.
     #[cfg(test)]
     pub(super) fn of_nodes(
         observed: &Observed,
@@ -186,7 +204,7 @@ impl FieldHypotheses {
         Ok(fields)
     }
 
-    /// R W phi, point by point.
+    /// Computes R W phi with each point as a coordinate, and Q'W phi.
     fn whole(&self) -> (Reduced, Mat<f64>) {
         let mut rows = self.rows_of(0, self.places.len());
         let (n, p) = self.base.shape();
@@ -196,7 +214,8 @@ impl FieldHypotheses {
         (Reduced { rows, pivots: None }, taken)
     }
 
-    /// The products of the waves over all points, in a factor that ends where nothing more is told apart.
+    /// Computes the products of the basis functions over all points, with the best fit removed, and factorizes them
+    /// until the remaining variance is negligible. Also returns Q'W phi.
     fn reduced_by_products(&self) -> (Reduced, Mat<f64>) {
         let (n, p, count) = (self.places.len(), self.base.ncols(), self.basis.len());
         let of = |first: &usize| {
@@ -214,7 +233,7 @@ impl FieldHypotheses {
         (pivoted_cholesky(&products), taken)
     }
 
-    /// W phi of some of the points.
+    /// Computes W phi for the points from `first` up to, but not including, `until`.
     fn rows_of(&self, first: usize, until: usize) -> Mat<f64> {
         let before = first.saturating_sub(1);
         let waves = self.basis.at(&self.places[before..until]);
@@ -230,7 +249,8 @@ impl FieldHypotheses {
         rows
     }
 
-    /// R W of columns that have a row a point, in the coordinates, and the products of all pairs of them.
+    /// Projects columns with one row for each point: returns R W times the columns in the coordinates, and the products
+    /// of all pairs of the projected columns.
     pub(super) fn coordinates(&self, columns: &DMatrix<f64>) -> (Mat<f64>, DMatrix<f64>) {
         let mut columns = whitened(&self.whitening, columns);
         let taken = &self.base * self.base.tr_mul(&columns);
@@ -253,7 +273,7 @@ impl FieldHypotheses {
         (coordinates, products)
     }
 
-    /// The eigenproblem of a node; none where it has no field that the fit leaves.
+    /// Solves the eigenproblem of a node. Returns None if the best fit leaves no variance of the field.
     fn node(&self, smoothness: Smoothness, range_mm: f64) -> Option<FieldHypothesis> {
         let (mut strengths, narrow) = self.basis.standard_deviations(smoothness, range_mm);
         let least = NOTHING * strengths.iter().copied().fold(0.0, f64::max);
@@ -301,7 +321,8 @@ impl FieldHypotheses {
         })
     }
 
-    /// The coefficients of waves that coordinates make by a node: D R'.
+    /// Converts coordinates to coefficients of the basis functions for a node: D C' with C the rows of the coordinates
+    /// and D the standard deviations.
     pub(super) fn coefficients_from(&self, node: &FieldHypothesis, coordinates: &Mat<f64>) -> Mat<f64> {
         let c = node.standard_deviations.len();
         let mut coefficients = self.reduced.rows.subcols(0, c).transpose() * coordinates;
@@ -315,24 +336,25 @@ impl FieldHypotheses {
         coefficients
     }
 
-    /// The coordinates that coefficients of waves make by a node: R D.
+    /// Converts coefficients of the basis functions to coordinates for a node: C D.
     pub(super) fn coordinates_from(&self, node: &FieldHypothesis, coefficients: &Mat<f64>) -> Mat<f64> {
         let c = node.standard_deviations.len();
         let strong = Mat::from_fn(c, coefficients.ncols(), |r, k| node.standard_deviations[r] * coefficients[(r, k)]);
         self.reduced.rows.subcols(0, c) * &strong
     }
 
-    /// How many effects nobody knows.
+    /// Returns the number of fixed effects.
     pub(super) fn effects(&self) -> usize {
         self.base.ncols()
     }
 
-    /// What columns with a row a point are of the effects: Q'W of them.
+    /// Projects columns with one row for each point onto the fixed effects: Q'W times the columns.
     pub(super) fn of_effects(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         self.base.tr_mul(&whitened(&self.whitening, columns))
     }
 
-    /// The coordinates of a node's coefficients, R D, and behind them what the best fit takes of them, Q'W phi D.
+    /// Returns the rows C D, which convert a node's coefficients to coordinates, followed by the rows Q'W phi D, which
+    /// the best fit removes.
     pub(super) fn with_effects(&self, node: &FieldHypothesis) -> Mat<f64> {
         let (r, p) = (self.reduced.rows.nrows(), self.taken.nrows());
         Mat::from_fn(r + p, node.standard_deviations.len(), |k, wave| {
@@ -341,7 +363,8 @@ impl FieldHypotheses {
         })
     }
 
-    /// Sums over the points of each wave by some weights: a row a column of weights, a column a wave.
+    /// Sums each basis function over the points with the given weights: one row for each column of weights, one column
+    /// for each basis function.
     pub(super) fn sums(&self, weights: &DMatrix<f64>) -> DMatrix<f64> {
         let n = self.places.len();
         let of = |first: &usize| {
@@ -355,7 +378,7 @@ impl FieldHypotheses {
         DMatrix::from_fn(sums.nrows(), sums.ncols(), |r, c| sums[(r, c)])
     }
 
-    /// A field at the points, by the coefficients of its waves.
+    /// Evaluates the field with these coefficients at the points.
     pub(super) fn at_points(&self, coefficients: &[f64]) -> Vec<f64> {
         let column = Mat::from_fn(coefficients.len(), 1, |r, _| coefficients[r]);
         let of = |places: &[[f64; 2]]| (self.basis.at(places) * &column).col_as_slice(0).to_vec();
@@ -363,8 +386,11 @@ impl FieldHypotheses {
     }
 }
 
-/// The logarithm of J / (1 + J) of every strength: J^2 is Fisher's information on ln tau with the scatter unknown,
-/// (sum q^2 - (sum q)^2 / (n - p)) / 2 with q = l tau / (1 + l tau). What cannot be told from scatter has none, and it saturates at one wave seen.
+/// Returns the logarithm of J / (1 + J) for every variance ratio.
+///
+/// J^2 is the Fisher information on ln tau with the noise unknown: (sum q^2 - (sum q)^2 / (n - p)) / 2 with
+/// q = l tau / (1 + l tau). A field that cannot be distinguished from noise has no information. The prior saturates
+/// once the points determine about one coefficient.
 fn log_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
     let of = |tau: f64| {
         let share = |l: f64| l * tau / (1.0 + l * tau);
@@ -382,7 +408,7 @@ fn log_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
     variance_ratios().map(of).collect()
 }
 
-/// Adds the lower triangle of rows' rows.
+/// Adds the lower triangle of rows' rows to the products.
 fn lower_product(products: &mut Mat<f64>, rows: &Mat<f64>) {
     triangular::matmul(
         products.as_mut(),
@@ -397,14 +423,14 @@ fn lower_product(products: &mut Mat<f64>, rows: &Mat<f64>) {
     );
 }
 
-/// A Cholesky factor with pivots of what has its lower triangle given.
+/// Returns the pivoted Cholesky factor of a matrix that is given by its lower triangle.
 fn pivoted_cholesky(products: &Mat<f64>) -> Reduced {
     let count = products.nrows();
     let at = |a: usize, b: usize| if a >= b { products[(a, b)] } else { products[(b, a)] };
     let mut left: Vec<f64> = (0..count).map(|k| products[(k, k)]).collect();
     let most = left.iter().copied().fold(0.0, f64::max);
     let mut pivots = Vec::new();
-    // Columns of the factor, which are rows of the coordinates.
+    // The columns of the factor are the rows of the coordinates.
     let mut rows: Vec<Vec<f64>> = Vec::new();
     while pivots.len() < count {
         let pivot = (0..count).fold(0, |best, k| if left[k] > left[best] { k } else { best });
@@ -428,7 +454,8 @@ fn pivoted_cholesky(products: &Mat<f64>) -> Reduced {
     Reduced { rows: Mat::from_fn(rows.len(), count, |r, c| rows[r][c]), pivots: Some(pivots) }
 }
 
-/// How much of each point's row and of that before it makes one whose scatter is independent and has the same variance.
+/// Returns the whitening: for each point the factors of its own row and of the row before. The whitened noise is
+/// independent and has the same variance.
 fn whitening(path: &[f64], points: usize, drift: f64) -> Vec<[f64; 2]> {
     if drift == 0.0 || path.is_empty() {
         return vec![[1.0, 0.0]; points];
@@ -448,7 +475,7 @@ fn whitened(whitening: &[[f64; 2]], columns: &DMatrix<f64>) -> DMatrix<f64> {
     })
 }
 
-/// The root mean square distance of places from their middle.
+/// Returns the root mean square distance of the places from their centroid, in mm.
 pub(super) fn size_mm(places: &[[f64; 2]]) -> f64 {
     let n = places.len() as f64;
     let middle = [0, 1].map(|axis| places.iter().map(|place| place[axis]).sum::<f64>() / n);

@@ -1,47 +1,52 @@
-//! The model as it grows: points come one batch after another, and what is known at a set of places is brought up to date with each.
+//! Incremental posterior of the model: points arrive in batches, and each batch updates the posterior at a fixed set of
+//! places.
 //!
-//! The factor L of the covariance of all points told so far is bordered row by row, and with it A = L^-1 k(points, places):
+//! The Cholesky factor L of the covariance of all points so far gets a new row for each point, and so does A = L^-1
+//! k(points, places). For a point at x with the deviation z, and v the whitened deviations before it:
 //!
 //! ```text
 //!  l = L^-1 k(points, x)      d^2 = k(x, x) + s^2 - l'l      a = (k(x, places) - l'A) / d      w = (z - l'v) / d
 //!  mean += w a                variance -= a^2
 //! ```
 //!
-//! A further point costs as much as points are known times places are asked for, and nothing is ever solved anew. Effects that nobody knows are part of the
-//! covariance with a variance beyond all that is measured: what is told of a place is the field and the effects together.
+//! The cost of a further point is the number of points so far times the number of places; no system is solved again.
+//! Fixed effects are part of the covariance, with a variance far beyond all measured values. The prediction at a place
+//! is the sum of field and effects.
 
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
 use super::{Hyperparameters, ModelError, Observed, Prediction};
 
-/// Standard deviation of an effect that nobody knows, in units of the field: more would drown the field in rounding.
+/// Standard deviation of a fixed effect, in units of that of the field. A larger value would lose the field in rounding
+/// errors.
 const VAGUE: f64 = 1e3;
-/// Places that are worked on at a time: so many, beside some hundred points, stay near the processor.
+/// Number of places that are processed at a time: with some hundred points, their data stay in the processor's cache.
 const BLOCK: usize = 256;
 
-/// A model that takes points in, and knows at every place of a set what it says there.
+/// Posterior at a fixed set of places, which is updated as points arrive.
 #[derive(Clone)]
 pub struct IncrementalPosterior {
     hyperparameters: Hyperparameters,
     places: Vec<[f64; 2]>,
     effects: DMatrix<f64>,
-    /// Where points were told, what effects move them by, and L row by row.
+    /// Places of the observed points, their rows of effects, and the rows of L.
     told: Vec<[f64; 2]>,
     moved: Vec<Vec<f64>>,
     lower: Vec<Vec<f64>>,
-    /// L^-1 of the deviations.
+    /// L^-1 times the deviations.
     whitened: Vec<f64>,
     blocks: Vec<Block>,
 }
 
-/// Effects that nobody knows, and beside them those that are stated: all have the same variance, so that these are as much smaller.
+/// Returns the columns of the fixed effects, followed by those of the random effects. All columns have the same prior
+/// variance, so the random effects are scaled down to a variance of 1.
 fn scaled_effects(effects: &DMatrix<f64>, stated: &DMatrix<f64>, hyperparameters: &Hyperparameters) -> DMatrix<f64> {
     if stated.ncols() == 0 {
         return effects.clone();
     }
     let (p, smaller) = (effects.ncols(), 1.0 / (VAGUE * hyperparameters.field.sigma_mm));
-    // Rows that do not belong together are told of by who takes them.
+    // If the numbers of rows differ, the result has no rows, and the caller reports the wrong shape.
     let rows = if stated.nrows() == effects.nrows() { effects.nrows() } else { 0 };
     DMatrix::from_fn(
         rows,
@@ -50,23 +55,23 @@ fn scaled_effects(effects: &DMatrix<f64>, stated: &DMatrix<f64>, hyperparameters
     )
 }
 
-/// Some of the places.
+/// Block of consecutive places.
 #[derive(Clone)]
 struct Block {
     first: usize,
     mean_mm: Vec<f64>,
     variance_mm2: Vec<f64>,
-    /// A, a row a point.
+    /// Part of A: a row per point, a column per place of the block.
     across: Vec<Vec<f64>>,
 }
 
 impl IncrementalPosterior {
-    /// Asks for some places before anything is told of them.
+    /// Creates the prior at `places`, before any point is observed.
     ///
-    /// `effects` has a row a place: what a unit of each effect adds there.
+    /// `effects` has a row per place: the deviation there per unit of each fixed effect.
     ///
     /// # Errors
-    /// Rows that do not belong together, numbers that are none, parameters that are not above 0.
+    /// Returns an error if the numbers of rows differ, a number is not finite, or a hyperparameter is not above 0.
     pub fn over(
         places: Vec<[f64; 2]>,
         effects: DMatrix<f64>,
@@ -76,7 +81,7 @@ impl IncrementalPosterior {
         Self::with_random_effects(places, effects, &stated, hyperparameters)
     }
 
-    /// The same with effects that are stated, of variance 1.
+    /// Creates the prior like [`Self::over`], with further random effects of variance 1, a row per place.
     pub(super) fn with_random_effects(
         places: Vec<[f64; 2]>,
         effects: DMatrix<f64>,
@@ -116,10 +121,11 @@ impl IncrementalPosterior {
         Ok(growing)
     }
 
-    /// Takes points in.
+    /// Conditions the model on further points.
     ///
     /// # Errors
-    /// Rows that do not belong together, and numbers that are none; nothing is taken in then.
+    /// Returns an error if the numbers of rows or columns differ or a number is not finite. No point is added in these
+    /// cases.
     pub fn update(&mut self, observed: &Observed) -> Result<(), ModelError> {
         let Observed { places, deviations_mm, .. } = observed;
         let effects = scaled_effects(&observed.fixed_effects, &observed.random_effects, &self.hyperparameters);
@@ -141,11 +147,12 @@ impl IncrementalPosterior {
         Ok(())
     }
 
-    /// Takes in that some of the places will be touched: what will be found there is not known, and how well it will be known does not
-    /// depend on it (hallucinated updates, Desautels, Krause and Burdick 2014).
+    /// Conditions the model on a future touch at the place with index `place`. The touch gets the expected deviation:
+    /// this leaves the mean unchanged, and the variance does not depend on the value that the touch will find
+    /// (hallucinated updates, Desautels, Krause and Burdick 2014).
     ///
     /// # Errors
-    /// Parameters by which nothing can be told apart.
+    /// Returns [`ModelError::NotDefinite`] if the new diagonal element of the factor is not finite and above 0.
     pub fn update_with_expected(&mut self, place: usize) -> Result<(), ModelError> {
         let known = self.told.len();
         let row = self.row(place);
@@ -155,19 +162,21 @@ impl IncrementalPosterior {
         Ok(())
     }
 
-    /// Returns what is known at each place, the effects in it.
+    /// Returns the prediction at each place, in the order of [`Self::places`]: mean and standard deviation of field and
+    /// effects together.
     pub fn predictions(&self) -> impl Iterator<Item = Prediction> + '_ {
         let of =
             |(mean_mm, variance): (&f64, &f64)| Prediction { mean_mm: *mean_mm, sigma_mm: variance.max(0.0).sqrt() };
         self.blocks.iter().flat_map(move |block| block.mean_mm.iter().zip(&block.variance_mm2).map(of))
     }
 
-    /// Returns where is asked.
+    /// Returns the places of the predictions.
     pub fn places(&self) -> &[[f64; 2]] {
         &self.places
     }
 
-    /// Says by how many standard deviations of what was expected each of some points is off, the scatter of the probe among them.
+    /// Computes the standardized innovation of each point: its deviation minus the predicted mean, divided by the
+    /// predicted standard deviation, which includes the noise of the probe.
     pub fn standardized_innovations(&self, observed: &Observed) -> Vec<f64> {
         let Observed { places, deviations_mm, .. } = observed;
         let effects = scaled_effects(&observed.fixed_effects, &observed.random_effects, &self.hyperparameters);
@@ -192,7 +201,7 @@ impl IncrementalPosterior {
             + (VAGUE * self.hyperparameters.field.sigma_mm).powi(2) * effects
     }
 
-    /// L^-1 of the covariances of a place with all points.
+    /// Returns L^-1 times the covariances of a place with all observed points.
     fn solved(&self, place: [f64; 2], row: &[f64]) -> Vec<f64> {
         let mut l: Vec<f64> = Vec::with_capacity(self.told.len());
         let pairs = self.hyperparameters.field.pairs();
@@ -210,12 +219,12 @@ impl IncrementalPosterior {
         self.solved(place, row).iter().zip(&self.whitened).map(|(l, w)| l * w).sum()
     }
 
-    /// Adds a row to the factor.
+    /// Adds the row of one point to the factor L.
     fn border(&mut self, place: [f64; 2], row: Vec<f64>, deviation_mm: f64) -> Result<(), ModelError> {
         let mut l = self.solved(place, &row);
         let own = self.covariance_mm2((place, &row), (place, &row)) + self.hyperparameters.noise_sigma_mm.powi(2);
         let left = own - l.iter().map(|l| l * l).sum::<f64>();
-        // Less than the scatter itself is rounding.
+        // A variance below that of the noise is rounding error.
         let d = left.max(self.hyperparameters.noise_sigma_mm.powi(2)).sqrt();
         if !(d.is_finite() && d > 0.0) {
             return Err(ModelError::NotDefinite);
@@ -229,7 +238,7 @@ impl IncrementalPosterior {
         Ok(())
     }
 
-    /// Carries the points from one on to all places.
+    /// Updates mean and variance at all places with the points from index `from` on.
     fn carry(&mut self, from: usize) {
         let Self { hyperparameters, places, effects, told, moved, lower, whitened, blocks } = self;
         let vague = (VAGUE * hyperparameters.field.sigma_mm).powi(2);
@@ -326,7 +335,7 @@ mod tests {
         let imagined: Vec<Prediction> = growing.predictions().collect();
         assert!(before.iter().zip(&imagined).all(|(a, b)| (a.mean_mm - b.mean_mm).abs() < 1e-12));
         assert!(imagined[77].sigma_mm < HYPER.noise_sigma_mm && imagined[77].sigma_mm < 0.9 * before[77].sigma_mm);
-        // Touched in truth, and found to be elsewhere.
+        // A real touch at the same place finds a different deviation.
         let mut touched = grown(&observed, &[60]);
         let effects = DMatrix::from_row_slice(1, 3, &[1.0, place[0] / 30.0, place[1] / 30.0]);
         touched
@@ -357,7 +366,8 @@ mod tests {
             IncrementalPosterior::with_random_effects(place.clone(), DMatrix::zeros(1, 0), &stated, hyperparameters)
                 .unwrap();
         growing.update(&Observed { random_effects: stated, ..Observed::without_effects(place, vec![3.0]) }).unwrap();
-        // Field and effect together: 4 + 2.25, of which a point with a scatter of 0.25 was told.
+        // The prior variance of field and effect together is 4 + 2.25; the noise variance of the observed point is
+        // 0.25.
         let told = growing.predictions().next().unwrap();
         assert!((told.mean_mm - 6.25 / 6.5 * 3.0).abs() < 1e-12, "{told:?}");
         assert!((told.sigma_mm.powi(2) - (6.25 - 6.25 * 6.25 / 6.5)).abs() < 1e-12, "{told:?}");

@@ -1,6 +1,7 @@
-//! Places between the touched ones: the nodes of a grid that have touched places near them all around.
+//! Places between the touched ones: those nodes of a grid that touched places surround.
 //!
-//! A place that has none within [`FARTHEST`] distances of the points on some side is one that nobody touched, or beyond the edge.
+//! A node without a touched place within [`FARTHEST`] spacings of the points on some side lies in an untouched area, or
+//! beyond the edge.
 
 use nalgebra::DMatrix;
 
@@ -8,27 +9,27 @@ use super::basis::{Basis, BasisGrid};
 use super::spacing_mm;
 use crate::geometry::{Nearest, Point};
 
-/// Places at most, and at least so many along the distance of two points.
+/// Maximum number of grid points, and grid points per spacing of the touched points where that maximum allows it.
 const MOST: f64 = 3000.0;
 const A_DISTANCE: f64 = 2.0;
-/// Degree of the polynomials that tell a smooth column between the points, at most.
+/// Maximum degree of the polynomials that interpolate a smooth column between the points.
 const MOST_DEGREE: usize = 9;
-/// Distances of the points within which touched places lie all around.
+/// Distance, in spacings of the points, within which touched places must surround a node.
 const FARTHEST: f64 = 2.5;
 
 /// Nodes of a grid, each between touched places.
 pub(super) struct IntermediateNodes {
     pub(super) grid: BasisGrid,
-    /// The number of each on the grid, column by column.
+    /// Index of each node on the grid, with x as the fastest.
     pub(super) nodes: Vec<usize>,
-    /// Touched places beside each, and how much it has of each.
+    /// Indices of three touched places near each node, and their weights.
     corners: Vec<([usize; 3], [f64; 3])>,
     /// Polynomials at the touched places and at the nodes.
     terms: [DMatrix<f64>; 2],
 }
 
 impl IntermediateNodes {
-    /// Lays a grid along the axes of some waves; none where it would hold no place.
+    /// Lays a grid along the axes of some waves; returns `None` if it would have no node.
     pub(super) fn of(places: &[[f64; 2]], waves: &Basis) -> Option<Self> {
         let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.rotated(place)).collect();
         let distance_mm = spacing_mm(&places);
@@ -61,9 +62,11 @@ impl IntermediateNodes {
         Some(Self { grid, nodes, corners, terms })
     }
 
-    /// Columns with a row a touched place, as they are at the nodes: polynomials, and of what these leave as much as the places beside it have.
+    /// Interpolates columns with a row per touched place to the nodes: by a fit of polynomials, and by weighted means
+    /// of its residuals at the nearby touched places.
     ///
-    /// Motions of a curved part are taken off forms that may be thousands of times larger: straight lines alone would leave some of that.
+    /// The polynomials are needed for the motions of a curved part, which are removed from forms that can be thousands
+    /// of times larger: linear interpolation alone would leave a part of that.
     pub(super) fn rows(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let [at_points, at_nodes] = &self.terms;
         let factor = at_points.clone().qr();
@@ -78,13 +81,14 @@ impl IntermediateNodes {
     }
 }
 
-/// Returns three of the nearest touched places and how much a place has of each, where those that are near lie all around it.
+/// Returns the three nearest touched places and their weights; `None` if touched places within `near_mm` do not
+/// surround the place.
 fn beside(at: [f64; 2], places: &[[f64; 2]], tree: &Nearest, near_mm: f64) -> Option<([usize; 3], [f64; 3])> {
     const ASKED: u32 = 12;
     let near: Vec<(usize, f64)> = tree.to(&Point::new(at[0], at[1], 0.0), ASKED).collect();
     let mut angles: Vec<f64> = Vec::new();
     for (k, square) in &near {
-        // A touched place is its own.
+        // The place is itself a touched one.
         if *square < 1e-12 * near_mm * near_mm {
             return Some(([*k; 3], [1.0, 0.0, 0.0]));
         }
@@ -102,7 +106,7 @@ fn beside(at: [f64; 2], places: &[[f64; 2]], tree: &Nearest, near_mm: f64) -> Op
     Some(([0, 1, 2].map(|k| near[k].0), [0, 1, 2].map(|k| near[k].1.recip() / whole)))
 }
 
-/// Products of Chebyshev's polynomials up to a degree over a rectangle: a row a place.
+/// Evaluates products of Chebyshev polynomials up to a total degree over a rectangle: a row per place.
 fn polynomials(places: &[[f64; 2]], spans: [[f64; 2]; 2], degree: usize) -> DMatrix<f64> {
     let orders: Vec<[usize; 2]> = (0..=degree).flat_map(|a| (0..=degree - a).map(move |b| [a, b])).collect();
     let along = |place: &[f64; 2], axis: usize| {
@@ -151,7 +155,7 @@ mod tests {
             let at = |k: usize, axis: usize| between.grid.corner_mm[axis] + between.grid.spacing_mm * k as f64;
             (rows[(r, 0)] - bent(at(i, 0), at(j, 1))).abs()
         });
-        // Between two places straight lines would be off by 4^2 / 8 0.03^2, some 2e-3.
+        // Linear interpolation between two places would be wrong by 4^2 / 8 * 0.03^2, about 2e-3.
         let most = off.fold(0.0, f64::max);
         assert!(most < 1e-6, "{most}");
     }

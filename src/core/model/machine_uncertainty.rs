@@ -1,54 +1,55 @@
-//! What adds to all points together, and no point can show: the machine's scales, its angles, its probe, and where a fixture holds the part.
+//! Random effects common to all points, which no point can show: the machine's scales, its angles, its probe, and the
+//! position in which a fixture holds the part.
 //!
-//! Each is an effect on the deviations whose size nobody knows but whose standard uncertainty somebody states: a column of E, scaled so that its
-//! factor has the variance 1. The covariance of what was measured is K + s^2 R + E E', and the form is the field alone. So an error of the machine is
-//! in the figures once, where it was measured, and is not added to them again.
+//! Each is an effect on the deviations of unknown size with a stated standard uncertainty: a column of E, scaled so
+//! that its factor has the variance 1. The covariance of the deviations is K + s^2 R + E E', and the form is the field
+//! alone. So an error of the machine enters the figures once, in the measurement, and is not added to them again.
 
 use nalgebra::{DMatrix, Matrix3};
 
 use crate::geometry::{Point, Vector};
 
-/// Standard uncertainties of what a measuring machine does to all points together; 0 where nothing is stated.
+/// Standard uncertainties of a measuring machine's effects that are common to all points; 0 where nothing is stated.
 ///
 /// Frame: the axes are those of the machine {W}.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct MachineUncertainty {
-    /// Of the length of each axis, as a share of it.
+    /// Relative standard uncertainty of the length of each axis.
     pub scale: [f64; 3],
-    /// Of the angles xy, xz and yz between the axes beside a right one.
+    /// Standard uncertainty of the deviations of the angles xy, xz and yz between the axes from a right angle.
     pub squareness_rad: [f64; 3],
-    /// Of the error of the probe in any one direction, beside its radius.
+    /// Standard uncertainty of the probe's error in any one direction, without that of its radius.
     pub probe_mm: f64,
-    /// Of the radius of the sphere that the probe is qualified on.
+    /// Standard uncertainty of the radius of the reference sphere on which the probe is qualified.
     pub reference_sphere_mm: f64,
 }
 
-/// What a part of an uncertainty comes from.
+/// Source of a part of an uncertainty.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum UncertaintySource {
-    /// Each touch by itself.
+    /// Noise of each touch.
     Scatter,
-    /// The form between the touches, and below their scatter.
+    /// Form between the touches, and form that is smaller than their noise.
     Form,
-    /// Where the part lies.
+    /// Pose of the part.
     Pose,
-    /// The radius of the probe as it was found, and that of the sphere on which.
+    /// Radius of the probe from its qualification, and radius of the reference sphere used for it.
     Radius,
-    /// The scales of the machine.
+    /// Scales of the machine's axes.
     Scales,
-    /// Its angles.
+    /// Angles between the machine's axes.
     Squareness,
-    /// The probe by direction.
+    /// Error of the probe by direction.
     Probe,
-    /// Temperature and expansion.
+    /// Temperature and thermal expansion.
     Temperature,
-    /// Where the part was held, in directions that the registration was not free to move it in.
+    /// Position of the part in its fixture, in directions that were locked in the registration.
     Datum,
 }
 
 impl UncertaintySource {
-    /// All of them, as they are told.
+    /// All sources, in the order in which they are reported.
     pub const ALL: [Self; 9] = [
         Self::Scatter,
         Self::Form,
@@ -62,7 +63,7 @@ impl UncertaintySource {
     ];
 }
 
-/// What is stated of all points together, as far as it is above 0.
+/// Random effects common to all points, as far as their standard uncertainty is above 0.
 #[derive(Clone, Debug)]
 pub(super) struct MachineEffects {
     machine: MachineUncertainty,
@@ -74,7 +75,8 @@ pub(super) struct MachineEffects {
 }
 
 impl MachineEffects {
-    /// `radius_mm` is the standard uncertainty of the radius of the probe as it was found, `temperature` that of all lengths as a share of them.
+    /// Creates the effects of the machine. `radius_mm` is the standard uncertainty of the probe's radius from its
+    /// qualification, `temperature` the relative standard uncertainty of all lengths.
     pub(super) fn new(
         machine: MachineUncertainty,
         [radius_mm, temperature]: [f64; 2],
@@ -85,17 +87,19 @@ impl MachineEffects {
         Self { machine, radius_mm, temperature, datum: [0.0; 6], centre, model_from_machine }
     }
 
-    /// Beside them those of where the part was held: along the axes of the model, and of the turns about them through the middle.
+    /// Adds the effects of the fixture: standard uncertainties of the shifts along the axes of the model, in mm, and of
+    /// the rotations about these axes through the centre, in rad.
     pub(super) fn held(self, datum: [f64; 6]) -> Self {
         Self { datum, ..self }
     }
 
-    /// Which columns there are.
+    /// Returns the source of each column.
     pub(super) fn sources(&self) -> Vec<UncertaintySource> {
         self.all().into_iter().map(|(source, _)| source).collect()
     }
 
-    /// What one standard uncertainty of each adds to the distance of each point from the surface: a row a point.
+    /// Returns the change of each point's deviation from the surface per standard uncertainty of each effect: a row per
+    /// point, a column per effect. Points and normals are in the model frame.
     pub(super) fn columns(&self, points: impl Iterator<Item = (Point, Vector)>) -> DMatrix<f64> {
         let all = self.all();
         let to_machine = self.model_from_machine.transpose();
@@ -128,18 +132,18 @@ impl MachineEffects {
 /// One effect, with its standard uncertainty.
 #[derive(Clone, Copy, Debug)]
 enum Effect {
-    /// Along the normal, everywhere alike.
+    /// Shift along the normal, the same everywhere.
     Radius(f64),
-    /// All lengths by a share.
+    /// Relative change of all lengths.
     Size(f64),
-    /// The first axis, in proportion to where a point is on the second.
+    /// Shift along the first axis, in proportion to the position along the second.
     Stretch([usize; 2], f64),
-    /// One of the five spherical harmonics of degree 2 of the normal. Those of degree 1 are shifts of the part. Scaled so that the sum of their
-    /// squares is 1 in every direction.
+    /// One of the five spherical harmonics of degree 2 of the normal. Those of degree 1 are shifts of the part. The
+    /// scale makes the sum of their squares 1 in every direction.
     Direction(usize, f64),
-    /// The whole part along an axis.
+    /// Shift of the whole part along an axis.
     Shift(Vector, f64),
-    /// The whole part about an axis through the middle.
+    /// Rotation of the whole part about an axis through the centre.
     Turn(Vector, f64),
 }
 
@@ -155,7 +159,8 @@ impl Effect {
         }
     }
 
-    /// What it adds at a place, by where that is beside the middle and by the normal, both in the frame of the machine.
+    /// Returns the deviation per standard uncertainty at a point, in mm. `arm` is its position from the centre, `n` its
+    /// normal; both are in the machine frame.
     fn on(&self, arm: Vector, n: Vector) -> f64 {
         let root = 3.0_f64.sqrt();
         let of_unit = match *self {
@@ -174,13 +179,15 @@ impl Effect {
     }
 }
 
-/// Says what no standard uncertainty can be: what is negative, none, or beyond all sense.
+/// Returns name and value of the first standard uncertainty that is impossible: negative, not a number, or beyond the
+/// limit of any real machine or fixture.
 pub(super) fn unsound(
     machine: &MachineUncertainty,
     [radius_mm, temperature]: [f64; 2],
     datum: &[f64; 6],
 ) -> Option<(&'static str, f64)> {
-    // More than a tenth of all lengths, than six degrees, than a centimetre, is no measuring machine, and more than a turn no fixture.
+    // Limits: a tenth of all lengths, six degrees and a centimetre for a measuring machine, more than a full turn for a
+    // fixture.
     let shares = machine.scale.map(|of| ("scale", of, 0.1)).into_iter();
     let angles = machine.squareness_rad.map(|of| ("squareness", of, 0.1)).into_iter();
     let others = [
@@ -215,7 +222,7 @@ mod tests {
             reference_sphere_mm: 4e-4,
         };
         let of = effects(machine, [3e-4, 1e-5]);
-        // 10, 20, 30 beside the middle, on a normal of 0.6 and 0.8.
+        // The point is at (10, 20, 30) from the centre, with the normal (0.6, 0, 0.8).
         let row = of.columns(std::iter::once((Point::new(11.0, 22.0, 33.0), Vector::new(0.6, 0.0, 0.8))));
         let root = 3.0_f64.sqrt();
         let by_hand = [
@@ -259,7 +266,7 @@ mod tests {
 
     #[test]
     fn the_axes_are_those_of_the_machine() {
-        // Its x axis is the model's y.
+        // The machine's x axis is the model's y axis.
         let turned = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
         let machine = MachineUncertainty { scale: [1e-6, 0.0, 0.0], ..MachineUncertainty::default() };
         let of = MachineEffects::new(machine, [0.0; 2], Point::origin(), turned);
@@ -269,7 +276,7 @@ mod tests {
 
     #[test]
     fn a_part_that_is_held_elsewhere_shows_as_its_motion_along_the_axes_of_the_model() {
-        // The machine's x axis is the model's y, its y axis the model's -x.
+        // The machine's x axis is the model's y axis, its y axis the model's -x axis.
         let turned = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
         let centre = Point::new(1.0, 2.0, 3.0);
         let of = MachineEffects::new(MachineUncertainty::default(), [0.0; 2], centre, turned)

@@ -1,28 +1,30 @@
-//! The correlation of a field at a distance, by its smoothness.
+//! Correlation of a field over the distance, by its smoothness.
 //!
-//! Matern's of smoothness nu is M(x) = 2^(1 - nu) x^nu K_nu(x) / Gamma(nu) with x = kappa r, kappa = sqrt(8 nu) / range: exp(-x) of nu = 1/2, and
-//! x^2 K_2(x) / 2. At one range it has fallen to 0.14, and without end of nu it is exp(-2 (r / range)^2). K_2 is the modified
-//! Bessel function of the second kind; its integral over exp(-x cosh t) cosh(2 t) is summed once at equal steps of x, and read by cubics
-//! between them: within 1e-10.
+//! The Matern correlation of smoothness nu is M(x) = 2^(1 - nu) x^nu K_nu(x) / Gamma(nu) with x = kappa r and kappa =
+//! sqrt(8 nu) / range. It is exp(-x) for nu = 1/2, and x^2 K_2(x) / 2 for nu = 2. At a distance of one range it has
+//! fallen to 0.14. In the limit of large nu it is exp(-2 (r / range)^2).
+//!
+//! K_2 is the modified Bessel function of the second kind. Its integral over exp(-x cosh t) cosh(2 t) is summed once at
+//! equal steps of x. Between these steps, cubics interpolate within 1e-10.
 
 use std::sync::OnceLock;
 
 use super::Smoothness;
 
-/// Steps of the table in 1, and where it ends: both are below 1e-14 there.
+/// Steps of the table per unit of x, and its last x: the correlation and its slope are below 1e-14 there.
 const STEPS: usize = 256;
 const LAST: usize = 45;
 const STEPS_A_RANGE: f64 = 4.0 * STEPS as f64;
 
-/// A table of the correlation and its slope.
+/// Table of the correlation and its slope.
 type Table = OnceLock<Vec<[f64; 2]>>;
 
-/// The correlation over the distance: of one smoothness, the same for every pair of places.
+/// Correlation over the distance for one smoothness, the same for every pair of places.
 #[derive(Clone, Copy)]
 pub(super) struct Curve {
-    /// The steps in which the correlation is read; none where it is an exponential.
+    /// Table from which the correlation is interpolated; `None` if it is an exponential.
     table: Option<&'static [[f64; 2]]>,
-    /// Whether the exponential is one of the distance, not of its square.
+    /// True if the exponential is one of the distance, not of its square.
     is_rough: bool,
 }
 
@@ -32,7 +34,7 @@ impl Curve {
         Self { table: (smoothness == Smoothness::Once).then(|| read(&ONCE)), is_rough: smoothness == Smoothness::Never }
     }
 
-    /// Returns the correlation at a distance in ranges, by its square.
+    /// Returns the correlation at a distance; the argument is the square of the distance divided by the range.
     #[inline]
     pub(super) fn at(&self, ranges2: f64) -> f64 {
         let Some(table) = self.table else {
@@ -52,7 +54,7 @@ fn read(table: &'static Table) -> &'static [[f64; 2]] {
     table.get_or_init(|| (0..=LAST * STEPS).map(|k| exact(k as f64 / STEPS as f64)).collect())
 }
 
-/// The correlation of nu = 2 and its slope, M' = -x^2 K_1(x) / 2.
+/// Computes the correlation for nu = 2 and its slope, M' = -x^2 K_1(x) / 2.
 fn exact(x: f64) -> [f64; 2] {
     if x == 0.0 {
         return [1.0, 0.0];
@@ -60,7 +62,8 @@ fn exact(x: f64) -> [f64; 2] {
     [0.5 * x * x * bessel(2.0, x), -0.5 * x * x * bessel(1.0, x)]
 }
 
-/// K_nu(x) by equal steps: the integrand is analytic and falls doubly exponentially, so the sum is exact to rounding.
+/// Computes K_nu(x) by the trapezoidal rule: the integrand is analytic and falls doubly exponentially, so the sum is
+/// exact to rounding.
 fn bessel(nu: f64, x: f64) -> f64 {
     const STEP: f64 = 0.125;
     let term = |t: f64| (-x * t.cosh()).exp() * (nu * t).cosh();
@@ -86,7 +89,7 @@ mod tests {
         Curve::of(smoothness).at(ranges * ranges)
     }
 
-    /// K_2 from tables (Abramowitz and Stegun, 9.8; Wolfram): 0.1, 1, 2, 5, 10.
+    /// Values of K_2 from tables (Abramowitz and Stegun, 9.8; Wolfram) at 0.1, 1, 2, 5, 10.
     const K: [(f64, f64); 5] = [
         (0.1, 199.503_964_642_114_1),
         (1.0, 1.624_838_898_635_177_4),

@@ -1,19 +1,23 @@
-//! One model of the error of a part: a rigid motion, a smooth random field, and the scatter of the probe.
+//! Model of the error of a part: a rigid motion, a smooth random field, and the noise of the probe.
 //!
 //! ```text
-//!  deviations at points --> Fields: smoothness and range, one eigenproblem each --> Posterior: each with every strength and scatter, and its
-//!                                                                                        |            probability
-//!                                                                                        +--> forms drawn from all of them: figures, map, frame
+//!  deviations at points --> FieldHypotheses: smoothness and range, --> Posterior: probability of each
+//!                           one eigenproblem each                      with every variance ratio and noise
+//!                                                                          |
+//!                                                                          +--> samples: figures, map, frame
 //! ```
 //!
-//! The deviation of point i is d_i = h_i' b + f(x_i) + e_i. The rows h_i are what the registration could still move (its Jacobian), with
-//! no knowledge of b beforehand; f is a field whose smoothness, range and strength nobody knows; e_i is independent, or shared
-//! with the points before it along the path where the probe drifts. Motion and field are told together, for a
-//! direction in which the surface does not hold the part looks like form: whoever takes one for known gives the other a lie.
+//! The deviation of point i is d_i = h_i' b + f(x_i) + e_i. The rows h_i are the motions that the registration was free
+//! to make (its Jacobian). Their coefficients b have a flat prior. f is a field of unknown smoothness, range and
+//! standard deviation. The noise e_i is independent, or correlated along the path if the probe drifts.
 //!
-//! [`Dense`] has the covariance of every pair of points by one set of parameters, [`Growing`] the same as points come.
+//! The model estimates motion and field together. A direction of the pose that the surface does not constrain looks
+//! like form. If one of the two is taken as known, the estimate of the other is biased.
 //!
-//! [`Sessions`] tells what comes back in several measurements from what is of each alone.
+//! [`DensePosterior`] uses the covariance of every pair of points for one set of hyperparameters.
+//! [`IncrementalPosterior`] does the same point by point, as the points arrive.
+//!
+//! [`Sessions`] separates the deviations that several measurements have in common from those of each single one.
 //!
 //! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
 
@@ -58,41 +62,42 @@ pub use stopping::{
 
 use nalgebra::DMatrix;
 
-/// What the model has to know before it can tell anything.
+/// Hyperparameters of the Gaussian-process model.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hyperparameters {
-    /// The field.
+    /// Covariance of the field.
     pub field: Field,
-    /// Standard deviation by which a point scatters by itself.
+    /// Standard deviation of the noise of a point, in mm.
     pub noise_sigma_mm: f64,
-    /// How much of its scatter the next point along the path has, from 0, where each scatters on its own, to below 1: a scanning
-    /// probe drifts. Points k steps apart share this to the power of k.
+    /// Correlation of the noise of two neighbouring points of the path: 0 if the noise is independent, below 1 if the
+    /// probe drifts. Points k steps apart have this correlation to the power of k.
     pub noise_autocorrelation: f64,
 }
 
-/// What was measured. All three have a row a point.
+/// Observations at the measured points. Every field has one row for each point.
 #[derive(Clone, Debug)]
 pub struct Observed {
-    /// Where.
+    /// Positions of the points in the plane of projection, in mm.
     pub places: Vec<[f64; 2]>,
-    /// What.
+    /// Signed deviations along the normal, in mm.
     pub deviations_mm: Vec<f64>,
-    /// What a unit of each effect that nobody knows adds to it, such as the motions of the part; may have no column.
+    /// Deviation caused by a unit of each fixed effect, such as a motion of the part. Zero columns are allowed.
     pub fixed_effects: DMatrix<f64>,
-    /// What a standard uncertainty of each effect that somebody states adds to it, such as those of the machine; may have no column.
+    /// Deviation caused by one standard uncertainty of each random effect, such as a machine error. Zero columns are
+    /// allowed.
     pub random_effects: DMatrix<f64>,
-    /// Which point of a path each of them is; empty where they were not measured along one.
+    /// Position of each point along the path, in steps; empty if the points do not follow a path.
     pub path: Vec<f64>,
 }
 
 impl Observed {
-    /// Deviations of which nothing moves them all.
+    /// Returns observations without fixed or random effects.
     pub fn without_effects(places: Vec<[f64; 2]>, deviations_mm: Vec<f64>) -> Self {
         let [effects, stated] = [0, 0].map(|columns| DMatrix::zeros(places.len(), columns));
         Self { places, deviations_mm, fixed_effects: effects, random_effects: stated, path: Vec::new() }
     }
 
-    /// Some of them.
+    /// Returns the observations of the chosen points.
     fn subset(&self, chosen: &[usize]) -> Self {
         Self {
             places: chosen.iter().map(|&k| self.places[k]).collect(),
@@ -103,7 +108,7 @@ impl Observed {
         }
     }
 
-    /// The effects that nobody knows, and beside them those that are stated.
+    /// Returns the columns of the fixed effects, followed by those of the random effects.
     fn all_effects(&self) -> DMatrix<f64> {
         let (n, p) = self.fixed_effects.shape();
         DMatrix::from_fn(n, p + self.random_effects.ncols(), |r, c| {
@@ -115,7 +120,10 @@ impl Observed {
         if self.path.is_empty() { Vec::new() } else { chosen.iter().map(|&k| self.path[k]).collect() }
     }
 
-    /// Says what makes these no observations.
+    /// Checks the shapes, the number of points and that every number is finite.
+    ///
+    /// # Errors
+    /// [`ModelError::Shape`], [`ModelError::TooFewPoints`] or [`ModelError::NotFinite`].
     fn check(&self) -> Result<(), ModelError> {
         let Self { places, deviations_mm, fixed_effects: effects, random_effects: stated, path } = self;
         let (points, columns) = (places.len(), effects.ncols());
@@ -141,7 +149,7 @@ impl Observed {
     }
 }
 
-/// How far apart the points of a part lie, as if each had as much of the rectangle around them.
+/// Returns the typical spacing of the points, in mm: the root of the area of the rectangle around them per point.
 fn spacing_mm(places: &[[f64; 2]]) -> f64 {
     let span = |axis: usize| {
         let of = places.iter().map(|place| place[axis]);
@@ -151,10 +159,11 @@ fn spacing_mm(places: &[[f64; 2]]) -> f64 {
 }
 
 impl Hyperparameters {
-    /// Finds the parameters that what was measured speaks for, as one number each: the middle of those that may be.
+    /// Estimates the hyperparameters from the observations, as one value each: the geometric mean over the posterior.
     ///
     /// # Errors
-    /// Rows that do not belong together, too few points, effects that cannot be told apart, expectations that cannot be.
+    /// Inconsistent shapes, numbers that are not finite, too few points, linearly dependent fixed effects, or an
+    /// invalid prior.
     pub fn estimate(observed: &Observed, priors: Option<&Prior>) -> Result<Self, ModelError> {
         if let Some(priors) = priors {
             priors.check()?;
@@ -164,9 +173,9 @@ impl Hyperparameters {
         Ok(posterior::Posterior::of(&fields, observed, priors, None).mean_hyperparameters())
     }
 
-    /// How much of their scatter two points share that are so many steps of the path apart.
+    /// Returns the correlation of the noise of two points that are this many steps of the path apart.
     fn noise_correlation(&self, steps: f64) -> f64 {
-        // Further apart nothing is left of it.
+        // A correlation below exp(-36) is below the rounding error of a double, and counts as zero.
         const FAR: f64 = 36.0;
         if self.noise_autocorrelation == 0.0 {
             return if steps == 0.0 { 1.0 } else { 0.0 };
@@ -175,7 +184,10 @@ impl Hyperparameters {
         if power < -FAR { 0.0 } else { power.exp() }
     }
 
-    /// Says what makes these no parameters.
+    /// Checks that every hyperparameter is within its range.
+    ///
+    /// # Errors
+    /// [`ModelError::Lay`], [`ModelError::Hyper`] or [`ModelError::Drift`].
     fn check(&self) -> Result<(), ModelError> {
         let Self { field, noise_sigma_mm: scatter_mm, noise_autocorrelation: drift } = *self;
         field.check()?;

@@ -1,8 +1,10 @@
-//! The way up a hill of two dimensions.
+//! Maximization of a function of two variables.
 
-/// Climbs to the highest place of two dimensions by a simplex (Nelder and Mead 1965).
+/// Maximizes a function of two variables by the simplex method (Nelder and Mead 1965); returns the best place and the
+/// value there.
 ///
-/// It begins with a simplex of some steps, and ends with one that is smaller than `near`.
+/// The first simplex has the edges `steps` from `start`. The search ends when the simplex is smaller than `near`, or
+/// after 120 iterations.
 pub(super) fn maximize(
     start: [f64; 2],
     steps: [f64; 2],

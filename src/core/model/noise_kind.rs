@@ -1,8 +1,9 @@
-//! Whether the scatter goes on from a touch to the next, and whether fields are wider along some direction: as far as neighbours speak for it.
+//! Kind of noise and field: autocorrelation of the noise from one touch to the next, and anisotropy of the field, each
+//! only if neighbouring points give enough evidence.
 //!
-//! The likelihood is a composite one (Varin, Reid and Firth 2011): of some points all over the part, and of blocks of neighbours, each with a plane of its
-//! own that nobody knows. It chooses
-//! a kind of field, and says nothing of how strong or wide it is: that is told by all points together.
+//! The likelihood is a composite one (Varin, Reid and Firth 2011): of some points all over the part, and of blocks of
+//! neighbours, each with an unknown plane of its own. It selects only the kind of field; strength and range follow
+//! later from all points together.
 
 use nalgebra::DMatrix;
 use rayon::prelude::*;
@@ -11,33 +12,36 @@ use super::hypotheses::{NoiseKind, size_mm};
 use super::nelder_mead::maximize;
 use super::{Anisotropy, DensePosterior, Field, Hyperparameters, Observed, Prior, spacing_mm};
 
-/// Blocks of so many neighbours at most, and so many blocks at most.
+/// Maximum number of points of a block, and of blocks.
 const POINTS_A_BLOCK: usize = 48;
 const MOST_BLOCKS: usize = 24;
-/// Points all over the part.
+/// Maximum number of points that are spread over the whole part.
 const SPREAD: usize = 150;
-/// Drifts at which the search begins, how finely one is told, the most, and by how much one has to be spoken for more than none.
+/// Start values of the noise autocorrelation, steps of its refinement, its maximum, and the gain of the log-likelihood
+/// over no autocorrelation that it needs.
 const DRIFTS: [f64; 3] = [0.3, 0.6, 0.85];
 const DRIFT_STEPS: [f64; 3] = [0.12, 0.06, 0.03];
 const MOST_DRIFT: f64 = 0.97;
 const DRIFT_EVIDENCE: f64 = 2.0;
-/// The logarithm of the stretch of a lay at which the search begins, the most that is told, and by how much it has to be spoken for.
+/// Logarithm of the stretch at which the search of an anisotropy begins, maximum stretch, and the gain of the
+/// log-likelihood over isotropy that it needs.
 const FIRST_STRETCH: f64 = 0.6;
 const MOST_STRETCHED: f64 = 10.0;
 const LAY_EVIDENCE: f64 = 4.0;
-/// Where the search of range and ratio begins: in distances of the points, and in strengths of the field.
+/// Start values of the search: ranges in spacings of the points, and noise in strengths of the field.
 const RANGES: [f64; 4] = [3.0, 6.0, 12.0, 24.0];
 const RATIOS: [f64; 4] = [0.01, 0.1, 0.6, 3.0];
-/// No range is below so many distances of the points: what is narrower cannot be told from scatter.
+/// Minimum range in spacings of the points: a narrower field cannot be distinguished from noise.
 const LEAST_RANGE: f64 = 2.5;
 
-/// By what factor a field may be stronger than what is seen of it (one standard deviation of its logarithm).
+/// Factor by which the field can be stronger than the observed deviations (one standard deviation of its logarithm).
 const STRONGER: f64 = 2.0;
 
-/// A place of range and ratio, by their logarithms, and the logarithm of the likelihood there.
+/// Logarithms of range and ratio, and the log-likelihood there.
 type Top = ([f64; 2], f64);
 
-/// Tells the kinds of field that the points may speak for: one without a drift, and one with a drift where neighbours speak for it.
+/// Returns the kinds of field that the points support: one without noise autocorrelation, and one with it if neighbours
+/// give enough evidence.
 pub(super) fn candidates(observed: &Observed) -> (NoiseKind, Option<NoiseKind>) {
     let blocks = CompositeLikelihood::of(observed);
     let plain = blocks.maximum(NoiseKind::PLAIN, None);
@@ -52,7 +56,7 @@ pub(super) fn candidates(observed: &Observed) -> (NoiseKind, Option<NoiseKind>) 
 struct CompositeLikelihood {
     all: Vec<Observed>,
     distance_mm: f64,
-    /// What every part of this size is like, and the root mean square of what was measured.
+    /// Prior for any part of this size, and root mean square of the deviations.
     priors: Prior,
     rms_mm: f64,
 }
@@ -84,7 +88,8 @@ impl CompositeLikelihood {
         Self { all, distance_mm: spacing_mm(&observed.places), priors, rms_mm: (squares / n).sqrt() }
     }
 
-    /// The likelihood by a kind of field, its scale the best.
+    /// Computes the log-likelihood of a kind of field with its most probable scale, plus the log prior density. The
+    /// arguments `range` and `ratio` are logarithms.
     fn log_likelihood(&self, kind: NoiseKind, [range, ratio]: [f64; 2]) -> f64 {
         if range < (LEAST_RANGE * self.distance_mm).ln() {
             return f64::NEG_INFINITY;
@@ -92,7 +97,7 @@ impl CompositeLikelihood {
         let field = Field { lay: kind.lay, ..Field::new(1.0, range.exp()) };
         let unit = Hyperparameters { field, noise_sigma_mm: ratio.exp(), noise_autocorrelation: kind.autocorrelation };
         let fit = |block: &Observed| {
-            // What tells nothing of its plane, such as points on a line, tells nothing here.
+            // A block that does not determine its plane, for example points on a line, is left out.
             let model = DensePosterior::fit(block, unit).ok()?;
             Some([
                 model.log_likelihood(),
@@ -105,7 +110,8 @@ impl CompositeLikelihood {
         if told.is_empty() || squares <= 0.0 {
             return f64::NEG_INFINITY;
         }
-        // A field far stronger than what is seen would be one of which the points show next to nothing.
+        // The prior limits the strength of the field: the points would show almost nothing of a field far stronger than
+        // the deviations.
         let sigma_mm = (squares / free).sqrt();
         let beyond = (sigma_mm / self.rms_mm.max(f64::MIN_POSITIVE)).ln().max(0.0) / STRONGER.ln();
         let known = self.priors.log_density(range.exp(), ratio.exp()) - 0.5 * beyond * beyond;
@@ -121,7 +127,7 @@ impl CompositeLikelihood {
         maximize(start.0, [0.3, 0.6], 0.05, |place| self.log_likelihood(kind, place))
     }
 
-    /// The drift that is spoken for most, where it is by enough more than none.
+    /// Returns the most likely noise autocorrelation; `None` if it has too little evidence over none.
     fn most_likely_autocorrelation(&self, plain: Top) -> Option<(NoiseKind, Top)> {
         let of = |drift: f64| NoiseKind { autocorrelation: drift, ..NoiseKind::PLAIN };
         let mut best = (0.0, plain);
@@ -145,9 +151,10 @@ impl CompositeLikelihood {
         Some((of(best.0), best.1))
     }
 
-    /// The lay of the field, where it is spoken for by enough more than none.
+    /// Returns the most likely anisotropy of the field; `None` if it has too little evidence over isotropy.
     fn most_likely_anisotropy(&self, kind: NoiseKind, without: Top) -> Option<Anisotropy> {
-        // A lay turns, and none has none: twice its angle and the logarithm of its stretch are the polar coordinates of a plane.
+        // A lay is the same after half a turn, and an isotropic field has no direction. So twice the angle and the
+        // logarithm of the stretch are polar coordinates of the search plane.
         let of = |[a, b]: [f64; 2]| Anisotropy::at(0.5 * b.atan2(a), a.hypot(b).exp().min(MOST_STRETCHED));
         let height = |place: [f64; 2]| self.log_likelihood(NoiseKind { lay: of(place), ..kind }, without.0);
         let starts =
@@ -165,10 +172,10 @@ fn higher(a: Top, b: Top) -> Top {
     if b.1 > a.1 { b } else { a }
 }
 
-/// Some of the points, far from each other and near.
+/// Returns some of the points, with both large and small distances between them.
 fn spread(observed: &Observed) -> Observed {
     let n = observed.places.len();
-    // Steps of the golden section go everywhere and repeat nothing.
+    // Steps of the golden section cover the whole sequence evenly, without a repeating pattern.
     let golden = |k: usize| (((k as f64 + 0.5) * 0.618_033_988_749_894_9).fract() * n as f64) as usize;
     let mut chosen: Vec<usize> = if n <= SPREAD { (0..n).collect() } else { (0..SPREAD).map(golden).collect() };
     chosen.sort_unstable();
@@ -183,6 +190,6 @@ fn with_plane(observed: &Observed, block: &[usize]) -> Observed {
         0 => 1.0,
         c => some.places[r][c - 1] - middle[c - 1],
     });
-    // What is stated is wide: beside neighbours it is a plane.
+    // The random effects vary slowly: over a block of neighbours they are a plane, which the fixed effects contain.
     Observed { fixed_effects: effects, random_effects: DMatrix::zeros(block.len(), 0), ..some }
 }

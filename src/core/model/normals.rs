@@ -1,13 +1,14 @@
-//! Normal numbers that are the same every time.
+//! Reproducible random numbers of a normal distribution.
 
-/// A stream of independent normal numbers: SplitMix64 (Steele, Lea and Flood 2014), made normal by pairs (Box and Muller 1958).
+/// Stream of independent standard normal numbers: SplitMix64 (Steele, Lea and Flood 2014), transformed in pairs (Box
+/// and Muller 1958).
 pub(super) struct Normals {
     state: u64,
     spare: Option<f64>,
 }
 
 impl Normals {
-    /// The stream of a number within those of a seed.
+    /// Creates the stream of this number for a seed.
     pub(super) fn new(seed: u64, stream: u64) -> Self {
         let mut mixed = Self { state: seed, spare: None };
         let state = mixed.bits() ^ stream.wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(17);
@@ -25,7 +26,7 @@ impl Normals {
         radius * cosine
     }
 
-    /// From 0 up to, and not, 1.
+    /// Returns a uniform random number in [0, 1).
     pub(super) fn uniform(&mut self) -> f64 {
         (self.bits() >> 11) as f64 / (1_u64 << 53) as f64
     }

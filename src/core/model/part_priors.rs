@@ -1,72 +1,74 @@
-//! What earlier parts taught of the field: how wide it is and how far a point scatters beside it, after passes with and without a correction.
+//! Prior of the field from earlier parts: its range and the ratio of the noise to it, after passes with and without a
+//! correction.
 //!
-//! A pass without a correction leaves what the machine grinds wrong everywhere: wide waves. One with a correction leaves what no correction takes
-//! back: narrow ones. So each kind is taught by itself, whatever the number of the pass: a part that begins with the correction that an
-//! earlier one left has no pass of the first kind.
+//! A pass without a correction leaves the systematic errors of the machine: wide waves. A pass with a correction leaves
+//! the errors that no correction removes: narrow waves. So each kind has a prior of its own, independent of the number
+//! of the pass: a part that starts with the correction of an earlier part has no pass of the first kind.
 //!
-//! A part teaches by what its own points tell, whatever was expected of it. The logarithms of range and ratio of n parts have a mean and a variance
-//! v; what is expected of the next has that mean and the variance
+//! Each part contributes the hyperparameters from its own points, without any prior. The logarithms of range and ratio
+//! of n parts have a mean and a variance v. The prior of the next part has that mean and the variance
 //!
 //! ```text
 //!  (2 w^2 + (n - 1) v) / (n + 1) * (1 + 1 / n)        and no less than (ln 2)^2
 //! ```
 //!
-//! where w = ln 2.5 is how much parts are taken to differ before anything is known of it.
+//! where w = ln 2.5 is the difference between parts that is assumed before any part is measured.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Hyperparameters, Prior};
 
-/// How different parts are before anything is known of them, and for how many parts that counts.
+/// Prior factor by which parts differ, and number of parts that this prior counts for.
 const DIFFERENT: f64 = 2.5;
 const COUNTS_FOR: f64 = 2.0;
-/// What is expected is never narrower than this factor: a part that differs is still told from its own points.
+/// Minimum factor of the prior: the points of a part that differs can still overrule it.
 const NARROWEST: f64 = 2.0;
-/// Machines change: no more parts than these count.
+/// Maximum number of parts that count, because machines change.
 const MOST_PARTS: u32 = 20;
 
-/// What earlier parts taught of their fields.
+/// Statistics of the fields of earlier parts, by the kind of pass.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct PartPriors {
-    /// After a pass that was ground without a correction.
+    /// Statistics after a pass that was ground without a correction.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub without_correction: Option<PartFit>,
-    /// After a pass that was ground with one.
+    /// Statistics after a pass that was ground with a correction.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub with_correction: Option<PartFit>,
 }
 
-/// What parts had in common.
+/// Statistics of the fields of several parts.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PartFit {
-    /// Median of the range, in millimetres, and by what factor parts differ: one standard deviation of its logarithm.
+    /// Median of the range, in millimetres, and factor by which parts differ: one standard deviation of its logarithm.
     pub range_mm: [f64; 2],
-    /// The same of the ratio of the scatter to the field.
+    /// Median and factor of the ratio of the noise to the field.
     pub scatter_ratio: [f64; 2],
-    /// How many parts taught it; of more than twenty the last ones count.
+    /// Number of parts in the statistics; at most twenty, and later parts replace earlier ones gradually.
     pub parts: u32,
 }
 
 impl PartPriors {
-    /// Returns what was taught by passes of this kind.
+    /// Returns the statistics of passes of this kind.
     pub fn fit(&self, is_corrected: bool) -> Option<PartFit> {
         if is_corrected { self.with_correction } else { self.without_correction }
     }
 
-    /// Takes in what a further part told after a pass of this kind.
+    /// Adds the hyperparameters of a further part after a pass of this kind.
     pub fn update(&mut self, is_corrected: bool, hyperparameters: &Hyperparameters) {
         let lesson = if is_corrected { &mut self.with_correction } else { &mut self.without_correction };
         *lesson = Some(PartFit::updated(*lesson, hyperparameters));
     }
 
-    /// Returns what other machines taught together, each of which counts as one part: its own may differ as theirs do.
+    /// Returns the pooled statistics of other machines. Each counts as one part: this machine can differ from them as
+    /// much as they differ from each other.
     #[must_use]
     pub fn pooled(machines: &[Self]) -> Self {
         let of = |is_corrected| PartFit::pooled(machines.iter().filter_map(|of| of.fit(is_corrected)));
         Self { without_correction: of(false), with_correction: of(true) }
     }
 
-    /// Whether every number is one that can be, for what was read from a file.
+    /// Returns true if every number is possible; for values that were read from a file.
     pub fn is_valid(&self) -> bool {
         let number = |of: [f64; 2]| of[0].is_finite() && of[0] > 0.0 && of[1].is_finite() && of[1] >= 1.0;
         let is_sound = |lesson: PartFit| {
@@ -77,7 +79,7 @@ impl PartPriors {
 }
 
 impl PartFit {
-    /// What is known after a further part.
+    /// Returns the statistics after a further part.
     pub fn updated(before: Option<Self>, hyperparameters: &Hyperparameters) -> Self {
         let [range_mm, ratio] =
             [hyperparameters.field.range_mm, hyperparameters.noise_sigma_mm / hyperparameters.field.sigma_mm];
@@ -85,7 +87,7 @@ impl PartFit {
             return Self { range_mm: [range_mm, 1.0], scatter_ratio: [ratio, 1.0], parts: 1 };
         };
         let n = f64::from((before.parts + 1).min(MOST_PARTS));
-        // Welford 1962.
+        // Online mean and variance (Welford 1962).
         let with = |[median, factor]: [f64; 2], value: f64| {
             let off = (value / median).ln();
             let squares = factor.ln().powi(2) * (n - 2.0) + off * off * (n - 1.0) / n;
@@ -98,7 +100,7 @@ impl PartFit {
         }
     }
 
-    /// What a machine is expected to have in common with others.
+    /// Returns the statistics over several machines, each counted as one part; `None` if there is no machine.
     fn pooled(machines: impl Iterator<Item = Self>) -> Option<Self> {
         let machines: Vec<Self> = machines.take(MOST_PARTS as usize).collect();
         let n = machines.len() as f64;
@@ -116,7 +118,7 @@ impl PartFit {
         })
     }
 
-    /// What is expected of the next part.
+    /// Returns the prior of the next part.
     pub fn priors(&self) -> Prior {
         let n = f64::from(self.parts.max(1));
         let expected = |[median, factor]: [f64; 2]| {
@@ -143,12 +145,13 @@ mod tests {
         assert!(taught.fit(true).is_none());
         taught.update(true, &hyperparameters(10.0, 0.1));
         let one = taught.fit(true).unwrap().priors();
-        // One part: twice the variance of ln 2.5.
+        // With one part, the variance is 2 (ln 2.5)^2.
         assert!((one.range_mm[0] - 10.0).abs() < 1e-12, "{one:?}");
         assert!((one.range_mm[1].ln() - 2f64.sqrt() * 2.5f64.ln()).abs() < 1e-12, "{one:?}");
         taught.update(true, &hyperparameters(40.0, 0.1));
         let lesson = taught.fit(true).unwrap();
-        // Mean of the logarithms: 20; they are off by ln 2 each, and the sample variance is 2 (ln 2)^2.
+        // The mean of the logarithms is that of 20. Each differs from it by ln 2, and the sample variance is 2 (ln
+        // 2)^2.
         assert!((lesson.range_mm[0] - 20.0).abs() < 1e-12 && lesson.parts == 2, "{lesson:?}");
         assert!((lesson.range_mm[1].ln() - 2f64.sqrt() * 2f64.ln()).abs() < 1e-12, "{lesson:?}");
         assert!((lesson.scatter_ratio[0] - 0.1).abs() < 1e-12 && (lesson.scatter_ratio[1] - 1.0).abs() < 1e-12);
@@ -168,7 +171,7 @@ mod tests {
         }
         assert!(factors.windows(2).all(|pair| pair[1] <= pair[0] + 1e-12), "{factors:?}");
         assert_eq!((factors[199], lesson.unwrap().parts), (2.0, 20));
-        // A machine that has changed.
+        // From here on the machine has changed.
         for _ in 0..80 {
             lesson = Some(PartFit::updated(lesson, &hyperparameters(60.0, 0.3)));
         }

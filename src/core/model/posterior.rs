@@ -1,11 +1,13 @@
-//! What a measurement says of the fields that its form may be: every node and strength with its probability, and forms drawn from all of them.
+//! Posterior of the field hypotheses: a probability for every node and variance ratio, and samples of the form.
 //!
-//! With the strength tau, w = V'z of the field's own coefficients z and q = l tau / (1 + l tau) the posterior of a node is that of independent numbers (Rasmussen
-//! and Williams 2006, 2.7). Scatter, strength, smoothness and range are drawn together with the field, for a larger scatter is a weaker form: s^2 from its inverse
-//! gamma, or, beside effects of a stated uncertainty and a scatter that the probe is known to have, from its density by equal steps of ln s.
+//! For a node and a variance ratio tau, let w = V'z be the projections of the coefficients z of the field, and
+//! q = l tau / (1 + l tau). The posterior of these is that of independent numbers (Rasmussen and Williams 2006, 2.7).
+//! Noise, variance ratio, smoothness and range are sampled together with the field, because a larger noise means a
+//! weaker form. s^2 is sampled from its inverse gamma distribution. With random effects, or with a prior of the noise
+//! of the probe, s is sampled from its density in equal steps of ln s.
 //!
-//! A field alike everywhere takes a lone peak for scatter and draws it down. So what is told of extremes from above is told by fields of
-//! [`UNDER`] times the variance: they follow the points more closely.
+//! A stationary field treats a single peak as noise and shrinks it. Therefore the upper bounds of extremes use fields
+//! of [`UNDER`] times the variance. These follow the points more closely.
 
 use faer::Mat;
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
@@ -16,19 +18,23 @@ use super::noise_kind::candidates;
 use super::normals::Normals;
 use super::{Field, Hyperparameters, ModelError, Observed, Prior, Smoothness};
 
-/// By how much the variance of fields is raised for the upper ends of extremes, that of rough ones less, and lowered for the lower ends.
+/// Factor on the variance of smooth fields for the upper bounds of extremes.
 const UNDER: f64 = 16.0;
+/// Factor on the variance of rough fields for the upper bounds of extremes.
 const UNDER_ROUGH: f64 = 4.0;
+/// Factor on the variance of fields for the lower bounds of extremes.
 const OVER: f64 = 1.0 / 4.0;
-/// By what factor a field may be stronger than what is seen of it (one standard deviation of its logarithm), where the pose is told.
+/// Factor by which the standard deviation of a field can exceed the RMS of the residuals (one standard deviation of its
+/// logarithm). Used for the pose and for the hyperparameters.
 const STRONGER: f64 = 3.0;
 
-/// Lays the fields of the kind that the points speak for.
+/// Returns the hypotheses for the kind of noise that has the higher likelihood.
 ///
-/// Neighbours alone take waves across the path for a drift along it. So both kinds are held against each other by all points and all fields.
+/// A likelihood of neighbouring points alone mistakes waves across the path for noise autocorrelation along it.
+/// Therefore both kinds are compared by all points and all fields.
 ///
 /// # Errors
-/// Those of [`Fields::over`].
+/// Those of [`FieldHypotheses::over`].
 pub(super) fn select_hypotheses(observed: &Observed) -> Result<FieldHypotheses, ModelError> {
     let (plain, drifting) = candidates(observed);
     let fields = FieldHypotheses::over(observed, plain)?;
@@ -38,39 +44,39 @@ pub(super) fn select_hypotheses(observed: &Observed) -> Result<FieldHypotheses, 
     Ok(if with > without { other } else { fields })
 }
 
-/// What is known of the scatter of the probe beforehand: its size, and the standard deviation of the logarithm of that.
+/// Prior of the noise of the probe: its standard deviation in mm, and the standard deviation of the logarithm of that.
 pub(super) type NoisePrior = Option<[f64; 2]>;
 
-/// Fields with their probabilities.
+/// Field hypotheses with their probabilities.
 pub(super) struct Posterior<'f> {
     fields: &'f FieldHypotheses,
     observed: &'f Observed,
     probe: NoisePrior,
-    /// U' of what was found and of what is stated, by node.
+    /// Projections U' of the deviations and of the random effects, for each node.
     seen: Vec<Projected>,
-    /// The logarithm of the density of each node and strength, the strengths of a node side by side.
+    /// Logarithm of the posterior density: one vector for each node, one value for each variance ratio.
     densities: Vec<Vec<f64>>,
-    /// By how much the likelihood of the best field is above that of none, in its logarithm.
+    /// Logarithm of the likelihood ratio of the best field and no field.
     pub(super) evidence: f64,
     squares: f64,
 }
 
-/// What a node sees: the columns are what was found, and behind it what is stated.
+/// Projections for one node: the first column is that of the deviations, the others are those of the random effects.
 struct Projected {
-    /// U' of the columns.
+    /// Projections U' of the columns.
     v: Mat<f64>,
-    /// The products of all columns, less those of V.
+    /// Products of all pairs of columns, less the products of their projections V.
     rest: DMatrix<f64>,
 }
 
-/// Which fields are drawn.
+/// Set of fields to sample from.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) enum HypothesisSet {
-    /// All that may be, and beside them those that follow the points more closely.
+    /// All fields; the second variance follows the points more closely.
     All,
-    /// The smooth ones, and beside them those that draw peaks down: what scatters unlike a normal probe looks like a rough field.
+    /// Smooth fields; the second variance shrinks peaks. Noise that is not normal looks like a rough field.
     Smooth,
-    /// The rough ones.
+    /// Rough fields.
     Rough,
 }
 
@@ -84,7 +90,7 @@ impl HypothesisSet {
         }
     }
 
-    /// The variances by which fields are drawn, in those of the fields.
+    /// Returns the two factors on the variance of the field that the samples use.
     fn variances(self, smoothness: Smoothness) -> [f64; 2] {
         match self {
             Self::Smooth => [1.0, OVER],
@@ -94,14 +100,15 @@ impl HypothesisSet {
     }
 }
 
-/// Fields that were drawn.
+/// Samples of the field.
 pub(super) struct PosteriorSamples {
-    /// The coefficients of their waves, a column each, by either variance.
+    /// Coefficients of the basis functions, one column for each sample, for each of the two variances.
     pub(super) waves: [Mat<f64>; 2],
-    /// The scatter of each, and the standard deviation of what is in waves that are too short to be told, of either kind.
+    /// Standard deviation of the noise of each sample.
     pub(super) scatter_mm: Vec<f64>,
+    /// Standard deviation of the waves shorter than those of the basis, for each of the two variances.
     pub(super) narrow_mm: [Vec<f64>; 2],
-    /// How much of what is stated each has beside it, in standard uncertainties: a column each.
+    /// Random effects in standard uncertainties, one column for each sample.
     pub(super) stated: DMatrix<f64>,
 }
 
@@ -148,7 +155,8 @@ impl<'f> Posterior<'f> {
         Self { densities, evidence: best - none, ..posterior }
     }
 
-    /// The logarithm of the likelihood of what was found, by all nodes and strengths together.
+    /// Returns the logarithm of the likelihood of the deviations, averaged over all nodes and variance ratios by their
+    /// prior.
     fn log_likelihood(&self) -> f64 {
         let sum = |of: &mut dyn Iterator<Item = f64>| {
             let all: Vec<f64> = of.collect();
@@ -159,7 +167,7 @@ impl<'f> Posterior<'f> {
         sum(&mut self.densities.iter().flatten().copied()) - expected + self.fields.log_whitened
     }
 
-    /// What tells the scatter by a node and a strength.
+    /// Returns the likelihood of the noise for a node and a variance ratio.
     fn noise_likelihood(&self, node: usize, tau: f64) -> NoiseLikelihood {
         let (FieldHypothesis { eigenvalues: values, truncated_variance: narrow, scale, .. }, Projected { v, rest }) =
             (&self.fields.hypotheses[node], &self.seen[node]);
@@ -179,29 +187,29 @@ impl<'f> Posterior<'f> {
         NoiseLikelihood::of(&products, logs, self.fields.degrees_of_freedom, self.probe)
     }
 
-    /// The most probable node and strength, with the scatter by them.
+    /// Returns the most probable node and variance ratio, with the most probable noise for them, in mm.
     pub(super) fn best(&self) -> Option<(&FieldHypothesis, f64, f64)> {
         let (number, tau, _) = self.probabilities(HypothesisSet::All).into_iter().max_by(|a, b| a.2.total_cmp(&b.2))?;
         Some((&self.fields.hypotheses[number], tau, self.noise_likelihood(number, tau).mode_mm()))
     }
 
-    /// How probable it is that the field is one of the rough ones.
+    /// Returns the probability that the field is a rough one.
     pub(super) fn is_rough(&self) -> f64 {
         let is = |of: &(usize, f64, f64)| HypothesisSet::Rough.has(self.fields.hypotheses[of.0].smoothness);
         self.probabilities(HypothesisSet::All).iter().filter(|of| is(of)).map(|of| of.2).sum()
     }
 
-    /// How many degrees of freedom the fit leaves.
+    /// Returns the degrees of freedom of the residuals.
     pub(super) fn degrees_of_freedom(&self) -> f64 {
         self.fields.degrees_of_freedom
     }
 
-    /// The root mean square of what the fit leaves.
+    /// Returns the root mean square of the residuals after the fit of the fixed effects.
     fn rms_mm(&self) -> f64 {
         (self.squares / self.observed.places.len() as f64).max(0.0).sqrt()
     }
 
-    /// The probability of each node and strength of some kinds, all together 1.
+    /// Returns (node, variance ratio, probability) for the fields of a set. The probabilities sum to 1.
     fn probabilities(&self, which: HypothesisSet) -> Vec<(usize, f64, f64)> {
         let chosen =
             || self.densities.iter().enumerate().filter(|of| which.has(self.fields.hypotheses[of.0].smoothness));
@@ -214,10 +222,10 @@ impl<'f> Posterior<'f> {
         some.into_iter().map(|(node, tau, weight)| (node, tau, weight / whole)).collect()
     }
 
-    /// The parameters of one node and strength.
+    /// Returns the hyperparameters of one node and variance ratio.
     fn hyperparameters(&self, node: usize, tau: f64) -> Hyperparameters {
         let FieldHypothesis { smoothness, range_mm, scale, .. } = &self.fields.hypotheses[node];
-        // No deviation at all is a field of no strength.
+        // If every deviation is zero, the noise is zero too: a positive minimum keeps the hyperparameters valid.
         let scatter_mm = self.noise_likelihood(node, tau).mode_mm().max(f64::MIN_POSITIVE.sqrt());
         let sigma_mm = scatter_mm * (tau * scale).sqrt();
         let NoiseKind { lay, autocorrelation: drift } = self.fields.kind;
@@ -228,15 +236,18 @@ impl<'f> Posterior<'f> {
         }
     }
 
-    /// How much less likely a field is whose strength is beyond what is seen: of it the points would show next to nothing.
+    /// Returns a weight, at most 1, for a field whose standard deviation exceeds the RMS of the residuals. The points
+    /// would show almost nothing of a field that is much stronger.
     fn doubt(&self, hyperparameters: &Hyperparameters) -> f64 {
         let beyond =
             (hyperparameters.field.sigma_mm / self.rms_mm().max(f64::MIN_POSITIVE)).ln().max(0.0) / STRONGER.ln();
         (-0.5 * beyond * beyond).exp()
     }
 
-    /// Parameters that may be, with their probabilities: of each node at its most probable strength. The most probable ones come first.
-    /// Only those of some kinds, beside each other.
+    /// Returns the hyperparameters of each node at its most probable variance ratio, with their relative probabilities.
+    ///
+    /// Only nodes of the smoothnesses that `is_of` accepts are included. The most probable one comes first, with weight
+    /// 1.
     pub(super) fn weighted_hyperparameters(&self, is_of: impl Fn(Smoothness) -> bool) -> Vec<(Hyperparameters, f64)> {
         let of = |(node, densities): (usize, &Vec<f64>)| {
             if !is_of(self.fields.hypotheses[node].smoothness) {
@@ -257,8 +268,10 @@ impl<'f> Posterior<'f> {
         all.into_iter().map(|(hyperparameters, of)| (hyperparameters, (of - top).exp())).collect()
     }
 
-    /// The parameters as one number each: the means of their logarithms over the nodes that are as smooth as the most probable one. Of a field that is
-    /// nowhere smooth nobody could say how much of it is scatter: it is none of these.
+    /// Returns the hyperparameters as one value each: the geometric means over the nodes as smooth as the most probable
+    /// one.
+    ///
+    /// Rough fields are not included, because their variance cannot be separated from the noise.
     pub(super) fn mean_hyperparameters(&self) -> Hyperparameters {
         let likely = self.weighted_hyperparameters(|smoothness| smoothness != Smoothness::Never);
         let Some((first, _)) = likely.first().copied() else {
@@ -279,10 +292,10 @@ impl<'f> Posterior<'f> {
         Hyperparameters { field, noise_sigma_mm: mean(|of| of.noise_sigma_mm), ..first }
     }
 
-    /// Draws so many fields of some kinds; the same seed gives the same ones.
+    /// Draws `count` samples from the fields of a set. The same seed gives the same samples.
     pub(super) fn samples(&self, which: HypothesisSet, count: usize, seed: u64) -> PosteriorSamples {
         let probabilities = self.probabilities(which);
-        // Equal steps through all of them: each as often as it is probable, to one.
+        // Equal steps through the cumulative probability: the count of each field is within one of its expected value.
         let mut chosen: Vec<(usize, f64, usize)> = Vec::with_capacity(count);
         let (mut until, mut next) = (0.0, probabilities.iter());
         let mut now = next.next();
@@ -323,7 +336,7 @@ impl<'f> Posterior<'f> {
         draws
     }
 
-    /// Draws of one node: z = sigma z0 + D R' U (w - sigma V'z0) / sqrt l.
+    /// Draws samples for one node: z = sigma z0 + D R' U (w - sigma V'z0) / sqrt l.
     fn samples_of(
         &self,
         number: usize,
@@ -355,7 +368,7 @@ impl<'f> Posterior<'f> {
                 let (scatter2, field2, l) = (told[c].0.powi(2), strength2(c, under), node.eigenvalues[k]);
                 let found = v[(k, 0)] - (0..told[c].1.len()).map(|e| told[c].1[e] * v[(k, 1 + e)]).sum::<f64>();
                 let all = field2 * (l + node.truncated_variance) + scatter2;
-                // l^(1/2) w: its mean and its spread.
+                // Mean and standard deviation of l^(1/2) w.
                 let mean = field2 * l / all * found;
                 let spread = (field2 * l * (field2 * node.truncated_variance + scatter2) / all).sqrt();
                 (mean + spread * by_points[(k, c)] - field2.sqrt() * of_before[(k, c)]) / l
@@ -379,7 +392,8 @@ impl<'f> Posterior<'f> {
         }
     }
 
-    /// The mean of the field by its most probable node and strength, in coefficients of the waves.
+    /// Returns the posterior mean for the most probable node and variance ratio: coefficients of the basis functions,
+    /// and random effects in standard uncertainties.
     pub(super) fn mean(&self) -> (Vec<f64>, DVector<f64>) {
         let none = || (vec![0.0; self.fields.basis.len()], DVector::zeros(self.observed.random_effects.ncols()));
         let best = self.probabilities(HypothesisSet::All).into_iter().max_by(|a, b| a.2.total_cmp(&b.2));
@@ -404,8 +418,11 @@ impl<'f> Posterior<'f> {
         (waves, stated)
     }
 
-    /// The mean over all fields of A K A' with K the covariance of the field by its cosines, of what takes the waves to some sums: a row a sum, a column a wave. Fields
-    /// beyond what is seen count less. Also that of the square of the scatter, a touch's share of shorter waves in it.
+    /// Returns the means over all fields of A K A' and of the variance of the noise in mm^2.
+    ///
+    /// A are the given `sums`: one row for each sum, one column for each basis function. K is the covariance of the
+    /// coefficients of the cosines. The variance of the noise includes the waves shorter than those of the basis.
+    /// Fields stronger than the residuals have less weight.
     pub(super) fn mean_covariance(&self, sums: &DMatrix<f64>) -> (DMatrix<f64>, f64) {
         let p = sums.nrows();
         let (mut covered, mut scatter2, mut whole) = (DMatrix::zeros(p, p), 0.0, 0.0);
@@ -417,7 +434,8 @@ impl<'f> Posterior<'f> {
             }
             let own2 = self.noise_likelihood(number, tau).mode_mm().powi(2);
             let strength2 = own2 * tau * node.scale;
-            // Polynomials are let be as large as corners need. As forms of a part they would hide its place more than its forms do.
+            // The variance of the polynomials is as large as the corners of the part need. As form of the part, the
+            // polynomials would make the pose more uncertain than real forms do.
             let cosines = self.fields.basis.count_of_polynomials()..node.standard_deviations.len();
             let strong = DMatrix::from_fn(p, cosines.len(), |r, k| {
                 let wave = cosines.start + k;
@@ -431,8 +449,13 @@ impl<'f> Posterior<'f> {
     }
 }
 
-/// What tells the scatter s: -2 ln p(s) = 2 m ln s + logs + sum ln(1 + u / s^2) + (S - sum b^2 / (s^2 + u)) / s^2, with u the eigenvalues of E'K0^-1 E
-/// and b of E'K0^-1 d beside them.
+/// Likelihood of the noise s, with m degrees of freedom:
+///
+/// ```text
+///  -2 ln p(s) = 2 m ln s + logs + sum ln(1 + u / s^2) + (S - sum b^2 / (s^2 + u)) / s^2
+/// ```
+///
+/// u are the eigenvalues of E'K0^-1 E. b are the components of E'K0^-1 d along the eigenvectors.
 struct NoiseLikelihood {
     free: f64,
     logs: f64,
@@ -456,7 +479,7 @@ impl NoiseLikelihood {
         Self { free, logs, squares: products[(0, 0)].max(f64::MIN_POSITIVE), by_stated, axes, probe }
     }
 
-    /// The logarithm of the density over ln s.
+    /// Returns the logarithm of the density over ln s.
     fn density(&self, log_mm: f64) -> f64 {
         let s2 = (2.0 * log_mm).exp();
         let mut value = 2.0 * self.free * log_mm + self.logs;
@@ -466,12 +489,13 @@ impl NoiseLikelihood {
             squares -= b * b / (s2 + u);
         }
         value += squares.max(0.0) / s2;
-        // A touch scatters no less than the probe does, and more where a form is too narrow to be told.
+        // A touch has at least the noise of the probe. It has more if the form is too narrow to be resolved.
         let below = self.probe.map_or(0.0, |[probe_mm, u]| ((log_mm - probe_mm.ln()) / u.max(0.02)).min(0.0));
         -0.5 * (value + below * below)
     }
 
-    /// Equal steps of ln s that hold all of it: the first, their width, the logarithm of the density at each.
+    /// Evaluates the density in equal steps of ln s that cover all of it: returns the first ln s, the step, and the
+    /// logarithm of the density at each step.
     fn steps(&self) -> (f64, f64, Vec<f64>) {
         const COARSE: usize = 24;
         const FINE: usize = 41;
@@ -509,7 +533,8 @@ impl NoiseLikelihood {
         self.by_stated.is_empty() && self.probe.is_none()
     }
 
-    /// The logarithm of the likelihood with s integrated out, but for what is the same of every field.
+    /// Returns the logarithm of the likelihood with s integrated out, without the constants that are the same for every
+    /// field.
     fn log_marginal(&self) -> f64 {
         if self.is_plain() {
             return -0.5 * (self.logs + self.free * self.squares.ln());
@@ -519,7 +544,7 @@ impl NoiseLikelihood {
         top + (step * densities.iter().map(|of| (of - top).exp()).sum::<f64>()).ln()
     }
 
-    /// The most probable s.
+    /// Returns the most probable s, in mm.
     fn mode_mm(&self) -> f64 {
         if self.is_plain() {
             return (self.squares / self.free).sqrt();
@@ -531,7 +556,8 @@ impl NoiseLikelihood {
 
     fn sample_mm(&self, normals: &mut Normals) -> f64 {
         if self.is_plain() {
-            // Chi-squared by its degrees of freedom: exact by normal numbers where they are few, else by its cube root (Wilson and Hilferty 1931).
+            // Chi-squared: for few degrees of freedom a sum of squared normal numbers, which is exact; otherwise the
+            // cube-root approximation (Wilson and Hilferty 1931).
             const MANY: f64 = 60.0;
             let chi2 = if self.free <= MANY {
                 (0..self.free as usize).map(|_| normals.next().powi(2)).sum::<f64>()
@@ -552,7 +578,7 @@ impl NoiseLikelihood {
         (first + step * (at.unwrap_or(0) as f64 + normals.uniform() - 0.5)).exp()
     }
 
-    /// The most probable size of what is stated, each beside its standard uncertainty.
+    /// Returns the most probable random effects, each in units of its standard uncertainty.
     fn stated_mean(&self, scatter_mm: f64) -> DVector<f64> {
         let along = self.by_stated.iter().map(|[u, b]| b / (scatter_mm * scatter_mm + u));
         &self.axes * DVector::from_iterator(self.by_stated.len(), along)
@@ -570,13 +596,14 @@ impl NoiseLikelihood {
 mod tests {
     use super::*;
 
-    /// Places of a part of 102 x 62 mm that go everywhere and repeat nothing.
+    /// Returns places on a part of 102 x 62 mm that cover it evenly and never repeat.
     fn places(count: u32) -> Vec<[f64; 2]> {
         let at = (0..count).map(|k| f64::from(k) + 0.5);
         at.map(|k| [(0.754_877_666 * k).fract() * 102.0, (0.569_840_291 * k).fract() * 62.0]).collect()
     }
 
-    /// A field of known parameters, moved and tilted by what nobody knows.
+    /// Returns observations of a field with known hyperparameters, plus a shift and a tilt that the model does not
+    /// know.
     fn drawn(hyperparameters: Hyperparameters, places: Vec<[f64; 2]>, path: Vec<f64>, seed: u64) -> Observed {
         let n = places.len();
         let covariance = DMatrix::from_fn(n, n, |r, c| {
@@ -625,7 +652,8 @@ mod tests {
         };
         for drift in [0.0, 0.7, 0.9] {
             let planted = Hyperparameters { noise_autocorrelation: drift, ..PLANTED };
-            // Of a strong drift few independent touches are left, and how much it is spoken for is chance.
+            // A strong drift leaves few independent touches, so the evidence for it varies by chance: the test uses the
+            // median.
             const PARTS: u64 = 5;
             let path: Vec<f64> = (0..540).map(f64::from).collect();
             let told = |seed| {
@@ -654,7 +682,8 @@ mod tests {
         }
     }
 
-    /// Beside a form a strong drift looks like one: where it is not found again it must be form, and never scatter that counts for nothing.
+    /// Next to a form, a strong drift looks like form. An estimate that misses the drift must assign it to the field,
+    /// and must not count it as independent noise.
     #[test]
     fn a_strong_drift_is_told_or_is_form() {
         let planted = Hyperparameters { noise_autocorrelation: 0.9, ..PLANTED };
@@ -686,7 +715,12 @@ mod tests {
         assert!((b.field.range_mm / a.field.range_mm - 1.0).abs() < 1e-9);
     }
 
-    /// Whether points are taken one by one or by what their waves have in common: -2 ln p = ln |K| + ln |H'K^-1 H| - ln |H'H| + m ln d'K^-1 (d - H b).
+    /// Compares the likelihood with the one that the covariance of the basis functions gives directly, for few and for
+    /// many points:
+    ///
+    /// ```text
+    ///  -2 ln p = ln |K| + ln |H'K^-1 H| - ln |H'H| + m ln d'K^-1 (d - H b)
+    /// ```
     #[test]
     fn the_likelihood_is_that_of_the_covariance_that_the_waves_make() {
         for (count, near) in [(60, 1e-6), (500, 0.2)] {

@@ -1,28 +1,32 @@
-//! What is known of a field before anything is measured.
+//! Prior of a field's hyperparameters, before anything is measured.
 
 use super::ModelError;
 
-/// What is known of a field before anything is measured: the median of each, and by what factor it may be off (one standard deviation of
-/// its logarithm).
+/// Prior of a field's hyperparameters: the median of each, and the factor by which it can differ (one standard
+/// deviation of its logarithm).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Prior {
-    /// Of the range.
+    /// Median and factor of the range; the median in mm.
     pub range_mm: [f64; 2],
-    /// Of the ratio of the scatter to the field.
+    /// Median and factor of the ratio of the noise to the field.
     pub noise_ratio: [f64; 2],
 }
 
-/// By what factors the range and the ratio of a part are off of which nothing is known, and how many parts are like none before.
+/// Factors of range and ratio for a part of which nothing is known, and share of parts that resemble no earlier part.
 const EVERY: [f64; 2] = [6.0, 20.0];
 const LIKE_NONE: f64 = 0.2;
 
 impl Prior {
-    /// What every part is like: the range some third of its size, the scatter a twentieth of the field, each by a factor of its own.
+    /// Returns the prior for any part of this size: the range is a third of the size, the noise a twentieth of the
+    /// field, each with a factor of its own.
     pub fn for_size(size_mm: f64) -> Self {
         Self { range_mm: [size_mm / 3.0, EVERY[0]], noise_ratio: [0.05, EVERY[1]] }
     }
 
-    /// Says what makes these no expectations.
+    /// Checks that each median is finite and above 0, and each factor finite and above 1.
+    ///
+    /// # Errors
+    /// Returns [`ModelError::Expected`] with the wrong values.
     pub(super) fn check(&self) -> Result<(), ModelError> {
         for (what, [median, factor]) in [("range", self.range_mm), ("ratio of scatter to field", self.noise_ratio)] {
             if !(median.is_finite() && median > 0.0 && factor.is_finite() && factor > 1.0) {
@@ -32,8 +36,10 @@ impl Prior {
         Ok(())
     }
 
-    /// One part of a few is like none before, and differs from what is expected as much as parts of which nothing is known (Schmidli and others
-    /// 2014). Beyond one factor either falls as slowly as it does there (Huber 1964).
+    /// Returns the logarithm of the prior density of range and ratio, up to a constant. It is a mixture: a small share
+    /// of parts resembles no earlier part, and differs as much as parts of which nothing is known (Schmidli and others
+    /// 2014). Beyond one factor, the density of either component falls only exponentially in the logarithm (Huber
+    /// 1964).
     pub(super) fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
         let of = |value: f64, median: f64, factor: f64| {
             let off = ((value / median).ln() / factor.ln()).abs();
@@ -58,7 +64,8 @@ mod tests {
     fn what_was_taught_counts_for_no_more_than_that_one_part_of_five_is_like_none_before() {
         let taught = Prior { range_mm: [8.0, 2.0], noise_ratio: [0.1, 2.0] };
         let [at, off] = [8.0, 8.0 * 25.0].map(|range_mm| taught.log_density(range_mm, 0.1));
-        // By hand: ln(0.8 / ln^2 2 + 0.2 / (ln 6 ln 20)), and of what is 25 times as wide all but nothing but the second, (0.5 - ln 25 / ln 6) lower.
+        // By hand: ln(0.8 / ln^2 2 + 0.2 / (ln 6 ln 20)). At 25 times the range almost only the second term remains,
+        // lower by (0.5 - ln 25 / ln 6).
         let (like, unlike) = (0.8 / 2f64.ln().powi(2), 0.2 / (6f64.ln() * 20f64.ln()));
         let [near, far] = [0.5 - 25f64.ln() / 2f64.ln(), 0.5 - 25f64.ln() / 6f64.ln()];
         assert!((at - (like + unlike).ln()).abs() < 1e-12, "{at}");

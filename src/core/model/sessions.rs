@@ -1,14 +1,16 @@
-//! Measurements in several sessions: what comes back in each, and what another one would find.
+//! Measurements in several sessions: the deviations common to all, and the prediction of a further session.
 //!
-//! A session is whatever is set up anew: a day, a station of a tracker, a clamping. The deviation of a point is
+//! A session is everything that is measured in one setup: a day, a station of a tracker, a clamping. The deviation of a
+//! point is
 //!
 //! ```text
 //!  d_i = h_i' b + f(x_i) + g_s(x_i) + e_i
 //! ```
 //!
-//! with the motions and the field f of the part as in the model of one measurement, and g_s a field of the session s alone, independent of that of any
-//! other: how the frame was told, how the part hung, what the air did to the beam. g has a strength and a range of its own; one that is wider than
-//! the part shifts and tilts it. No point of one session tells f from g: it takes two.
+//! The motions and the field f of the part are as in the model of one measurement. g_s is a field of session s alone,
+//! independent of that of any other session: how the frame was established, how the part hung, how the air bent the
+//! beam. g has a strength and a range of its own. A field g that is wider than the part shifts and tilts it. The points
+//! of one session cannot separate f from g; this needs two sessions.
 //!
 //! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
 
@@ -20,61 +22,64 @@ use super::nelder_mead::maximize;
 use super::{DensePosterior, Field, Hyperparameters, ModelError, Observed, Prior};
 use crate::registration::{Deviation, PointStatus, Registration};
 
-/// Points, and the session of each.
+/// Observed points, and the session of each.
 #[derive(Clone, Debug)]
 pub struct Sessions {
     observed: Observed,
     of: Vec<u32>,
 }
 
-/// What comes back in every session, and what is of each alone.
+/// Hyperparameters of the field common to all sessions, and of the field of each session.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BetweenSessionVariance {
-    /// The field that comes back, and the scatter of a point.
+    /// Field common to all sessions, and noise of a point.
     pub hyperparameters: Hyperparameters,
-    /// The field of a session.
+    /// Field of a single session.
     pub session_field: Field,
-    /// Standard uncertainty of the logarithm of its strength.
+    /// Standard uncertainty of the logarithm of the session field's standard deviation.
     pub session_log_sigma_u: f64,
-    /// In how many sessions it was seen.
+    /// Number of sessions in the estimate.
     pub sessions: usize,
 }
 
-/// What a session that was not seen will find at a point.
+/// Prediction of the deviation that an unseen session will find at a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PredictionInterval {
-    /// The most probable deviation, after the best fit of that session.
+    /// Most probable deviation, after the best fit of that session.
     pub mean_mm: f64,
-    /// Standard uncertainty of the deviation that will be found, its field and its scatter in it.
+    /// Standard uncertainty of the deviation that will be found, including the session's field and the noise.
     pub sigma_mm: f64,
-    /// How many degrees of freedom that uncertainty is known by.
+    /// Degrees of freedom of that standard uncertainty.
     pub degrees_of_freedom: f64,
 }
 
-/// Of so many points every pair is looked at while parameters are searched, and at the end.
+/// Maximum number of points of which every pair is evaluated: in the search of hyperparameters, and in the prediction.
 const MOST_SEARCHED: usize = 300;
 const MOST_KNOWN: usize = 1500;
-/// Fewer sessions tell nothing of what differs between them.
+/// Minimum number of sessions: one alone contains no difference between sessions.
 const FEWEST_SESSIONS: usize = 2;
-/// Where the search begins: shares of the strength of the session's field in that of the part, and its range in that of the part.
+/// Start values of the search: strengths of the session's field as shares of that of the part's field, and factors of
+/// the prior median of each range.
 const SHARES: [f64; 3] = [0.1, 0.5, 2.0];
 const RANGES: [f64; 3] = [0.3, 1.0, 3.0];
-/// How often the parameters of either field are searched while those of the other stand still.
+/// Rounds of the search: each searches the hyperparameters of one field with those of the other fixed, and then the
+/// reverse.
 const ROUNDS: usize = 4;
-/// What is known of the field of a session beforehand, the median and the factor of one standard deviation: its share in that of the part, and its range in the
-/// most probable one of that.
+/// Prior of the session's field, as the median and the factor of one standard deviation of the logarithm: its strength
+/// as a share of that of the part's field, and its range divided by the prior median of the part's range.
 const OWN_SHARE: [f64; 2] = [0.5, 6.0];
 const OWN_RANGE: [f64; 2] = [3.0, 6.0];
-/// How far beside the best strength the likelihood is looked at.
+/// Distance from the maximum, in the logarithm of the strength, at which the likelihood is evaluated for its curvature.
 const STEP: f64 = 0.1;
-/// Fewer degrees of freedom are not told apart.
+/// Minimum number of degrees of freedom; a smaller one counts as this.
 const LEAST_DEGREES: f64 = 2.0;
 
 impl Sessions {
-    /// Takes points and the number of the session of each.
+    /// Joins observed points with the number of the session of each.
     ///
     /// # Errors
-    /// Rows that do not belong together, and numbers that are none.
+    /// Returns an error if the numbers of rows or of sessions differ from that of the points, or a number is not
+    /// finite.
     pub fn new(observed: Observed, of: Vec<u32>) -> Result<Self, ModelError> {
         observed.check()?;
         if of.len() != observed.places.len() {
@@ -83,11 +88,12 @@ impl Sessions {
         Ok(Self { observed, of })
     }
 
-    /// Takes registrations, each with the number of the session of every point that was measured. The motions that each was free to make
-    /// are unknown for itself. What lies apart was left out before.
+    /// Joins the used points of registrations, each with the number of the session of every measured point. The motions
+    /// that a registration was free to make are fixed effects of its own. Outliers are left out: only points with
+    /// [`PointStatus::Used`] count.
     ///
     /// # Errors
-    /// Those of [`Sessions::new`].
+    /// Those of [`Sessions::new`]; also if a registration has no used point.
     pub fn from_registrations(registrations: &[(&Registration, &[u32])]) -> Result<Self, ModelError> {
         let (mut parts, mut of) = (Vec::new(), Vec::new());
         for (registration, sessions) in registrations {
@@ -106,15 +112,16 @@ impl Sessions {
         Self::new(joined(&parts), of)
     }
 
-    /// Returns what was found at each point that was used, the registrations one after another.
+    /// Returns the deviation at each used point, in mm, one registration after another.
     pub fn deviations_mm(&self) -> &[f64] {
         &self.observed.deviations_mm
     }
 
-    /// Tells what comes back from what does not, by restricted likelihood.
+    /// Estimates the field common to all sessions and the field of a single session by restricted likelihood and
+    /// `priors`.
     ///
     /// # Errors
-    /// Fewer than two sessions, and those of [`Dense::fit`].
+    /// Returns an error if there are fewer than two sessions; otherwise those of [`DensePosterior::fit`].
     pub fn between_session_variance(&self, priors: &Prior) -> Result<BetweenSessionVariance, ModelError> {
         priors.check()?;
         let mut numbers = self.of.clone();
@@ -126,7 +133,8 @@ impl Sessions {
         let few = self.thinned(MOST_SEARCHED);
         let (found, top) = few.searched(priors);
         let (hyperparameters, own, _) = few.scaled(found, priors)?;
-        // By the curvature of the hill along the strength, whose scale moves with it.
+        // The uncertainty of the strength follows from the curvature of the log-likelihood along it. The common scale
+        // changes with it, so the change of ln(sigma) is taken from the fits.
         let beside = |step: f64| {
             let [common, [share, range]] = found;
             few.scaled([common, [share + step, range]], priors).map(|(_, own, value)| (own.sigma_mm.ln(), value))
@@ -142,7 +150,8 @@ impl Sessions {
         })
     }
 
-    /// Climbs from the best of some beginnings: the common field, then that of the session, and again.
+    /// Searches the maximum from the best of several start values: over the common field, then over the session's
+    /// field, in turns.
     fn searched(&self, priors: &Prior) -> ([[f64; 2]; 2], f64) {
         let height = |at| self.scaled(at, priors).map_or(f64::NEG_INFINITY, |(_, _, value)| value);
         let [median_mm, _] = priors.range_mm;
@@ -168,8 +177,11 @@ impl Sessions {
         best
     }
 
-    /// The parameters with the scale that suits them best, and the logarithm of their probability: range and scatter of the common field, share and range of
-    /// the session's, by their logarithms, scatter and share in units of the common field.
+    /// Returns the hyperparameters at their most probable common scale, the session's field, and the logarithm of their
+    /// probability density.
+    ///
+    /// The arguments are logarithms: range and noise of the common field, then strength and range of the session's
+    /// field. Noise and strength are in units of the strength of the common field.
     fn scaled(
         &self,
         [[range, ratio], [share, own_range]]: [[f64; 2]; 2],
@@ -182,7 +194,7 @@ impl Sessions {
         let model = self.fit(unit, own)?;
         let squares = model.whitened_squares(&self.observed);
         let free = (self.of.len() - self.observed.fixed_effects.ncols()) as f64;
-        // No deviation at all is a field of no strength.
+        // If all deviations are 0, so is the scale; the limit keeps it above 0.
         let scale = (squares / free).sqrt().max(f64::MIN_POSITIVE.sqrt());
         let log_of = |value: f64, [median, factor]: [f64; 2]| -0.5 * ((value / median).ln() / factor.ln()).powi(2);
         let value = model.log_likelihood() + 0.5 * squares - 0.5 * free - free * scale.ln()
@@ -206,7 +218,7 @@ impl Sessions {
         })
     }
 
-    /// Some of them, evenly in the order they were measured.
+    /// Returns at most `most` of the points, evenly spaced in the order of measurement.
     fn thinned(&self, most: usize) -> Self {
         let n = self.of.len();
         let chosen: Vec<usize> = (0..n.min(most)).map(|k| k * n / n.min(most)).collect();
@@ -214,7 +226,7 @@ impl Sessions {
     }
 }
 
-/// Points one after another, each part with effects of its own.
+/// Joins the points of all parts in their order; each part has fixed effects of its own.
 fn joined(parts: &[Observed]) -> Observed {
     let rows = parts.iter().map(|part| part.places.len()).sum();
     let mut effects = DMatrix::zeros(rows, parts.iter().map(|part| part.fixed_effects.ncols()).sum());
@@ -229,13 +241,14 @@ fn joined(parts: &[Observed]) -> Observed {
 }
 
 impl BetweenSessionVariance {
-    /// Tells what sessions that were not seen will find: at the places of `unseen`, in its sessions, after its own best fit. What was found there, and
-    /// whether its numbers are those of known sessions, does not matter.
+    /// Predicts the deviations of unseen sessions at the places of `unseen`, after the best fit of `unseen` itself. The
+    /// prediction uses the places and the session of each. It does not use the deviations of `unseen`, and it treats
+    /// every session as new, even if its number is that of a known session.
     ///
-    /// Takes time as the cube of the number of points; of more than 1,500 known ones as many are taken.
+    /// The cost is cubic in the number of points. If there are more than 1,500 known points, 1,500 of them are used.
     ///
     /// # Errors
-    /// Those of [`Dense::fit`].
+    /// Those of [`DensePosterior::fit`].
     pub fn predict(&self, known: &Sessions, unseen: &Sessions) -> Result<Vec<PredictionInterval>, ModelError> {
         let model = known.thinned(MOST_KNOWN).fit(self.hyperparameters, self.session_field)?;
         let Observed { places, fixed_effects: effects, .. } = &unseen.observed;
@@ -252,7 +265,8 @@ impl BetweenSessionVariance {
         let of = |k: usize| {
             let steady_mm2 = common[k] + scatter_mm2 * base.free(k);
             let variance_mm2 = (steady_mm2 + own[k]).max(f64::MIN_POSITIVE);
-            // Of a variance whose logarithm is uncertain by 2 u, and a part of the whole (Satterthwaite 1946).
+            // Degrees of freedom of a total variance of which one part is uncertain (Satterthwaite 1946): the logarithm
+            // of the session's variance has the standard uncertainty 2 u.
             let relative = 2.0 * self.session_log_sigma_u * own[k] / variance_mm2;
             let degrees = (2.0 / relative.powi(2).max(f64::MIN_POSITIVE)).max(LEAST_DEGREES);
             PredictionInterval { mean_mm: fitted_mm[k], sigma_mm: variance_mm2.sqrt(), degrees_of_freedom: degrees }
@@ -262,17 +276,18 @@ impl BetweenSessionVariance {
 }
 
 impl PredictionInterval {
-    /// Returns by how much what will be found lies off the mean at most, with a probability of 95 %: Student's t, for an uncertainty that few
-    /// sessions tell is uncertain itself.
+    /// Returns the half width of the 95 % prediction interval about the mean, in mm. It uses Student's t, because an
+    /// uncertainty that is estimated from few sessions is uncertain itself.
     pub fn half_width_mm(&self) -> f64 {
         self.sigma_mm * student(self.degrees_of_freedom)
     }
 }
 
-/// The quantile 97.5 % of Student's t (Fisher and Cornish 1960): within 2 % of 2 degrees of freedom, 0.4 % of 3, exact of many.
+/// Returns the 97.5 % quantile of Student's t by an asymptotic expansion (Fisher and Cornish 1960). Its error is within
+/// 2 % at 2 degrees of freedom, within 0.4 % at 3, and vanishes for many.
 fn student(degrees: f64) -> f64 {
     const Z: f64 = 1.959_963_984_540_054;
-    // Terms of 1 / degrees, each z times a polynomial of z^2, the highest power first.
+    // Terms in powers of 1 / degrees: each is z times a polynomial in z^2, the highest power first.
     const TERMS: [(f64, [f64; 5]); 4] = [
         (4.0, [0.0, 0.0, 0.0, 1.0, 1.0]),
         (96.0, [0.0, 0.0, 5.0, 16.0, 3.0]),
@@ -286,7 +301,7 @@ fn student(degrees: f64) -> f64 {
     })
 }
 
-/// An orthonormal base Q of what a best fit takes off.
+/// Orthonormal basis Q of the effects that a best fit removes.
 struct BestFitBasis {
     q: DMatrix<f64>,
 }
@@ -303,12 +318,12 @@ impl BestFitBasis {
         values.iter().zip(fitted.iter()).map(|(value, fitted)| value - fitted).collect()
     }
 
-    /// How much of the variance of independent points the fit leaves at one of them.
+    /// Returns the share of the variance of independent points that the best fit leaves at one of them.
     fn free(&self, point: usize) -> f64 {
         1.0 - self.q.row(point).norm_squared()
     }
 
-    /// The diagonal of P V P with P = 1 - Q Q'.
+    /// Returns the diagonal of P V P with P = 1 - Q Q'.
     fn variances_after(&self, covariance: &Mat<f64>) -> Vec<f64> {
         let (n, p) = self.q.shape();
         let q = Mat::from_fn(n, p, |r, c| self.q[(r, c)]);

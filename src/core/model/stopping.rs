@@ -1,14 +1,15 @@
-//! Where to touch next, and whether to touch on.
+//! Stopping rule of a measurement, and choice of the targets to touch next.
 //!
 //! ```text
-//!  registration --> Form over all targets --> decided? known well enough to correct by? anything that was not expected?
-//!                        |                                    |
-//!                        +--> Growing --> the next targets <--+ no
+//!  registration --> Form at all targets --> decided? known well enough for a correction? innovations as expected?
+//!                        |                                             |
+//!                        +--> IncrementalPosterior --> next targets <--+ no
 //! ```
 //!
-//! Targets are those of a measuring pattern: every one is a place that the probe can reach, and touching all of them is the pattern itself.
-//! A batch goes where least is known, where the highest and the lowest place may be first; a tenth of it goes anywhere, so that what the
-//! model does not expect is met; and around what was not expected.
+//! The targets are those of a measuring pattern: the probe can reach every one, and the whole pattern is all of them. A
+//! batch goes to the places with the largest posterior variance, with more weight where the maximum or the minimum of
+//! the form can lie. One touch in ten goes to a random target, so that the measurement also finds what the model does
+//! not expect. Further touches go to the neighbours of outliers.
 
 use super::form::Motions;
 use super::normals::Normals;
@@ -16,93 +17,100 @@ use super::{Form, IncrementalPosterior, ModelError, ModelInputs, Observed, Predi
 use crate::geometry::{Point, Vector};
 use crate::registration::{Deviation, PointStatus, Registration};
 
-/// What a measurement is to tell.
+/// Limits of the figures and required accuracy of the form, by which [`decide`] ends a measurement.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StoppingCriteria {
-    /// The largest peak to valley that is accepted; infinite where it is not limited.
+    /// Largest accepted peak to valley, in mm; infinite if it is not limited.
     pub pv_mm: f64,
-    /// The same without the outermost 0.1 % at either end.
+    /// Largest accepted PV 99.8 % (without the outermost 0.1 % at either end), in mm; infinite if it is not limited.
     pub pv_most_points_mm: f64,
-    /// The largest root mean square that is accepted; infinite where it is not limited.
+    /// Largest accepted root mean square, in mm; infinite if it is not limited.
     pub rms_mm: f64,
-    /// How well the form has to be known for a correction: better is lost in what a pass adds by itself.
+    /// Standard uncertainty of the smooth form (RMS over all targets) that is enough for a correction, in mm. A smaller
+    /// one brings no gain, because the pass itself adds a larger error.
     pub correction_mm: f64,
-    /// Whether another pass may be ground, and is expected to make the part better.
+    /// True if another pass is allowed and is expected to improve the part.
     pub may_grind: bool,
 }
 
-/// A measurement that is going on.
+/// Measurement in progress.
 #[derive(Clone, Copy, Debug)]
 pub struct PartialMeasurement<'a> {
-    /// All targets, touched or not: points of the nominal surface and their normals, in the model frame.
+    /// All targets, touched or not: points of the nominal surface with their unit normals, in the model frame, in mm.
     pub targets: &'a [(Point, Vector)],
-    /// Which of them was tried in which batch; none where it was not.
+    /// Number of the batch in which each target was tried; `None` if it was not tried yet.
     pub tried: &'a [Option<u32>],
-    /// Which target each deviation of the registration is of.
+    /// Target index of each deviation of the registration.
     pub touched: &'a [usize],
 }
 
-/// What is known, and what follows.
+/// Decision about a measurement: the form so far, and the targets to touch next.
 #[derive(Clone, Debug)]
 pub struct StoppingDecision {
-    /// The form over all targets; without slopes, ISO figures and its budget where touches follow.
+    /// Form at all targets; without slopes, ISO figures and budget if more touches follow.
     pub form: Form,
-    /// The targets to touch next, in the order of a short way; none where enough is known.
+    /// Targets to touch next, in the order of a short tour; empty if enough is known.
     pub next: Vec<usize>,
-    /// Why.
+    /// Reason of the decision.
     pub reason: Reason,
 }
 
-/// Why to touch on, or not.
+/// Reason why the measurement continues or ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reason {
-    /// The figures are within their limits, as surely as is asked of one look among many.
+    /// Every figure is within its limit, with the probability that one decision among many requires
+    /// ([`ModelInputs::look_risk`]).
     Within,
-    /// The part has to be corrected, and the form is known well enough for that.
+    /// The part has to be corrected, and the form is known well enough for the correction.
     Known,
-    /// The part has to be corrected, and more touches would cost more than another pass mends.
+    /// The part has to be corrected, and further touches would cost more than the error that another pass corrects.
     Enough,
-    /// Every target was tried.
+    /// All targets were tried.
     All,
-    /// Fewer touches say nothing.
+    /// There are fewer touches than [`MIN_TOUCHES`]: too few for a decision.
     Few,
-    /// What was found last is not what was expected.
+    /// The innovations of the last batch are larger than expected.
     Surprised,
-    /// A touch stands out, and what is around it is not known.
+    /// A touch is an outlier, and too few of its neighbours were tried.
     Around,
-    /// Something narrow stands on the part: only the whole pattern tells its size.
+    /// The part has a narrow feature: only the whole pattern shows its size.
     Feature,
-    /// A figure may lie on either side of its limit.
+    /// The interval of a figure contains its limit.
     Undecided,
     /// The form is not known well enough for a correction.
     Unknown,
-    /// A figure is beyond its limit for certain, and no pass is left that would be corrected.
+    /// A figure is certainly beyond its limit, and no further pass is available to correct it.
     Beyond,
-    /// So many batches were touched that the others are touched at once.
+    /// [`MAX_BATCHES`] batches were touched: all remaining targets follow at once.
     Late,
 }
 
-/// Touches that tell whether it is the right part, and where it is.
+/// Number of touches of the first batch: enough to check that it is the right part, and where it lies.
 pub const FIRST_BATCH: usize = 10;
-/// Fewer touches decide nothing.
+/// Minimum number of touches of a decision.
 pub const MIN_TOUCHES: usize = 40;
-/// Batches of a measurement, but for a last one of all that is left: who counts them on a wire has few bits for it.
+/// Maximum number of batches of a measurement, without a last one of all remaining targets. The number of a batch must
+/// fit into the few bits that a field bus has for it.
 pub const MAX_BATCHES: u32 = 60;
-/// Touches of a batch, at least and at most.
+/// Minimum and maximum number of touches of a batch.
 const BATCH: [usize; 2] = [20, 100];
-/// One in so many goes anywhere.
+/// One touch in this many goes to a random target.
 const ANYWHERE: usize = 10;
-/// A touch that is off by so many standard deviations is looked at from around, with so many neighbours.
+/// Number of standard deviations from which an innovation counts as an outlier, and number of neighbours that are
+/// examined around an outlier.
 const STANDS_OUT: f64 = 4.5;
 const NEIGHBOURS: usize = 6;
-/// So many of them have to be tried.
+/// Number of these neighbours that must have been tried.
 const SURROUNDED: usize = 4;
-/// By chance the squares of a batch are larger in one of a thousand.
+/// Normal quantile of 99.9 %: by chance, the mean square of the innovations exceeds its bound in one batch of a
+/// thousand.
 const BY_CHANCE: f64 = 3.09;
-/// Where nothing is accepted and another pass may help, touching on is given up at this share of the pattern, and at no fewer.
+/// If the part is not accepted and another pass can help, the measurement ends at this share of the pattern, but not
+/// before this number of touches.
 const GIVEN_UP: (f64, usize) = (1.0 / 6.0, 120);
 
-/// Returns so many targets that lie as far apart as they can: each is the one farthest from those before it.
+/// Returns the indices of at most `most` targets that lie as far apart as possible: each is the target farthest from
+/// all chosen before it.
 pub fn farthest_points(targets: &[(Point, Vector)], most: usize) -> Vec<usize> {
     let mut chosen: Vec<usize> = Vec::new();
     let mut apart_mm = vec![f64::INFINITY; targets.len()];
@@ -117,10 +125,10 @@ pub fn farthest_points(targets: &[(Point, Vector)], most: usize) -> Vec<usize> {
     chosen
 }
 
-/// Looks at what has been touched: is it enough, and where to touch next if not.
+/// Decides whether the touches so far are enough, and returns the targets to touch next if not.
 ///
 /// # Errors
-/// Those of [`Form::over`].
+/// Those of [`Form::estimate_at`].
 pub fn decide(
     registration: &Registration,
     inputs: &ModelInputs,
@@ -154,12 +162,12 @@ pub fn decide(
     };
     let is_all = matches!(why, Reason::Feature | Reason::Late);
     let next = if is_all { next } else { short_tour(so_far.targets, next) };
-    // More is said of the last look alone.
+    // Slopes, ISO figures and budget are computed for the last decision only.
     let form = if next.is_empty() { Form::estimate_at(registration, inputs, so_far.targets)? } else { form };
     Ok(StoppingDecision { form, next, reason: why })
 }
 
-/// What the figures and the map say.
+/// Returns the reason that follows from the figures and from the uncertainty of the form.
 fn settled(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, usize)) -> Reason {
     let figures = [
         (form.figures.pv, purpose.pv_mm),
@@ -173,7 +181,8 @@ fn settled(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, us
     let is_beyond = figures.iter().any(|(figure, limit)| figure.least_mm > *limit);
     let (share, least) = GIVEN_UP;
     let gives_up = count >= least.max((share * pattern as f64) as usize);
-    // Who judges looks once, and may accept what a look among many may not: then more is touched, not ground.
+    // The final judgement is a single decision, so its limit is less strict than that of one decision among many. A
+    // part that it can accept gets more touches, not another pass.
     let is_accepted = figures.iter().all(|(figure, limit)| figure.accepted_mm <= *limit);
     match () {
         () if is_beyond && !purpose.may_grind => Reason::Beyond,
@@ -184,16 +193,17 @@ fn settled(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, us
     }
 }
 
-/// What was expected, held against what was found.
+/// Posterior of the touches so far, with the innovations of the last batch.
 struct ExpectedTouches {
     growing: IncrementalPosterior,
-    /// By how many standard deviations each touch of the last batch is off, with its target.
+    /// Target and standardized innovation of each touch of the last batch.
     last: Vec<(usize, f64)>,
     outliers: Vec<usize>,
 }
 
 impl ExpectedTouches {
-    /// Tells the model all that was found before the last batch, looks what it expects of that, and tells it the rest.
+    /// Conditions the model on all batches before the last, computes the standardized innovations of the last batch,
+    /// and then conditions the model on that batch too.
     fn of(
         registration: &Registration,
         inputs: &ModelInputs,
@@ -220,7 +230,7 @@ impl ExpectedTouches {
         let (rows, columns) = (motions.rows(targets.iter().copied()), stated.columns(targets.iter().copied()));
         let mut growing = IncrementalPosterior::with_random_effects(places, rows, &columns, form.hyperparameters)?;
         growing.update(&before)?;
-        // Before the motions are held nothing is expected.
+        // With no more points than fixed effects the motions are not determined, so the model predicts nothing.
         let is_held = before.places.len() > before.fixed_effects.ncols();
         let off = if is_held { growing.standardized_innovations(&found) } else { vec![0.0; found.places.len()] };
         growing.update(&found)?;
@@ -229,11 +239,11 @@ impl ExpectedTouches {
         Ok(Self { growing, last: of_targets.into_iter().zip(off).collect(), outliers })
     }
 
-    /// Whether the last batch as a whole is not what was expected, those that stand out left aside.
+    /// Returns true if the innovations of the last batch without its outliers are larger than expected by chance.
     fn is_surprised(&self) -> bool {
         let squares: Vec<f64> = self.last.iter().filter(|(_, z)| z.abs() < STANDS_OUT).map(|(_, z)| z * z).collect();
         let n = squares.len() as f64;
-        // The quantile of chi-squared over its degrees of freedom (Wilson and Hilferty 1931).
+        // Quantile of chi-squared divided by its degrees of freedom (Wilson and Hilferty 1931).
         let ninth = 2.0 / (9.0 * n);
         n > 0.0 && squares.iter().sum::<f64>() / n > (1.0 - ninth + BY_CHANCE * ninth.sqrt()).powi(3)
     }
@@ -243,7 +253,7 @@ impl ExpectedTouches {
         off.chain(self.outliers.iter().copied())
     }
 
-    /// Targets around touches that stand out, where few of their neighbours were tried.
+    /// Returns the untried neighbours of outliers of which too few neighbours were tried.
     fn around(&self, so_far: &PartialMeasurement) -> Vec<usize> {
         let mut around = Vec::new();
         for target in self.standing_out() {
@@ -257,13 +267,13 @@ impl ExpectedTouches {
         around
     }
 
-    /// Whether two neighbours were both taken for outliers: dust is alone.
+    /// Returns true if two neighbours are both outliers: dust makes a single outlier.
     fn feature(&self, so_far: &PartialMeasurement) -> bool {
         let is_beside = |&a: &usize| neighbours(so_far.targets, a).iter().any(|k| self.outliers.contains(k));
         self.outliers.iter().any(is_beside)
     }
 
-    /// Chooses what to touch next.
+    /// Chooses the targets to touch next: `around` first, then random ones, then those of largest weighted variance.
     fn next(
         &mut self,
         so_far: &PartialMeasurement,
@@ -276,7 +286,7 @@ impl ExpectedTouches {
         chosen.iter().for_each(|&k| open[k] = false);
         let mut random = Normals::new(seed, so_far.touched.len() as u64);
         for _ in 0..wanted.div_ceil(ANYWHERE).min(wanted.saturating_sub(chosen.len())) {
-            // The phase of two normal numbers is as probable everywhere.
+            // The phase of two independent normal numbers is uniformly distributed.
             let share = (random.next().atan2(random.next()) / std::f64::consts::TAU).rem_euclid(1.0);
             let free: Vec<usize> = (0..open.len()).filter(|&k| open[k]).collect();
             let Some(&anywhere) = free.get((share * free.len() as f64) as usize) else { break };
@@ -295,7 +305,8 @@ impl ExpectedTouches {
         Ok(chosen)
     }
 
-    /// The open place of which least is known; what may be the highest or the lowest counts twice.
+    /// Returns the open target with the largest weighted variance. The weight is 2 where the maximum or the minimum of
+    /// the form can lie, otherwise 1.
     fn least_known(&self, open: &[bool]) -> Option<usize> {
         let known: Vec<Prediction> = self.growing.predictions().collect();
         let surely =
@@ -312,7 +323,7 @@ impl ExpectedTouches {
     }
 }
 
-/// The nearest other targets.
+/// Returns the indices of the nearest other targets.
 fn neighbours(targets: &[(Point, Vector)], of: usize) -> Vec<usize> {
     let apart = |k: usize| (targets[k].0 - targets[of].0).norm_squared();
     let mut others: Vec<usize> = (0..targets.len()).filter(|&k| k != of).collect();
@@ -324,7 +335,7 @@ fn neighbours(targets: &[(Point, Vector)], of: usize) -> Vec<usize> {
     others
 }
 
-/// Puts targets in the order of a short way: always to the nearest, and crossings taken out (2-opt).
+/// Sorts targets into a short tour: always to the nearest next target, then crossings are removed (2-opt).
 pub fn short_tour(targets: &[(Point, Vector)], chosen: Vec<usize>) -> Vec<usize> {
     let apart = |a: usize, b: usize| (targets[a].0 - targets[b].0).norm();
     let mut open = chosen;

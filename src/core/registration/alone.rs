@@ -1,7 +1,8 @@
-//! Whether what is far from the surface is one touch gone wrong, or on the part.
+//! Classification of the points that lie far from the surface: a single faulty touch, or form of the part.
 //!
-//! The fit leaves out what is far from the surface and from its neighbours: a chip would tilt it. But what two neighbouring touches found
-//! on one side of the surface is form, at any height, and counts in every figure. Only a touch that is alone counts in none.
+//! The fit rejects each point that is far from the surface and from its neighbours: a chip would tilt the pose. But if
+//! two neighbouring touches deviate to the same side of the surface, the deviation is form, at any height. Both points
+//! then count in every figure. Only an isolated touch counts in no figure.
 
 use rayon::prelude::*;
 
@@ -12,19 +13,23 @@ use super::refit::LEAST_SIGMA_MM;
 use super::robust::robust_sigma;
 use super::verdict::Verdict;
 
-/// Neighbours that are asked, and of how many the distances are looked at.
+/// Number of neighbours to compare with, and number of nearest points whose median distance is the scale.
 const ASKED: usize = 8;
 const NEAREST: u32 = 64;
-/// Neighbours are those within this many distances of the third nearest: in a square pattern those along its sides and diagonals.
+/// Largest distance of a neighbour, in distances of the third nearest. In a square pattern this includes the points
+/// along the sides and the diagonals.
 const BESIDE: f64 = 1.5 + 1e-3;
-/// Touches nearer than this share of the distances around were made at one place, and repeat its mistake.
+/// Share of that median distance below which two touches are repeats at one place. A repeat has the same fault, so it
+/// confirms nothing.
 const SAME_PLACE: f64 = 0.05;
-/// A neighbour that found less than this share of a height did not find the same.
+/// Smallest share of the point's own height at which a neighbour confirms it, both measured from the local level.
 const LEAST_SHARE: f64 = 0.1;
-/// The same where it is told from the surface: a neighbour on a hump is above it too.
+/// The same share with both heights measured from the surface. It is larger because a neighbour on a hump is above the
+/// surface too.
 const LEAST_SHARE_OF_ALL: f64 = 0.25;
 
-/// Has the points count that were left out of the fit and are not alone: in the number of points used, the objective, RMS and PV.
+/// Marks the outliers that are not isolated as used, and adds them to the number of points used, the objective, RMS and
+/// PV.
 pub(super) fn count_what_agrees(deviations: &mut [Deviation], verdict: &mut Verdict, outlier_sigmas: f64) {
     if Counts::of(deviations).outliers == 0 {
         return;
@@ -49,7 +54,7 @@ pub(super) fn count_what_agrees(deviations: &mut [Deviation], verdict: &mut Verd
     verdict.rms_mm = (verdict.objective_mm2 / verdict.used as f64).sqrt();
 }
 
-/// Counts the points on the part that the pose was not fitted to although it was fitted to most of their neighbours.
+/// Returns how many points on the part were left out of the fit although most of their neighbours were fitted.
 pub(super) fn contradicted(deviations: &[Deviation]) -> usize {
     let around = Around::of(deviations, 0.0);
     let is_left = |k: &usize| !deviations[around.of[*k]].in_fit;
@@ -61,14 +66,15 @@ pub(super) fn contradicted(deviations: &[Deviation]) -> usize {
     (0..around.of.len()).into_par_iter().filter(is_left).filter(among_others).count()
 }
 
-/// The points on the part by the places of their feet: how high one is moves it to no other place.
+/// Points on the part, indexed by their projections onto the surface. The height of a point does not change the
+/// position of its projection.
 struct Around {
     tree: Nearest,
     heights_mm: Vec<f64>,
-    /// The numbers of these points among all, ascending.
+    /// Indices of these points among all points, ascending.
     of: Vec<usize>,
     feet: Vec<Point>,
-    /// The median of the heights, and half of what makes an outlier.
+    /// Median of the heights, and half of the limit for an outlier.
     surface_mm: f64,
     least_mm: f64,
 }
@@ -85,7 +91,7 @@ impl Around {
         Self { tree: Nearest::of(feet.iter().copied()), heights_mm, of, feet, surface_mm, least_mm }
     }
 
-    /// Whether no neighbour found what this point did, beside what is usual around it.
+    /// Returns true if no neighbour deviates as this point does, relative to the level around the point.
     fn is_alone(&self, k: usize) -> bool {
         let Ok(own) = self.of.binary_search(&k) else { return true };
         let near: Vec<(usize, f64)> = self
@@ -101,7 +107,8 @@ impl Around {
         let mut around: Vec<f64> = others.iter().map(|(n, _)| self.heights_mm[*n]).collect();
         around.sort_unstable_by(f64::total_cmp);
         let level_mm = around[around.len() / 2];
-        // Beside what is usual around, and, where most of that is the defect itself, beside the surface.
+        // Compare with the local level. If the defect itself covers most of the neighbourhood, compare with the
+        // surface.
         let is_same = |n: usize, from_mm: f64, share: f64| {
             let [own_mm, other_mm] = [own, n].map(|k| self.heights_mm[k] - from_mm);
             own_mm.signum() * other_mm > self.least_mm.max(share * own_mm.abs())

@@ -1,4 +1,4 @@
-//! The first of the two alternating problems: each point's foot on the offset surface under a given pose.
+//! First of the two alternating problems: projects each point onto the offset surface under a given pose.
 
 use rayon::prelude::*;
 
@@ -10,34 +10,34 @@ use super::deviation::PointStatus;
 use super::linearize::{FourSums, Scaling, Sums};
 use super::robust::ScaledLoss;
 
-/// Points a task takes at a time: long enough to hide the cost of a task, short enough to share out.
+/// Points per task: enough to hide the cost of a task, few enough to share the work between threads.
 const CHUNK: usize = 512;
 
-/// How a centre becomes a distance.
+/// Conversion of a probe centre to a distance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct ResidualModel {
-    /// Subtracted from every distance: the probe radius where it was not put into the surface.
+    /// Length subtracted from every distance: the probe radius if the surface is not offset by it.
     pub(crate) subtract_mm: f64,
-    /// What a distance counts for.
+    /// Loss that weights a distance.
     pub(crate) loss: ScaledLoss,
 }
 
-/// A foot that many steps of the sampling beyond the edge lies on it, but for rounding.
+/// Tolerance for rounding, in steps of the sampling: a projection no farther than this beyond the edge is on the part.
 pub(super) const ON_PART_STEPS: f32 = 1e-3;
 
-/// What is remembered of a measured point from one iteration to the next.
+/// State of a measured point that passes from one iteration to the next.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Correspondence {
     pub(crate) place: Place,
     pub(crate) distance_mm: f64,
-    /// How far beyond the edge, in steps of the sampling.
+    /// Distance of the projection beyond the edge, in steps of the sampling.
     pub(crate) beyond_steps: f32,
-    /// Whether the point takes part in the fit.
+    /// True if the point takes part in the fit.
     pub(crate) used: bool,
 }
 
 impl Correspondence {
-    /// Returns what became of the point.
+    /// Returns the status of the point.
     pub(crate) fn status(&self) -> PointStatus {
         match self.used {
             true => PointStatus::Used,
@@ -46,7 +46,7 @@ impl Correspondence {
         }
     }
 
-    /// Whether the foot lies beyond the edge: the surface is not known there, however near it is.
+    /// Returns true if the projection is beyond the edge. The surface is unknown there, however near the point is.
     pub(crate) fn is_off_part(&self) -> bool {
         self.beyond_steps > ON_PART_STEPS
     }
@@ -54,10 +54,11 @@ impl Correspondence {
     pub(crate) const NEW: Self = Self { place: Place::UNKNOWN, distance_mm: 0.0, beyond_steps: 0.0, used: true };
 }
 
-/// Finds the feet of all points under a pose and sums the linear problem at them.
+/// Projects all points under a pose and returns the sums of the linear problem at the projections.
 ///
-/// Work is shared between threads in chunks whose sums are added in order, so that the result does not depend on how many
-/// threads there are; nor does it depend on the vector instructions of the machine, which are chosen as it runs.
+/// Threads share the work in chunks. The sums of the chunks are added in order, so the result does not depend on the
+/// number of threads. It does not depend on the vector instructions of the machine either; these are selected at run
+/// time.
 pub(crate) fn correspond(
     surface: &OffsetSurface,
     residual: &ResidualModel,
@@ -76,7 +77,7 @@ pub(crate) fn correspond(
     parts.iter().fold(Sums::zero(), Sums::merge)
 }
 
-/// The work of one task, in a form that is compiled once for each set of vector instructions.
+/// Work of one task, in a form that is compiled once for each set of vector instructions.
 struct Chunk<'a> {
     pass: &'a Pass<'a>,
     points: &'a [Point],
@@ -86,14 +87,14 @@ struct Chunk<'a> {
 impl pulp::NullaryFnOnce for Chunk<'_> {
     type Output = Sums;
 
-    // Inlined into the caller that has the instructions; a call from it would be to code without them.
+    // Inlined into the caller that uses the vector instructions: a called function would be compiled without them.
     #[inline(always)]
     fn call(self) -> Sums {
         self.pass.chunk(self.points, self.correspondences)
     }
 }
 
-/// One pass over the points: everything that is the same for all of them.
+/// One pass over the points: the data that all of them share.
 struct Pass<'a> {
     surface: &'a OffsetSurface<'a>,
     residual: &'a ResidualModel,
@@ -102,7 +103,8 @@ struct Pass<'a> {
 }
 
 impl Pass<'_> {
-    /// Sums one chunk of points: in fours where they stay on their facets or find new ones together, alone elsewhere.
+    /// Returns the sums of one chunk of points. Processes four points together if they stay on their facets or move to
+    /// new facets together, and single points otherwise.
     #[inline(always)]
     fn chunk(&self, points: &[Point], correspondences: &mut [Correspondence]) -> Sums {
         let mut sums = Sums::zero();
@@ -113,7 +115,7 @@ impl Pass<'_> {
         let (four_points, rest_points) = points.as_chunks::<LANES>();
         let (four_correspondences, rest_correspondences) = correspondences.as_chunks_mut::<LANES>();
         for (points, correspondences) in four_points.iter().zip(four_correspondences) {
-            // No closure around what is to be compiled with the vector instructions: it would be compiled without them.
+            // No closure around code that needs the vector instructions: a closure would be compiled without them.
             let start = if in_fours { self.start(correspondences, &recent) } else { None };
             let taken = match start {
                 Some(places) => self.four(points, correspondences, places, &mut fours),
@@ -142,7 +144,8 @@ impl Pass<'_> {
         sums
     }
 
-    /// Where four points were, or may be expected after those before them; `None` where nothing tells.
+    /// Returns the last places of four points, or places extrapolated from the eight points before them; `None` if
+    /// neither is known.
     #[inline(always)]
     fn start(&self, correspondences: &[Correspondence; LANES], recent: &[[Place; LANES]; 2]) -> Option<[Place; LANES]> {
         let places =
@@ -153,7 +156,8 @@ impl Pass<'_> {
         self.surface.four_extrapolated_places(&recent[0], &recent[1])
     }
 
-    /// Takes four points that are on the part, near the places given; returns false, with nothing done, for any others.
+    /// Processes four points together if they are on the part and near the given places. Otherwise returns false and
+    /// changes no correspondence and no sum.
     #[inline(always)]
     fn four(
         &self,
@@ -182,7 +186,7 @@ impl Pass<'_> {
     #[inline]
     fn one(&self, point: &Point, correspondence: &mut Correspondence, last: &mut Place, sums: &mut Sums) {
         let p = self.model_from_cmm.point(point); // g^-1 Y
-        // A point without a past begins where its neighbour in the file ended, if it has one.
+        // A point without an earlier place starts at the place of the point before it in the file, if there is one.
         let start = if correspondence.place == Place::UNKNOWN { *last } else { correspondence.place };
         let foot = self.surface.foot(&p, start);
         *last = foot.place;
@@ -196,7 +200,8 @@ impl Pass<'_> {
     }
 }
 
-/// How far the foot of a point lies beyond the edge, in steps of the sampling; one at least beyond the outline, which ends the part before its points do.
+/// Returns the distance of a point's projection beyond the edge, in steps of the sampling. Outside the outline it is at
+/// least one, because the outline can end the part before the nominal points end.
 pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &Foot) -> f32 {
     let is_outside = surface.nominal().outline().is_some_and(|outline| {
         let contact = p - foot.normal * (foot.distance_mm + surface.radius_mm());
@@ -206,7 +211,7 @@ pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &Foot) -> f
     if is_outside { steps.max(1.0) } else { steps }
 }
 
-/// Four points moved by a pose.
+/// Returns four points transformed by a pose.
 #[inline(always)]
 fn four_moved(pose: &Pose, w: &Vector3x4) -> Vector3x4 {
     let (r, t) = (&pose.rotation, &pose.translation_mm);
@@ -217,7 +222,7 @@ fn four_moved(pose: &Pose, w: &Vector3x4) -> Vector3x4 {
     [row(0), row(1), row(2)]
 }
 
-/// Four measured points at the end: their feet, and the rows of A there.
+/// Four measured points at the end: their projections, and the rows of A there.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FourFinal {
     pub(crate) centre: Vector3x4,
@@ -225,22 +230,23 @@ pub(crate) struct FourFinal {
     pub(crate) row: [F64x4; 6],
 }
 
-/// Makes of four points at their feet what is to be reported of each.
+/// Conversion of four points and their projections to the reported items.
 pub(crate) trait Report: Sync {
-    /// What is reported of one point.
+    /// Reported item of one point.
     type Item: Copy + Send;
 
-    /// Nothing reported yet.
+    /// Placeholder before a point is reported.
     const BLANK: Self::Item;
 
-    /// Returns what is reported of each of four points. Inlined, so that it is compiled with the caller's instructions.
+    /// Returns the reported items of four points. Inlined, so that it is compiled with the caller's vector
+    /// instructions.
     fn four(&self, correspondences: [&Correspondence; LANES], at: &FourFinal) -> [Self::Item; LANES];
 }
 
-/// Fours that a task of [`at_feet`] takes at a time.
+/// Groups of four points per task of [`at_feet`].
 const FOURS: usize = 8;
 
-/// Finds the feet once more and makes of each what is to be reported; nothing else of them is kept.
+/// Projects all points once more and returns one reported item per point, in the order of the points.
 pub(crate) fn at_feet<R: Report>(
     surface: &OffsetSurface,
     measured: &[Point],
@@ -252,7 +258,7 @@ pub(crate) fn at_feet<R: Report>(
     let at_end =
         AtEnd { surface, measured, correspondences, model_from_cmm: cmm_from_model.inverse(), scaling, report };
     let arch = pulp::Arch::new();
-    // Whole blocks, written where they stay; the last is filled up with the last point.
+    // Whole blocks, written in place. The last block is padded with the last point.
     let blocks: Vec<[[R::Item; LANES]; FOURS]> = (0..measured.len().div_ceil(LANES * FOURS))
         .into_par_iter()
         .with_min_len(CHUNK / (LANES * FOURS))
@@ -263,7 +269,7 @@ pub(crate) fn at_feet<R: Report>(
     items
 }
 
-/// What is the same for all points at the end.
+/// Data that all points share at the end.
 struct AtEnd<'a, R> {
     surface: &'a OffsetSurface<'a>,
     measured: &'a [Point],
@@ -292,7 +298,7 @@ impl<R: Report> pulp::NullaryFnOnce for EndBlock<'_, R> {
 }
 
 impl<R: Report> AtEnd<'_, R> {
-    /// The four points from one on; past the end the last one again.
+    /// Reports four points from the index `first` on. Past the end it repeats the last point.
     #[inline(always)]
     fn four(&self, first: usize) -> [R::Item; LANES] {
         let end = self.measured.len() - 1;
@@ -312,7 +318,7 @@ impl<R: Report> AtEnd<'_, R> {
             .four(correspondences, &FourFinal { centre, feet, row: self.scaling.four_rows(&centre, &feet.normal) })
     }
 
-    /// The feet of four points that were searched for one by one.
+    /// Returns the projections of four points, each searched on its own.
     #[cold]
     fn four_single(&self, centre: &Vector3x4, correspondences: [&Correspondence; LANES]) -> FourFeet {
         let foot = |l: usize| {
@@ -327,10 +333,10 @@ impl<R: Report> AtEnd<'_, R> {
     }
 }
 
-/// Returns the middle of a cloud and its rms distance from it.
+/// Returns the centroid of a cloud and the rms distance of its points from it, in mm.
 pub(crate) fn middle_and_size(points: &[Point]) -> (Point, f64) {
     let n = points.len() as f64;
-    // In chunks that are added in order: the same bits on any number of threads.
+    // Chunks are added in order, so the bits are the same on any number of threads.
     let parts: Vec<Vector> = points.par_chunks(1 << 14).map(|c| c.iter().map(|p| p.coords).sum()).collect();
     let middle = Point::from(parts.iter().sum::<Vector>() / n);
     let square = |c: &[Point]| c.iter().map(|p| (p - middle).norm_squared()).sum::<f64>();

@@ -1,4 +1,4 @@
-//! What is found of one measured point.
+//! Deviation of one measured point.
 
 use rayon::prelude::*;
 
@@ -7,43 +7,44 @@ use crate::geometry::{Point, Vector};
 /// One measured point against the nominal surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Deviation {
-    /// The contact point in the model frame: the centre moved back by the probe radius along the normal.
+    /// Contact point in the model frame: the centre moved back by the probe radius along the normal.
     pub point: Point,
-    /// Unit normal of the nominal surface at the foot, towards the probe.
+    /// Unit normal of the nominal surface at the projection, towards the probe.
     pub normal: Vector,
-    /// Signed distance in millimetres, positive where material stands proud.
+    /// Signed deviation in millimetres, positive where material is above the nominal surface.
     pub deviation_mm: f64,
-    /// Standard uncertainty of the deviation in millimetres: the residual noise and the pose together.
+    /// Standard uncertainty of the deviation in millimetres: residual noise and pose uncertainty combined.
     pub uncertainty_mm: f64,
-    /// What became of the point.
+    /// Status of the point.
     pub status: PointStatus,
-    /// Whether the pose was fitted to it: not to what is far from the surface, be it form or a touch gone wrong.
+    /// True if the pose was fitted to this point. False if the point is far from the surface, because of form or of a
+    /// faulty touch.
     pub in_fit: bool,
 }
 
-/// What became of a measured point.
+/// Status of a measured point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PointStatus {
-    /// It counts in every figure.
+    /// Inlier: it counts in every figure.
     Used,
-    /// It is far from the surface, and no neighbour found the same.
+    /// Outlier: it is far from the surface, and no neighbour confirms it.
     Outlier,
-    /// Its foot lies beyond the edge of the nominal surface.
+    /// The projection is beyond the edge of the nominal surface.
     OffPart,
 }
 
-/// How many points became what.
+/// Number of points of each status.
 #[derive(Clone, Copy, Default)]
 pub(super) struct Counts {
     pub(super) outliers: usize,
     pub(super) off_part: usize,
-    /// Points on the part that the pose was not fitted to.
+    /// Points on the part that were left out of the fit.
     pub(super) left: usize,
 }
 
 impl Counts {
-    /// Counts on all threads: of many points most of the time is taken by memory.
+    /// Counts the points on all threads: with many points, memory access takes most of the time.
     pub(super) fn of(deviations: &[Deviation]) -> Self {
         let of_one = |d: &Deviation| Self {
             outliers: usize::from(d.status == PointStatus::Outlier),

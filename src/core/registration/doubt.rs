@@ -1,4 +1,4 @@
-//! What makes a fit doubtful that was found all the same: a radius that is not the ball's, and points that are not enough.
+//! Warnings about a fit that succeeded: a probe radius that does not match the ball, and too few usable points.
 
 use crate::geometry::Point;
 
@@ -10,36 +10,38 @@ use super::result::{Registration, WithLeftOut};
 use super::start::spread;
 use super::verdict::length;
 
-/// A radius is doubted only if another one leaves at most this share of the rms. Half the radius on a free-form of 64 mm radius
-/// leaves a quarter beside the form error of a ground part, double the radius less.
+/// Largest share of the rms that another radius leaves, if the given radius is doubted. On a free-form surface of 64 mm
+/// radius, half the radius leaves a quarter in addition to the form error of a ground part. Double the radius leaves
+/// less.
 const RMS_LEFT: f64 = 0.65;
 
-/// A radius is doubted only if it is off by this share of itself: a diameter or a mistaken ball are. The form error of a wheel that
-/// wears is of the very shape that a wrong radius makes; it was seen to tell 0.25 mm less than the 1.5 mm of the ball.
+/// Smallest relative error of the radius at which it is doubted. A diameter in place of a radius, or the wrong ball,
+/// exceeds it. The form error of a worn wheel has the same shape as the effect of a wrong radius: in one case it made
+/// the estimate 0.25 mm less than the 1.5 mm of the ball.
 const LEAST_SHARE_OFF: f64 = 0.4;
 
-/// A radius is doubted only if it makes this much rms of the cloud's size: 7 um on a part of 100 x 60 mm. That is more than what a
-/// ground part is bent by, and leaves out the surfaces that can hardly tell a radius.
+/// Smallest rms that a wrong radius explains, as a share of the cloud's size, at which it is doubted: 7 um on a part of
+/// 100 x 60 mm. A ground part bends less. The limit also excludes surfaces that hardly determine the radius.
 const LEAST_RMS_OF_SIZE: f64 = 2e-4;
 
-/// Below this share of the radius given there is no ball: what is left is the form error's.
+/// Share of the given radius below which the points are contact points: the rest of the estimate is form error.
 const MOST_OF_CONTACT: f64 = 0.25;
 
-/// Below this there is no ball, but a surface that is wanted this much above the nominal one.
+/// Smallest radius of a ball, in mm. A smaller value is an intended offset above the nominal surface, not a ball.
 const LEAST_BALL_MM: f64 = 0.1;
 
-/// A radius that so few points more than there are unknowns tell is chance.
+/// Fewest points in excess of the seven unknowns. With fewer, the estimated radius is chance.
 const LEAST_FREEDOM: usize = 20;
 
-/// Points that another radius is tried on.
+/// Number of points that another radius is fitted to.
 const TRIED: usize = 2048;
 
-/// Shares of the points, and of the surface, beyond which they are spoken of.
+/// Limits for a warning: shares of the points, and the share of the surface that is covered.
 const MOST_OUTLIERS: f64 = 0.05;
 const MOST_OFF_PART: f64 = 0.2;
 const LEAST_COVERAGE: f64 = 0.5;
 
-/// Tells in words what a person should know of the points and of the radius.
+/// Returns warnings about the points, the nominal surface and the probe radius.
 pub(super) fn doubts(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Vec<String> {
     let mut doubts = of_points(found);
     doubts.extend(of_nominal(part, found));
@@ -47,7 +49,7 @@ pub(super) fn doubts(part: &Part, found: &Registration, measured: &[Point], opti
     doubts
 }
 
-/// Tells that many points were left out, or that they cover little of the surface.
+/// Returns warnings about many rejected points, and about points that cover little of the surface.
 fn of_points(found: &Registration) -> Vec<String> {
     let points = found.deviations.len();
     let Counts { outliers, off_part, .. } = Counts::of(&found.deviations);
@@ -89,11 +91,11 @@ fn of_points(found: &Registration) -> Vec<String> {
     doubts
 }
 
-/// Counts the points off the part that have points on it all around.
+/// Estimates how many points off the part have points on the part in every direction.
 fn in_gaps(found: &Registration, off_part: usize) -> usize {
-    /// Directions in the plane of the model frame that are looked along.
+    /// Number of directions in the xy plane of the model frame.
     const SECTORS: usize = 8;
-    /// Points that are looked at, at most.
+    /// Most points of each kind that are examined.
     const MOST: usize = 2000;
     let some_of = |is_off: bool, count: usize| -> Vec<[f64; 2]> {
         let of = found.deviations.iter().filter(|d| (d.status == PointStatus::OffPart) == is_off);
@@ -114,9 +116,10 @@ fn in_gaps(found: &Registration, off_part: usize) -> usize {
 }
 
 impl Registration {
-    /// Says why nothing can be judged by these points: so many of them contradict their neighbours that nobody knows which of both is the part.
+    /// Returns why these points allow no judgement, or `None`. Too many of them contradict their neighbours, so it is
+    /// unknown which of the two groups is the part.
     pub fn no_verdict(&self) -> Option<String> {
-        /// Share of the points on the part.
+        /// Largest share of the points on the part.
         const MOST: f64 = 0.1;
         let Counts { off_part, left, .. } = Counts::of(&self.deviations);
         if left as f64 <= MOST * (self.deviations.len() - off_part) as f64 {
@@ -145,9 +148,9 @@ impl Registration {
     }
 }
 
-/// Tells that the nominal points scatter themselves, as far as it is in the deviations.
+/// Warns that the nominal points have noise of their own, if it contributes noticeably to the deviations.
 fn of_nominal(part: &Part, found: &Registration) -> Option<String> {
-    /// A smaller scatter than both is not told: a file with four digits of a millimetre scatters by 0.03 um.
+    /// Limits for the warning; both must be exceeded. A file with four digits of a millimetre has a noise of 0.03 um.
     const LEAST_MM: f64 = 1e-4;
     const LEAST_OF_RMS: f64 = 0.1;
     let scatter_mm = part.nominal.scatter_mm();
@@ -160,7 +163,7 @@ fn of_nominal(part: &Part, found: &Registration) -> Option<String> {
     })
 }
 
-/// Names the points that were left out, and the figures with them.
+/// Names the rejected points, and gives the figures that include them.
 fn of_left_out(found: &Registration) -> Option<String> {
     let WithLeftOut { points, rms_mm, pv_mm, places } = found.with_left_out()?;
     let were = if points == 1 { "1 point was".to_owned() } else { format!("{points} points were") };
@@ -172,7 +175,7 @@ fn of_left_out(found: &Registration) -> Option<String> {
     ))
 }
 
-/// Tells which other radius fits the points much better, if one does.
+/// Describes another probe radius that fits the points much better, if there is one.
 pub(super) fn of_radius(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Option<String> {
     let given_mm = options.probe_radius_mm;
     if !can_be_doubted(part, found, options) {
@@ -207,7 +210,8 @@ pub(super) fn of_radius(part: &Part, found: &Registration, measured: &[Point], o
     })
 }
 
-/// Registers some points with another radius; one below zero is that of a ball on the other side, and zero is none.
+/// Registers a sample of the points with another radius, in mm. A negative radius is a ball on the other side of the
+/// surface. Zero means contact points.
 fn refit(part: &Part, found: &Registration, sample: &[Point], given: &Options, radius_mm: f64) -> Option<Registration> {
     let is_ball = radius_mm.abs() >= LEAST_BALL_MM;
     let options = Options {
@@ -221,18 +225,19 @@ fn refit(part: &Part, found: &Registration, sample: &[Point], given: &Options, r
     super::fit(&part, sample, &options).ok()
 }
 
-/// Whether another radius fits so much better that it is no form error.
+/// Returns true if another radius fits so much better that form error cannot explain the difference.
 fn is_better(part: &Part, rms_mm: f64, other_rms_mm: f64) -> bool {
     let taken2 = rms_mm * rms_mm - other_rms_mm * other_rms_mm;
     other_rms_mm <= RMS_LEFT * rms_mm && taken2 >= (LEAST_RMS_OF_SIZE * part.size_mm).powi(2)
 }
 
-/// Whether it is worth trying another radius: it takes enough away by the linear model, and the scatter leaves it known.
+/// Returns true if another radius is worth a fit: by the linear model it removes enough rms, and the noise leaves it
+/// well determined.
 fn can_be_doubted(part: &Part, found: &Registration, options: &Options) -> bool {
-    /// The model is linear, and a wrong radius is far off: a little more is let through than is said in the end.
+    /// The model is linear, and a wrong radius is far off. So this test lets through a little more than the final one.
     const MARGIN: f64 = 1.15;
     let (given_mm, rms_mm) = (options.probe_radius_mm, found.verdict.rms_mm);
-    // With a coordinate locked the place of the fixture would be taken for the radius.
+    // With a locked coordinate, a wrong position of the fixture would look like a wrong radius.
     let is_ball = options.method != Method::Contact && given_mm >= LEAST_BALL_MM && !options.locked.contains(&true);
     if !is_ball || found.verdict.used < 7 + LEAST_FREEDOM || rms_mm < LEAST_RMS_OF_SIZE * part.size_mm {
         return false;
@@ -245,7 +250,8 @@ fn can_be_doubted(part: &Part, found: &Registration, options: &Options) -> bool 
     })
 }
 
-/// Follows the radius that the points tell until it stands, to the other side of the surface if need be; `None` if nothing fits.
+/// Iterates the radius that the points give until it no longer changes, and returns it in mm. It may change sign, to
+/// the other side of the surface. Returns `None` if a fit fails.
 fn settled(first_mm: f64, given_mm: f64, refit: &impl Fn(f64) -> Option<Registration>) -> Option<f64> {
     const TURNS: usize = 5;
     let mut radius_mm = first_mm;

@@ -1,11 +1,11 @@
-//! Why a registration cannot be had.
+//! Errors of a registration.
 
 use thiserror::Error;
 
 use super::options::Coordinate;
 use crate::surface::SurfaceError;
 
-/// Why a registration cannot be had.
+/// Reason why a registration fails.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]

@@ -1,4 +1,4 @@
-//! The alternating iteration of section 2.3 of the paper: feet, ball-constrained step, feet again.
+//! Alternating iteration of section 2.3 of the paper: project, take a ball-constrained step, project again.
 
 use nalgebra::{Matrix6, Vector6};
 
@@ -10,42 +10,43 @@ use super::error::RegistrationError;
 use super::linearize::{Scaling, Sums};
 use super::solve::Spectrum;
 
-/// One turn of the iteration.
+/// One step of the iteration.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Iteration {
-    /// The objective after the step, in mm^2: the sum of the squared distances, eq. (7), or of the robust loss of them.
+    /// Objective after the step, in mm^2: the sum of the squared distances, eq. (7), or of their robust loss.
     pub objective_mm2: f64,
     /// Length of the step in scaled coordinates: radians, and translations in units of the cloud's rms size.
     pub step: f64,
-    /// Radius of the ball that the step was kept in, alpha in eq. (15).
+    /// Radius of the ball that limited the step, alpha in eq. (15).
     pub ball_radius: f64,
-    /// Whether the step was taken; one that raises the objective is taken back.
+    /// True if the step was accepted. A step that raises the objective is undone.
     pub taken: bool,
     /// Number of points that took part.
     pub points: usize,
 }
 
-/// What the iteration is to do, and when to stop.
+/// Input and stopping rules of the iteration.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Problem<'a> {
     pub(crate) surface: OffsetSurface<'a>,
     pub(crate) residual: ResidualModel,
     pub(crate) measured: &'a [Point],
-    /// The middle of the measured points and their rms distance from it.
+    /// Centroid of the measured points, and their rms distance from it.
     pub(crate) middle: Point,
     pub(crate) size_mm: f64,
     /// Locked coordinates of the twist: x, y, z, rx, ry, rz of the model frame.
     pub(crate) locked: [bool; 6],
-    /// Singular values below this share of the largest are directions that the surface cannot see.
+    /// Smallest singular value of a direction that the surface determines, as a share of the root of the sum of their
+    /// squares.
     pub(crate) least_share: f64,
-    /// Stop when 1 - f(l+1) / f(l) falls to this, the paper's epsilon.
+    /// Relative decrease 1 - f(l+1) / f(l) at which the iteration stops: epsilon in the paper.
     pub(crate) tolerance: f64,
-    /// The first radius of the ball.
+    /// Initial radius of the ball.
     pub(crate) ball_radius: f64,
     pub(crate) most_iterations: usize,
 }
 
-/// Where a descent ended.
+/// End of a descent.
 #[derive(Clone, Debug)]
 pub(crate) struct Descent {
     pub(crate) cmm_from_model: Pose,
@@ -56,16 +57,18 @@ pub(crate) struct Descent {
     pub(crate) converged: bool,
 }
 
-/// A step this short moves no point by more than rounding.
+/// Length of a step that moves no point by more than rounding.
 const STILL: f64 = 1e-14;
 
-/// A step that promises this share of the tolerance is not tried: a pass over all points would only confirm that it is none.
+/// Share of the tolerance below which a promised decrease is not tried. A pass over all points would only confirm that
+/// nothing decreases.
 const NO_GAIN: f64 = 1e-2;
 
-/// A step this short that raises the objective is the noise of rounding or of one triangle's edge, not a wrong way.
+/// Length below which a step that raises the objective is noise, from rounding or from the edge of one triangle, and
+/// not a wrong direction.
 const SETTLED: f64 = 1e-7;
 
-/// A pose, and the linear problem at the feet under it.
+/// A pose, and the linear problem at the projections under it.
 struct Standing {
     pose: Pose,
     scaling: Scaling,
@@ -76,17 +79,21 @@ struct Standing {
 struct BallStep {
     scaled: Vector6<f64>,
     length: f64,
-    /// What the linear problem says that the objective falls by, at most.
+    /// Upper bound of the decrease of the objective, by the linear problem.
     promised_mm2: f64,
-    /// Number of directions that the surface sees.
+    /// Number of directions that the surface determines.
     rank: usize,
 }
 
 impl Problem<'_> {
-    /// Descends from a pose to the nearest minimum of the objective; the objective of steps taken never rises, eq. (14).
+    /// Descends from a pose to the nearest minimum of the objective. The objective of the accepted steps never rises,
+    /// eq. (14).
     ///
-    /// At the end the correspondences and the sums are those of the pose that is returned. The sums at the start may be known
-    /// already.
+    /// At the end the correspondences and the sums belong to the returned pose. `known` gives the sums at the start if
+    /// they are computed already.
+    ///
+    /// # Errors
+    /// Fewer points in the fit than free coordinates.
     pub(crate) fn descend(
         &self,
         start: Pose,
@@ -99,7 +106,7 @@ impl Problem<'_> {
             None => self.stand(start, correspondences),
         };
         let (mut ball_radius, mut rank, mut converged) = (self.ball_radius, 0, false);
-        // Whether the correspondences tell of the pose that stands, or of one that was taken back.
+        // True if the correspondences belong to the current pose, false if they belong to a step that was undone.
         let mut current = true;
         for _ in 0..self.most_iterations {
             let step = self.step_within(ball_radius, &at)?;
@@ -134,13 +141,14 @@ impl Problem<'_> {
         Ok(Descent { cmm_from_model: pose, objective_mm2: sums.objective_mm2, scaling, sums, rank, converged })
     }
 
-    /// Finds the feet under a pose and sums the linear problem there.
+    /// Projects all points under a pose and sums the linear problem there.
     fn stand(&self, pose: Pose, correspondences: &mut [Correspondence]) -> Standing {
         let scaling = self.scaling_at(&pose);
         Standing { pose, scaling, sums: self.feet(correspondences, &pose, &scaling) }
     }
 
-    /// Returns the best step of the linear problem within the ball, along the directions that are free and seen; eq. (15).
+    /// Returns the best step of the linear problem within the ball, along the free directions that the surface
+    /// determines; eq. (15).
     fn step_within(&self, ball_radius: f64, at: &Standing) -> Result<BallStep, RegistrationError> {
         let sums = &at.sums;
         if sums.points < self.locked.iter().filter(|locked| !**locked).count() {
@@ -155,18 +163,18 @@ impl Problem<'_> {
         Ok(BallStep { scaled: m, length: m.norm(), promised_mm2: 2.0 * m.dot(&right), rank })
     }
 
-    /// Whether a step is not worth trying; the first of a registration is, if it moves anything.
+    /// Returns true if a step is not worth a trial. The first step of a registration is tried if it moves anything.
     fn is_at_minimum(&self, step: &BallStep, sums: &Sums, is_first: bool) -> bool {
         let little = !is_first && step.promised_mm2 <= NO_GAIN * self.tolerance * sums.objective_mm2;
         step.length < STILL || sums.objective_mm2 == 0.0 || little
     }
 
-    /// Where the twist of a step from a pose is taken.
+    /// Returns the centre and the size to which the twist of a step from a pose refers.
     pub(crate) fn scaling_at(&self, pose: &Pose) -> Scaling {
         Scaling { centre: pose.inverse().point(&self.middle), size_mm: self.size_mm }
     }
 
-    /// Finds the feet under a pose and sums the linear problem.
+    /// Projects all points under a pose and returns the sums of the linear problem.
     pub(crate) fn feet(&self, correspondences: &mut [Correspondence], pose: &Pose, scaling: &Scaling) -> Sums {
         correspond(&self.surface, &self.residual, self.measured, correspondences, pose, scaling)
     }

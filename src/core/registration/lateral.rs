@@ -1,18 +1,21 @@
-//! Whether a map of the deviations would sit where it belongs on the part.
+//! Lateral error of a map of the deviations: how far it lies from its place on the part.
 //!
-//! On a shallow part the heights are known to micrometres while the part may be shifted or turned in its own surface by millimetres
-//! without any distance telling. A map made in such a pose has the right shape at the wrong place. By how much that makes it wrong:
+//! On a shallow part the heights are known to micrometres. At the same time the part can be shifted or turned within
+//! its own surface by millimetres, and no distance shows it. A map made in this pose has the right shape at the wrong
+//! place. The resulting error is:
 //!
 //! ```text
-//!  error of the map  =  k * (largest lateral uncertainty of a point, from the covariance of the pose)  *  (slope of the map)
+//!  error of the map  =  k * (largest lateral uncertainty of a point) * (slope of the map)
+//!
+//!  k: coverage factor; lateral uncertainty: from the covariance of the pose
 //! ```
 //!
-//! The slope is that between neighbouring patches of the measured deviations, the value that 95 of 100 pairs stay below; patches and
-//! not points, so that the noise of points that lie close together is not taken for slope. The map is refused when its error is more
-//! than a share of what there is to correct, its rms. It is refused too when it might sit farther beside its place than a limit,
-//! however gentle its slopes: where the part ends, and where panels meet, a map is not gentle, and a tool path that is cut to the outline
-//! of the part runs off it there. Directions that the recipe holds have no variance and do not count; nor do those
-//! that the surface cannot see at all, which stay where the start pose has them.
+//! The slope is taken between neighbouring patches of the measured deviations: the 95 % quantile over all pairs.
+//! Patches are used instead of points, so that the noise of points that lie close together does not count as slope. The
+//! map is refused if its error exceeds a share of the rms to be corrected. It is also refused if its lateral error
+//! exceeds a limit, however gentle its slopes are. At the edge of the part and where panels meet, a map is not gentle,
+//! and a tool path cut to the outline of the part runs off it there. Locked directions have no variance and do not
+//! count. Directions that the surface does not determine at all do not count either; they stay at the start pose.
 
 use std::collections::BTreeMap;
 
@@ -22,14 +25,14 @@ use super::deviation::{Deviation, PointStatus};
 use super::result::Registration;
 use crate::geometry::Vector;
 
-/// What error of a map is put up with.
+/// Limits for the lateral error of a map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapLimits {
-    /// How many standard uncertainties are reckoned with.
+    /// Coverage factor of the standard uncertainties.
     pub coverage_factor: f64,
-    /// The largest error of the map, as a share of the rms of what it corrects.
+    /// Largest error of the map, as a share of the rms that it corrects.
     pub share: f64,
-    /// How far the map may sit beside its place, with the coverage factor.
+    /// Largest lateral error of the map in mm, with the coverage factor.
     pub place_mm: f64,
 }
 
@@ -39,22 +42,23 @@ impl Default for MapLimits {
     }
 }
 
-/// What the lateral uncertainty of a pose does to a map.
+/// Effect of the lateral uncertainty of a pose on a map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LateralError {
-    /// Largest standard uncertainty of a measured point along the surface.
+    /// Largest standard uncertainty of a measured point along the surface, in mm.
     pub lateral_mm: f64,
-    /// Slope of the deviations, millimetres per millimetre, that 95 of 100 pairs of neighbouring patches stay below.
+    /// Slope of the deviations in mm per mm: the 95 % quantile over pairs of neighbouring patches.
     pub slope: f64,
-    /// Lateral uncertainty, with the coverage factor, times slope.
+    /// Lateral uncertainty, with the coverage factor, times slope, in mm.
     pub error_mm: f64,
 }
 
-/// Returns what the lateral uncertainty of a pose, by a covariance of its twist, does to a map of its deviations: that of the verdict tells
-/// how well the pose is found again, that of [`crate::model::Form`] also what a form does to it.
+/// Returns the effect of a pose's lateral uncertainty on a map of its deviations. `covariance` is that of the twist.
+/// The covariance of the verdict gives the repeatability of the pose. The covariance of [`crate::model::Form`] also
+/// includes the effect of form on the pose.
 ///
-/// Equation: for the twist [v; omega] of covariance C a point moves by v + omega x p; J C J^T with J = [1, -p^], seen in the tangent
-/// plane, is the covariance of that; its largest eigenvalue counts.
+/// Equation: for the twist [v; omega] of covariance C a point moves by v + omega x p. The covariance of this motion is
+/// J C J^T with J = [1, -p^], projected onto the tangent plane; its largest eigenvalue counts.
 pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_factor: f64) -> LateralError {
     let used: Vec<&Deviation> = found.deviations.iter().filter(|d| d.status == PointStatus::Used).collect();
     let lateral_mm = used.iter().map(|d| lateral_sigma(covariance, d)).fold(0.0, f64::max);
@@ -62,9 +66,9 @@ pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_f
     LateralError { lateral_mm, slope, error_mm: coverage_factor * lateral_mm * slope }
 }
 
-/// Tells in words why no map may be made from a registration; nothing if one may.
+/// Returns in words why a registration does not allow a map; `None` if it does.
 ///
-/// See the head of this module for the criterion.
+/// The module documentation gives the criterion.
 pub fn weak_for_compensation(found: &Registration, covariance: &Matrix6<f64>, limits: &MapLimits) -> Option<String> {
     let LateralError { lateral_mm, slope, error_mm } = lateral_error(found, covariance, limits.coverage_factor);
     let rms_mm = found.verdict.rms_mm;
@@ -91,11 +95,11 @@ pub fn weak_for_compensation(found: &Registration, covariance: &Matrix6<f64>, li
     ))
 }
 
-/// Standard uncertainty of a point along the surface, in the direction in which it is largest.
+/// Returns the standard uncertainty of a point along the surface, in mm, in the direction in which it is largest.
 fn lateral_sigma(c: &Matrix6<f64>, deviation: &Deviation) -> f64 {
     let hat = deviation.point.coords.cross_matrix();
     let block = |i: usize, j: usize| -> Matrix3<f64> { c.fixed_view::<3, 3>(i, j).into_owned() };
-    // (v - p^ omega) has the covariance Cvv - Cvw p^T... with p^T = -p^.
+    // (v - p^ omega) has the covariance Cvv + Cvw p^ - p^ Cwv - p^ Cww p^, because p^T = -p^.
     let moved = block(0, 0) + block(0, 3) * hat - hat * block(3, 0) - hat * block(3, 3) * hat;
     let n: Vector = deviation.normal;
     let tangent = Matrix3::identity() - n * n.transpose();
@@ -103,12 +107,12 @@ fn lateral_sigma(c: &Matrix6<f64>, deviation: &Deviation) -> f64 {
     (0.5 * (seen + seen.transpose())).symmetric_eigenvalues().max().max(0.0).sqrt()
 }
 
-/// The slope between neighbouring patches that 95 of 100 pairs stay below; 0 if there are no neighbours.
+/// Returns the 95 % quantile of the slopes between neighbouring patches; 0 if there are no neighbours.
 fn slope(used: &[&Deviation]) -> f64 {
     let n = used.len() as f64;
     let middle = used.iter().map(|d| d.point.coords).sum::<Vector>() / n;
     let size = (used.iter().map(|d| (d.point.coords - middle).norm_squared()).sum::<f64>() / n).sqrt();
-    // Points spread over a square of rms size s stand s sqrt(6 / n) apart; a patch holds about nine of them.
+    // Points spread over a square of rms size s are s sqrt(6 / n) apart, so a patch holds about nine of them.
     let edge = 3.0 * size * (6.0 / n).sqrt();
     if !(edge > 0.0 && edge.is_finite()) {
         return 0.0;
@@ -156,7 +160,7 @@ mod tests {
     const HEIGHT_MM: f64 = 0.05;
     const WAVE_MM: f64 = 100.0;
 
-    /// A flat part that carries a wave, d = h sin(x / w), and whose pose has these standard uncertainties.
+    /// Returns a flat part that carries a wave, d = h sin(x / w), with the given standard uncertainties of the pose.
     fn waved(sigmas: [f64; 6], twins: bool) -> Registration {
         let at = |k: usize| HALF_MM * (k as f64 / 20.0 - 1.0);
         let mut deviations: Vec<Deviation> = (0..=40)
@@ -171,7 +175,7 @@ mod tests {
             })
             .collect();
         if twins {
-            // The same places again a micrometre aside, with noise: no slope of the part.
+            // The same places again, a micrometre aside and with noise. This adds no slope to the part.
             let noisy = |(k, d): (usize, &Deviation)| Deviation {
                 point: d.point + Vector::new(1e-3, 0.0, 0.0),
                 deviation_mm: d.deviation_mm + if k % 2 == 0 { 1e-3 } else { -1e-3 },

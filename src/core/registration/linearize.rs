@@ -1,15 +1,16 @@
-//! One row of the linear problem A m = b a point, summed into its normal matrix.
+//! Linear problem A m = b with one row per point, summed into its normal matrix.
 
 use nalgebra::{Matrix6, Vector6};
 
 use crate::geometry::{Point, Twist, Vector};
 use crate::surface::simd::{F64x4, LANES, Real, Vector3x4, cross, minus};
 
-/// Where the twist of a step is taken: about the middle of the cloud, translations in units of its size.
+/// Centre and size to which the twist of a step refers: rotations about the centroid of the cloud, translations in
+/// units of its size.
 ///
-/// About the origin of the model frame a far part would make every rotation look like a translation; about its middle the
-/// columns are as independent as the surface allows. In units of its size a ball |m| <= alpha means the same motion of the
-/// rim for a translation as for a rotation, whatever the size of the part.
+/// About the origin of the model frame, every rotation of a distant part would look like a translation. About the
+/// centroid, the columns of A are as independent as the surface allows. In units of the size, a ball |m| <= alpha
+/// allows the same motion of the rim by translation as by rotation, for any size of the part.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Scaling {
     pub(crate) centre: Point,
@@ -17,7 +18,7 @@ pub(crate) struct Scaling {
 }
 
 impl Scaling {
-    /// Returns the twist in the model frame, millimetres and radians, of scaled coordinates about the centre.
+    /// Returns the twist in the model frame, in mm and radians, of scaled coordinates about the centre.
     pub(crate) fn twist(&self, scaled: &Vector6<f64>) -> Twist {
         let omega: Vector = scaled.fixed_rows::<3>(3).into();
         let shift: Vector = scaled.fixed_rows::<3>(0) * self.size_mm;
@@ -25,7 +26,7 @@ impl Scaling {
         Twist::new(v.x, v.y, v.z, omega.x, omega.y, omega.z)
     }
 
-    /// Returns the matrix that takes scaled coordinates about the centre to a twist in the model frame.
+    /// Returns the 6x6 matrix that maps scaled coordinates about the centre to a twist in the model frame.
     pub(crate) fn to_twist(self) -> Matrix6<f64> {
         Matrix6::from_columns(&std::array::from_fn::<_, 6, _>(|k| {
             let mut unit = Vector6::zeros();
@@ -34,7 +35,8 @@ impl Scaling {
         }))
     }
 
-    /// Returns the row of A for a point with a normal, eq. (12): how the distance falls with each coordinate of the step.
+    /// Returns the row of A for a point and its normal, eq. (12): the decrease of the distance with each coordinate of
+    /// the step.
     #[inline]
     pub(crate) fn row(&self, p: &Point, normal: &Vector) -> [f64; 6] {
         let arm = (p - self.centre).cross(normal);
@@ -44,7 +46,7 @@ impl Scaling {
 }
 
 impl Scaling {
-    /// The rows of four points side by side.
+    /// Returns the rows of four points, one point per lane.
     #[inline(always)]
     pub(crate) fn four_rows(&self, p: &Vector3x4, normal: &Vector3x4) -> [F64x4; 6] {
         let centre = [F64x4::splat(self.centre.x), F64x4::splat(self.centre.y), F64x4::splat(self.centre.z)];
@@ -54,7 +56,7 @@ impl Scaling {
     }
 }
 
-/// The sums of points that come in fours, a sum for each of the four.
+/// Sums over points in groups of four, one sum per lane.
 #[derive(Clone, Debug)]
 pub(crate) struct FourSums {
     gram: [F64x4; 21],
@@ -69,7 +71,7 @@ impl FourSums {
         Self { gram: [zero; 21], right: [zero; 6], objective_mm2: zero, points: 0 }
     }
 
-    /// Adds four points, of which those with a weight and a loss of 0 change nothing.
+    /// Adds four points. A point with weight 0 and loss 0 changes no sum; `used` is the number of points in the fit.
     #[inline(always)]
     pub(crate) fn add(&mut self, row: &[F64x4; 6], distance: F64x4, weight: F64x4, loss_mm2: F64x4, used: usize) {
         let mut k = 0;
@@ -85,7 +87,7 @@ impl FourSums {
         self.points += used;
     }
 
-    /// Adds the four sums, in their order, to another.
+    /// Adds the four sums, in their order, to `sums`.
     pub(crate) fn add_to(&self, sums: &mut Sums) {
         for l in 0..LANES {
             for (a, b) in sums.gram.iter_mut().zip(&self.gram) {
@@ -100,16 +102,16 @@ impl FourSums {
     }
 }
 
-/// The normal equations of the linear problem: A^T A, A^T b and what was summed along.
+/// Normal equations of the linear problem: A^T W A, A^T W b, the objective and the number of points.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Sums {
     /// Lower triangle of A^T W A, row by row.
     gram: [f64; 21],
     /// A^T W b, eq. (13).
     right: [f64; 6],
-    /// The objective: sum of the squared distances, or of the robust loss of them; eq. (7).
+    /// Objective in mm^2: the sum of the squared distances, or of their robust loss; eq. (7).
     pub(crate) objective_mm2: f64,
-    /// Number of points that were counted.
+    /// Number of points in the fit.
     pub(crate) points: usize,
 }
 
@@ -118,7 +120,7 @@ impl Sums {
         Self { gram: [0.0; 21], right: [0.0; 6], objective_mm2: 0.0, points: 0 }
     }
 
-    /// Adds one point of a weight and its share of the objective.
+    /// Adds one point with its weight and its share of the objective.
     #[inline]
     pub(crate) fn add(&mut self, row: &[f64; 6], distance: f64, weight: f64, loss_mm2: f64) {
         let mut k = 0;
@@ -134,7 +136,7 @@ impl Sums {
         self.points += 1;
     }
 
-    /// Adds another sum; in a fixed order, so that a result does not depend on the number of threads.
+    /// Adds other sums. Callers merge in a fixed order, so that the result does not depend on the number of threads.
     pub(crate) fn merge(mut self, other: &Self) -> Self {
         for (a, b) in self.gram.iter_mut().zip(&other.gram) {
             *a += b;
@@ -147,7 +149,7 @@ impl Sums {
         self
     }
 
-    /// Returns A^T A.
+    /// Returns A^T W A.
     pub(crate) fn gram(&self) -> Matrix6<f64> {
         Matrix6::from_fn(|i, j| {
             let (i, j) = (i.max(j), i.min(j));
@@ -155,7 +157,7 @@ impl Sums {
         })
     }
 
-    /// Returns A^T b.
+    /// Returns A^T W b.
     pub(crate) fn right(&self) -> Vector6<f64> {
         Vector6::from(self.right)
     }
@@ -166,7 +168,7 @@ mod tests {
     use super::*;
     use crate::geometry::Pose;
 
-    /// The row is the derivative of the distance to a fixed plane, with the sign of eq. (11), as the equation states it.
+    /// Compares the row with the derivative of the distance to a fixed plane, with the sign of eq. (11).
     #[test]
     fn the_row_is_the_derivative_of_the_distance() {
         let scaling = Scaling { centre: Point::new(30.0, -20.0, 7.0), size_mm: 40.0 };

@@ -1,17 +1,18 @@
-//! Where is the part? Registers measured probe centres to the offset of the nominal surface.
+//! Registration: estimates the pose of the part from measured probe centres and the offset of the nominal surface.
 //!
 //! ```text
 //!  start  ------->  correspond -> linearize -> solve  ------->  verdict
-//!  (search,         (feet)        (A, b)       (ball)           (covariance, weak directions, outliers)
+//!  (search,         (projections) (A, b)       (ball)           (covariance, weak directions, outliers)
 //!   or given)          ^                          |
-//!                      +------ iterate -----------+          (refit: once more without what does not belong to the fit)
+//!                      +------ iterate -----------+          (refit: once more without the rejected points)
 //! ```
 //!
-//! The method is section 2 of the paper: alternate between the feet of the points on the offset surface and a
-//! ball-constrained least-squares step of the pose, until the objective no longer falls.
+//! The method is section 2 of the paper. It alternates between the projection of the points onto the offset surface and
+//! a ball-constrained least-squares step of the pose, until the objective no longer falls.
 //!
-//! Pure: no file, no clock, no randomness; the same input gives the same bits on any number of threads. Frames: measured
-//! points are in the CMM frame {W}, the nominal surface in the model frame {M}. Units: millimetres and radians.
+//! Pure: no file, no clock, no randomness. The same input gives the same bits on any number of threads. Frames:
+//! measured points are in the CMM frame {W}, the nominal surface in the model frame {M}. Units: millimetres and
+//! radians.
 
 mod alone;
 mod correspond;
@@ -54,11 +55,11 @@ pub(crate) use robust::robust_sigma;
 use start::{InitialPose, free_rms, initial_pose, mirror_image, mirrored_rms};
 pub use verdict::{Verdict, WeakDirection};
 
-/// Registers measured points to a nominal surface.
+/// Registers measured points to a nominal surface and returns the pose, the deviations and the verdict.
 ///
-/// Shapes: measured points in any order, at least one more than there are free directions; the deviations come back in the same order. Frames: the points are in the
-/// CMM frame, the surface in the model frame, and the pose takes the latter to the former. Units: millimetres. Equations: (3),
-/// (7) to (15) of the paper.
+/// Shapes: measured points in any order, at least one more than there are free directions; one deviation per point, in
+/// the same order. Frames: the points are in the CMM frame, the surface in the model frame. The pose maps the model
+/// frame to the CMM frame. Units: millimetres. Equations: (3), (7) to (15) of the paper.
 ///
 /// # Errors
 /// Input that cannot be registered, a cloud that does not fit the surface, and an iteration that does not converge.
@@ -73,7 +74,7 @@ pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Res
     Ok(registration)
 }
 
-/// Finds the pose, whatever it is worth.
+/// Estimates the pose without a test of how well it fits.
 fn fit(part: &Part, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
     if let Some(side) = options.side.given() {
         part.check_fold(options, side)?;
@@ -92,9 +93,9 @@ fn fit(part: &Part, measured: &[Point], options: &Options) -> Result<Registratio
     report(part, &problem, descent, correspondences, trace, &initial, options)
 }
 
-/// Says that a cloud is a mirror image, if that is why it cannot be registered.
+/// Replaces an error by [`RegistrationError::Mirrored`] if a mirrored cloud is the cause.
 ///
-/// What is wrong with the surface, the radius or the points themselves is found before any pose is tried, and stays as it is.
+/// Errors of the surface, the radius or the points are found before any pose is tried. They are returned unchanged.
 fn or_mirrored(part: &Part, measured: &[Point], options: &Options, error: RegistrationError) -> RegistrationError {
     use RegistrationError::{NotConverged, TooFewUsed, Undetermined, WrongSide};
     if !matches!(error, TooFewUsed { .. } | NotConverged { .. } | WrongSide { .. } | Undetermined) {
@@ -106,7 +107,7 @@ fn or_mirrored(part: &Part, measured: &[Point], options: &Options, error: Regist
     }
 }
 
-/// Turns the end of the iteration into what is reported.
+/// Converts the end of the iteration to the reported result.
 fn report(
     part: &Part,
     problem: &Problem,
@@ -130,15 +131,16 @@ fn report(
     Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: initial.side, verdict })
 }
 
-/// No distance is told more exactly.
+/// Difference of two distances that is only rounding, in mm.
 const ROUNDING_MM: f64 = 1e-12;
 
-/// The turns of the iteration with the state that is reported as the last, whatever came to count behind them.
+/// Returns the trace with the reported state as its last entry. Appends an entry if the last step was undone, or if
+/// more points count than at the last accepted step.
 fn with_the_end(mut trace: Vec<Iteration>, verdict: &Verdict, options: &Options) -> Vec<Iteration> {
     let Verdict { objective_mm2, used, .. } = *verdict;
     let is_told = |taken: &&Iteration| {
         let off_mm2 = (taken.objective_mm2 - objective_mm2).abs();
-        // Sums in another order differ by rounding, which is all there is where the points lie on the surface.
+        // Sums in another order differ by rounding. If the points lie on the surface, the sums contain nothing else.
         taken.points == used && off_mm2 <= 1e-9 * objective_mm2 + used as f64 * ROUNDING_MM * ROUNDING_MM
     };
     let told = trace.iter().rfind(|turn| turn.taken).filter(is_told).map(|turn| turn.objective_mm2);
@@ -150,7 +152,10 @@ fn with_the_end(mut trace: Vec<Iteration>, verdict: &Verdict, options: &Options)
     trace
 }
 
-/// Refuses a fit that is none: a cloud of another part, or a mirror image.
+/// Rejects a fit of another part or of a mirror image.
+///
+/// # Errors
+/// A strip that is too narrow, a mirror image, or an rms above the limit.
 fn confirm(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
     narrow::check_strip(&found.deviations, options)?;
     let rms_mm = found.verdict.rms_mm;
@@ -159,8 +164,9 @@ fn confirm(part: &Part, found: &Registration, measured: &[Point], options: &Opti
     if !doubtful {
         return Ok(());
     }
-    // A pose that is held does not tell a mirror image from a part that lies elsewhere, and what a tenth of the points say of a defect does not tell
-    // it from another surface: both are compared as they fit when nothing holds them, by the same measure.
+    // A locked pose cannot distinguish a mirror image from a part that lies elsewhere. A defect on a tenth of the
+    // points cannot be distinguished from another surface. So both clouds are fitted with nothing locked, and compared
+    // by the same trimmed rms.
     let is_held = options.locked.contains(&true);
     let free_rms_mm = free_rms(part, measured, options, found.side).unwrap_or(rms_mm);
     if let Some(mirrored_rms_mm) = mirrored_rms(part, measured, options, found.side)

@@ -1,11 +1,11 @@
-//! Clouds that are hardly wider than a line: a scan line, a few rows.
+//! Clouds that are hardly wider than a line: a scan line, or a few rows.
 //!
-//! A line of points fits a curved surface in poses that are centimetres apart, and the scatter says of each that it is exact: what turns the
-//! part about the line moves no point far. So such a cloud is refused, unless what it cannot tell is held: the turn about it, and the
-//! shift across it.
+//! A line of points fits a curved surface in poses that are centimetres apart. The residual noise makes each of them
+//! look exact, because a turn of the part about the line moves no point far. So a narrow cloud is refused, unless the
+//! directions that it does not determine are locked: the rotation about the line, and the shift across it.
 //!
-//! Two looks. Before any pose is tried: do the points follow each other like beads on a thread? After the fit: how wide is the strip of
-//! the contacts along the surface, in distances from point to point?
+//! There are two tests. Before the search for a pose: do the points follow each other like beads on a thread? After the
+//! fit: how wide is the strip of contacts along the surface, in distances from point to point?
 
 use nalgebra::{Matrix3, SymmetricEigen};
 
@@ -14,16 +14,16 @@ use super::error::RegistrationError;
 use super::options::{Coordinate, Options, Start};
 use crate::geometry::{Point, Pose, Vector};
 
-/// A cloud narrower than so many distances from point to point tells nothing across.
+/// Smallest width of a cloud, in distances from point to point. A narrower cloud determines nothing across.
 const LEAST_DISTANCES: f64 = 2.5;
-/// From end to end of a thread, point by point, it is no farther than so many times its extent.
+/// Largest length of the path from point to point of a thread, in units of its extent.
 const THREAD: f64 = 2.0;
-/// Points that are looked at, at most.
+/// Most points that are examined.
 const MOST: usize = 600;
-/// A cloud that is wider than this share of its length is not narrow, however few its points are.
+/// Width, as a share of the length, above which a cloud is not narrow, however few points it has.
 const WIDE: f64 = 0.2;
 
-/// Refuses a thread before a pose is tried.
+/// Rejects a thread before any pose is tried, unless the undetermined directions are locked.
 pub(super) fn check_thread(measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
     let few: Vec<Point> = measured.iter().step_by(measured.len().div_ceil(MOST)).copied().collect();
     let Some(_) = Thread::of(few) else { return Ok(()) };
@@ -36,7 +36,7 @@ pub(super) fn check_thread(measured: &[Point], options: &Options) -> Result<(), 
     if are_held(&needed, options) { Ok(()) } else { Err(refused(thread.width_mm, thread.distance_mm, needed)) }
 }
 
-/// Points that follow each other along a line, which may be bent.
+/// Points that follow each other along a line, straight or bent.
 struct Thread {
     axis: Vector,
     width_mm: f64,
@@ -44,7 +44,8 @@ struct Thread {
 }
 
 impl Thread {
-    /// Taken in the order along the longest axis, the points of a plane go to and fro across it, and those of a line do not.
+    /// Returns the thread that the points form, or `None`. In the order along the longest axis, the points of a plane
+    /// go to and fro across it; the points of a line do not.
     fn of(mut points: Vec<Point>) -> Option<Self> {
         let (middle, axes) = principal(points.iter().copied());
         let axis: Vector = axes.column(2).into();
@@ -65,7 +66,7 @@ impl Thread {
     }
 }
 
-/// Refuses a strip of contacts that is too narrow for its points.
+/// Rejects a strip of contacts that is too narrow for its points, unless the undetermined directions are locked.
 pub(super) fn check_strip(deviations: &[Deviation], options: &Options) -> Result<(), RegistrationError> {
     let used = || deviations.iter().filter(|d| d.status == PointStatus::Used);
     let normal = used().map(|d| d.normal).sum::<Vector>();
@@ -77,7 +78,7 @@ pub(super) fn check_strip(deviations: &[Deviation], options: &Options) -> Result
     let (middle, axes) = principal(used().map(flat));
     let [across, along]: [Vector; 2] = [1, 2].map(|k| axes.column(k).into());
     let extent = |axis: &Vector| {
-        // Of a strip that is evenly filled: sqrt(12) times its standard deviation.
+        // Extent of an evenly filled strip: sqrt(12) times its standard deviation.
         let (sum, n) = used().fold((0.0, 0.0), |(sum, n), d| (sum + (flat(d) - middle).dot(axis).powi(2), n + 1.0));
         (12.0 * sum / n).sqrt()
     };
@@ -93,7 +94,7 @@ pub(super) fn check_strip(deviations: &[Deviation], options: &Options) -> Result
             others.map(|(_, p)| (p - contacts[k]).norm_squared()).fold(f64::INFINITY, f64::min).sqrt()
         })
         .collect();
-    // Rows may lie nearer to each other than their points do.
+    // Rows can be nearer to each other than the points in a row.
     let distance_mm = median(&mut nearest).max((width_mm * length_mm / contacts.len() as f64).sqrt());
     let needed = untold(along, normal);
     if width_mm < LEAST_DISTANCES * distance_mm && !are_held(&needed, options) {
@@ -102,7 +103,7 @@ pub(super) fn check_strip(deviations: &[Deviation], options: &Options) -> Result
     Ok(())
 }
 
-/// The turn about a line and the shift across it, as the coordinates nearest to them.
+/// Returns the shift across a line and the rotation about it, as the nearest coordinates.
 fn untold(line: Vector, normal: Vector) -> [Coordinate; 2] {
     const SHIFTS: [Coordinate; 3] = [Coordinate::X, Coordinate::Y, Coordinate::Z];
     const TURNS: [Coordinate; 3] = [Coordinate::Rx, Coordinate::Ry, Coordinate::Rz];
@@ -118,7 +119,7 @@ fn refused(width_mm: f64, distance_mm: f64, hold: [Coordinate; 2]) -> Registrati
     RegistrationError::Narrow { width_mm, distance_mm, least_mm: LEAST_DISTANCES * distance_mm, hold }
 }
 
-/// The middle of points, and their principal axes from the shortest to the longest.
+/// Returns the centroid of the points, and their principal axes from the shortest to the longest, one per column.
 fn principal(points: impl Iterator<Item = Point> + Clone) -> (Point, Matrix3<f64>) {
     let n = points.clone().count().max(1) as f64;
     let middle = Point::from(points.clone().map(|p| p.coords).sum::<Vector>() / n);

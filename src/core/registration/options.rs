@@ -1,4 +1,4 @@
-//! How to register: what is asked for.
+//! Options of a registration.
 
 use crate::geometry::Pose;
 use crate::surface::{Distance, Side};
@@ -20,13 +20,13 @@ pub enum Method {
     SubtractRadius,
 }
 
-/// Where to begin.
+/// Start of the search for the pose.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Start {
-    /// Nowhere in particular: several poses are tried, chosen by the shape of the surface.
+    /// No start pose: several poses are tried, chosen by the shape of the surface.
     #[default]
     Search,
-    /// At a pose `cmm_from_model`.
+    /// A start pose `cmm_from_model`.
     Pose(Pose),
 }
 
@@ -49,7 +49,7 @@ pub enum ProbeSide {
 }
 
 impl ProbeSide {
-    /// Returns the side, if it is given.
+    /// Returns the side, or `None` for [`ProbeSide::Auto`].
     pub fn given(self) -> Option<Side> {
         match self {
             Self::Auto => None,
@@ -83,44 +83,45 @@ pub enum Coordinate {
 }
 
 impl Coordinate {
-    /// Returns its name, as recipes and commands have it.
+    /// Returns the name of the coordinate in recipes and commands.
     pub fn name(self) -> &'static str {
         ["x", "y", "z", "rx", "ry", "rz"][self as usize]
     }
 
-    /// Returns which of x, y, z, rx, ry, rz are among some coordinates, as [`Options::locked`] has them.
+    /// Returns one flag for each of x, y, z, rx, ry, rz, true if it is among `coordinates`; the form of
+    /// [`Options::locked`].
     pub fn locked(coordinates: &[Self]) -> [bool; 6] {
         [Self::X, Self::Y, Self::Z, Self::Rx, Self::Ry, Self::Rz].map(|coordinate| coordinates.contains(&coordinate))
     }
 }
 
-/// How to register.
+/// Options of a registration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
     /// Radius of the probe in millimetres.
     pub probe_radius_mm: f64,
-    /// What the measured points are taken for.
+    /// Meaning of the measured points.
     pub method: Method,
-    /// How the nominal surface runs between its points.
+    /// Shape of the nominal surface between its points.
     pub distance: Distance,
-    /// Where to begin.
+    /// Start of the search for the pose.
     pub start: Start,
-    /// On which side of the nominal surface the probe centres lie.
+    /// Side of the nominal surface on which the probe centres lie.
     pub side: ProbeSide,
-    /// Coordinates that every step leaves alone: x, y, z, rx, ry, rz of the model frame.
+    /// Locked coordinates, which no step changes: x, y, z, rx, ry, rz of the model frame.
     pub locked: [bool; 6],
-    /// How a distance counts.
+    /// Loss of a distance.
     pub loss: Loss,
-    /// A point farther from the surface than this many robust sigmas is an outlier where no neighbour found the same;
-    /// infinity keeps every point.
+    /// Limit for an outlier, in robust sigmas. A point farther from the surface is an outlier if no neighbour confirms
+    /// it. Infinity keeps every point.
     pub outlier_sigmas: f64,
-    /// Stop when 1 - f(l+1) / f(l) falls to this: the paper's epsilon.
+    /// Relative decrease 1 - f(l+1) / f(l) at which the iteration stops: epsilon in the paper.
     pub tolerance: f64,
-    /// The first radius of the ball, in radians and in units of the cloud's rms size: alpha in eq. (15).
+    /// Initial radius of the ball, in radians and in units of the cloud's rms size: alpha in eq. (15).
     pub ball_radius: f64,
-    /// Give up after this many iterations.
+    /// Maximum number of iterations before the registration fails.
     pub most_iterations: usize,
-    /// Refuse a fit whose rms deviation is above this; `None` for 0.2 mm and one part in ten thousand of the cloud's rms size.
+    /// Largest rms deviation of an accepted fit, in mm; `None` for 0.2 mm plus 1e-4 of the cloud's rms size.
     pub rms_limit_mm: Option<f64>,
 }
 

@@ -1,4 +1,4 @@
-//! The part to register to, with what can be checked before anything is computed.
+//! Nominal part to register to, and the checks of the input before any computation.
 
 use rayon::prelude::*;
 
@@ -11,34 +11,40 @@ use super::iterate::Problem;
 use super::options::{Method, Options, Start};
 use super::robust::{Loss, ScaledLoss};
 
-/// The nominal surface and the sizes that limits are stated in.
+/// Nominal surface, and the sizes that the limits refer to.
 pub(super) struct Part<'a> {
     pub(super) nominal: &'a Nominal,
-    /// Radius of the offset surface: the probe's, or 0 where the points are registered to the nominal surface itself.
+    /// Radius of the offset surface in mm: that of the probe, or 0 if the points are registered to the nominal surface
+    /// itself.
     pub(super) offset_mm: f64,
-    /// Subtracted from each distance.
+    /// Length subtracted from each distance, in mm.
     pub(super) subtract_mm: f64,
-    /// Middle of the measured cloud.
+    /// Centroid of the measured cloud.
     pub(super) middle: Point,
-    /// Rms size of the measured cloud.
+    /// Rms size of the measured cloud, in mm.
     pub(super) size_mm: f64,
-    /// Singular values below this share of the largest count as unseen.
+    /// Smallest singular value of a direction that the surface determines, as a share of the root of the sum of their
+    /// squares.
     pub(super) least_share: f64,
 }
 
 impl<'a> Part<'a> {
-    /// Checks what can be checked before anything is computed.
+    /// Checks the input before any computation and returns the part with its sizes.
+    ///
+    /// # Errors
+    /// A fully locked pose without a start pose, too few, non-finite, collinear or repeated points, a cloud of the
+    /// wrong size, and a probe radius outside its limits.
     pub(super) fn check(
         nominal: &'a Nominal,
         measured: &[Point],
         options: &Options,
     ) -> Result<Self, RegistrationError> {
-        // A pose that is held whole is given, and the deviations from it are asked for.
+        // A fully locked pose is given; only the deviations from it are wanted.
         let is_held = options.locked == [true; 6];
         if is_held && options.start == Start::Search {
             return Err(RegistrationError::Undetermined);
         }
-        // One more than the free directions, or nothing is left to tell how well it fits.
+        // One more than the free directions. With fewer, nothing shows how well the pose fits.
         let least = 7 - options.locked.iter().filter(|locked| **locked).count();
         if measured.len() < least {
             return Err(RegistrationError::TooFewPoints { points: measured.len(), least });
@@ -52,7 +58,7 @@ impl<'a> Part<'a> {
         check_repeats(measured)?;
         let (middle, size_mm) = middle_and_size(measured);
         let nominal_mm = nominal.size_mm();
-        // A pose that is held needs no more than one point, and one point has no size.
+        // A fully locked pose needs only one point, and one point has no size.
         let size_mm = if is_held { size_mm.max(1e-3 * nominal_mm) } else { size_mm };
         if !is_held {
             check_sizes(size_mm, nominal_mm).map_err(|error| or_one_far_off(nominal, measured, error))?;
@@ -79,7 +85,7 @@ impl<'a> Part<'a> {
             .with_lookup(lookup)
     }
 
-    /// Refuses a probe that does not fit into the surface.
+    /// Rejects a probe that does not fit into the surface.
     pub(super) fn check_fold(&self, options: &Options, side: Side) -> Result<(), RegistrationError> {
         match self.surface(options, side).fold() {
             Some(fold) => Err(fold.into()),
@@ -110,9 +116,10 @@ impl<'a> Part<'a> {
     }
 }
 
-/// Refuses a cloud of which more than one point in a hundred is there twice.
+/// Rejects a cloud in which more than one point in a hundred occurs twice.
 ///
-/// Looked at are the points whose own bits choose them, some thousand of any number: of two equal points both or neither.
+/// A hash of the coordinates selects a sample of some thousand points, for any size of the cloud. Two equal points are
+/// therefore either both in the sample or both not.
 fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
     const LOOKED_AT: usize = 8192;
     let mixed = |p: &Point| {
@@ -133,7 +140,7 @@ fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
     Ok(())
 }
 
-/// Names the point far from all others that makes a size what it is, if there is one.
+/// Replaces an error of the size by the name of the one distant point that causes it, if there is one.
 fn or_one_far_off(nominal: &Nominal, measured: &[Point], error: RegistrationError) -> RegistrationError {
     if let Some((index, distance_mm)) = far_off(measured) {
         return RegistrationError::FarOff { index, at: measured[index].into(), distance_mm };

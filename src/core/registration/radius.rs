@@ -1,32 +1,33 @@
-//! What the uncertainty of the probe's radius does to a registration.
+//! Effect of the probe radius and of its uncertainty on a registration.
 //!
-//! A radius that is wrong by d moves every distance by -d. The fit takes what it can of that for a motion of the part:
+//! A radius that is wrong by d changes every distance by -d. The fit explains part of this as a motion of the part:
 //!
 //! ```text
 //!  pose  -d g,  g = (A^T A)^-1 A^T 1        deviation  -d (1 - a_i g)
 //! ```
 //!
-//! On a nearly flat part almost all of it is taken for height, where the scatter of thousands of points is far below what a sphere of
-//! some points tells the radius to: left out, it would be most of what is wrong.
+//! On a nearly flat part almost all of it becomes a change of height. There the noise of thousands of points averages
+//! to far less than the uncertainty of a radius that was calibrated on some points of a sphere. Without this term, the
+//! largest part of the uncertainty would be missing.
 
 use nalgebra::Vector6;
 
 use super::deviation::{Deviation, PointStatus};
 use super::result::Registration;
 
-/// What the points tell of the radius that they were registered with.
+/// Estimate of the probe radius from the registered points.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ToldRadius {
-    /// How much larger the radius should be, in millimetres.
+    /// Estimated radius minus the given one, in mm.
     pub(super) more_mm: f64,
-    /// Its standard uncertainty by what scatter would be left, as if every point scattered by itself.
+    /// Standard uncertainty of the estimate in mm, from the remaining residuals, which are assumed independent.
     pub(super) sigma_mm: f64,
-    /// The share of the rms that would be left.
+    /// Share of the rms that remains with the estimated radius.
     pub(super) rms_left: f64,
 }
 
 impl Registration {
-    /// Returns what the points tell of the radius, taken for a seventh unknown; `None` where there is no scatter.
+    /// Returns the radius that the points give as a seventh unknown; `None` if the residuals are zero.
     ///
     /// ```text
     ///  dr = sum r_i (1 - a_i g) / sum (1 - a_i g)^2
@@ -51,10 +52,12 @@ impl Registration {
         (more_mm.is_finite() && sigma_mm.is_finite() && told.rms_left.is_finite()).then_some(told)
     }
 
-    /// Adds the standard uncertainty of the probe's radius, in millimetres, to what is stated of pose and deviations.
+    /// Adds the standard uncertainty of the probe radius, in mm, to the covariance of the pose and to the uncertainties
+    /// of the deviations.
     ///
-    /// (A^T A)^-1 is taken from the covariance, so that directions that are held or locked stay as they are; without any
-    /// scatter there is none, and nothing is changed. Equation: GUM, 5.1.2, for one more input; a robust loss is taken for squares.
+    /// (A^T A)^-1 is taken from the covariance, so directions that are undetermined or locked do not change. If the
+    /// residuals are zero, the matrix is not available and nothing changes. Equation: GUM, 5.1.2, for one more input. A
+    /// robust loss is treated as squares.
     pub fn allow_for_radius(&mut self, radius_sigma_mm: f64) {
         let variance = self.verdict.residual_sigma_mm.powi(2);
         if !(variance > 0.0 && radius_sigma_mm > 0.0 && radius_sigma_mm.is_finite()) {
@@ -71,7 +74,8 @@ impl Registration {
     }
 }
 
-/// How the distance of a point falls with the twist of the pose; moving the point along its normal changes nothing of it.
+/// Returns the decrease of a point's distance with each coordinate of the pose's twist. A move of the point along its
+/// normal does not change it.
 fn row(deviation: &Deviation) -> Vector6<f64> {
     let (n, arm) = (deviation.normal, deviation.point.coords.cross(&deviation.normal));
     Vector6::new(n.x, n.y, n.z, arm.x, arm.y, arm.z)

@@ -1,4 +1,4 @@
-//! From the initial pose to the one that is reported: descend, trim what does not belong to the fit, and refit.
+//! Descent from the initial pose to the reported one: descend, reject outliers, and fit again.
 
 use rayon::prelude::*;
 
@@ -11,7 +11,10 @@ use super::options::Options;
 use super::robust::{Loss, ScaledLoss, robust_sigma};
 use super::start::{InitialPose, spread};
 
-/// Descends, drops what is off the part or an outlier, and descends again until nothing changes.
+/// Descends, rejects the points that are off the part or outliers, and repeats until nothing changes.
+///
+/// # Errors
+/// A descent that does not converge, too few points in the fit, and a pose without any determined direction.
 pub(super) fn trim_and_refit(
     problem: &Problem,
     initial: &InitialPose,
@@ -19,7 +22,8 @@ pub(super) fn trim_and_refit(
     correspondences: &mut [Correspondence],
     trace: &mut Vec<Iteration>,
 ) -> Result<Descent, RegistrationError> {
-    /// Rounds after which points are only dropped and no longer taken back, so that the sets cannot alternate for ever.
+    /// Rounds after which points are only rejected and no longer accepted again, so that the sets cannot alternate for
+    /// ever.
     const BOTH_WAYS: usize = 8;
     const MOST_ROUNDS: usize = 16;
     let mut problem = *problem;
@@ -58,13 +62,15 @@ pub(super) fn trim_and_refit(
     }
 }
 
-/// How many points of a dense cloud descend before the rest: first a few for the long way, then more for the rest of it.
+/// Numbers of points of a dense cloud that descend before the rest: first a few for the long way, then more for the
+/// rest of it.
 const COARSE_COUNTS: [usize; 2] = [1024, 16_384];
 
-/// The same where every place touched costs a fit: fewer touch less, and the rest then touch only where they end.
+/// The same if the surface must be fitted at every place touched. Fewer points touch fewer places, and the rest then
+/// touch only the places near the end.
 const COARSE_COUNTS_WHERE_NORMALS_COST: [usize; 1] = [2048];
 
-/// Starts the search for the feet near where they are, with the normals there fitted all at once.
+/// Sets the start places of the projections near the points, and fits the normals there all at once.
 fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) {
     if !problem.surface.fits_normals() {
         return;
@@ -76,9 +82,11 @@ fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Po
     }
 }
 
-/// Descends with a few of many points, from where the rest have a step or two to go; its turns stand in the trace.
+/// Descends with `count` of the points to a pose from which all points need only a step or two. Its steps are added to
+/// the trace.
 ///
-/// Near the end outliers are told among the few themselves; far from it they cannot be.
+/// `screened` rejects outliers among the few points. This is possible near the end only; far from it outliers cannot be
+/// distinguished.
 fn descend_coarsely(
     problem: &Problem,
     pose: Pose,
@@ -98,7 +106,7 @@ fn descend_coarsely(
     Ok(coarse.descend(pose, None, &mut correspondences, trace)?.cmm_from_model)
 }
 
-/// Refuses an end that hangs on too few points, or on none of the six directions.
+/// Rejects an end with too few points in the fit, or with none of the six directions determined.
 fn finish(descent: Descent, points: usize, is_held: bool) -> Result<Descent, RegistrationError> {
     if descent.sums.points * 2 < points {
         return Err(RegistrationError::TooFewUsed { used: descent.sums.points, points });
@@ -109,7 +117,7 @@ fn finish(descent: Descent, points: usize, is_held: bool) -> Result<Descent, Reg
     Ok(descent)
 }
 
-/// Gives a robust loss the scale of the distances as they are now.
+/// Sets the scale of a robust loss to the robust sigma of the current distances.
 fn rescale(problem: &mut Problem, options: &Options, correspondences: &[Correspondence], known: bool) {
     // Before the first distances are known there is no scale, and every point counts by its square.
     if known && options.loss != Loss::None {
@@ -117,22 +125,23 @@ fn rescale(problem: &mut Problem, options: &Options, correspondences: &[Correspo
     }
 }
 
-/// No CMM repeats better than this, and rounding in a file may be all the scatter there is.
+/// Smallest noise in mm: no CMM repeats better, and rounding in a file can be all the noise there is.
 pub(crate) const LEAST_SIGMA_MM: f64 = 1e-5;
 
 fn sigma_of(correspondences: &[Correspondence]) -> (f64, f64) {
-    // A sample tells the sigma of many points to a percent.
+    // A sample gives the sigma of many points to a percent.
     let stride = correspondences.len().div_ceil(1 << 16);
     let on_part = correspondences.iter().step_by(stride).filter(|t| !t.is_off_part()).map(|t| t.distance_mm);
     let (median, sigma) = robust_sigma(on_part);
     (median, sigma.max(LEAST_SIGMA_MM))
 }
 
-/// Searches anew for the feet that are too far away to be believed, and for those beyond the edge; returns how many were found elsewhere.
+/// Projects again the points that are beyond the edge or implausibly far away. Returns how many have a better
+/// projection elsewhere.
 ///
-/// A walk over the facets ends at the edge of a gap, and may have all of the part behind that.
+/// A walk over the facets ends at the edge of a gap, and all of the part can lie beyond the gap.
 fn find_again(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) -> usize {
-    /// No touch that is on the part is as far from it, once the part is about where it should be.
+    /// Distance in mm that no touch on the part exceeds, once the part is near its pose.
     const FAR_MM: f64 = 0.2;
     let may_be = |t: &Correspondence| t.is_off_part() || t.distance_mm.abs() > FAR_MM;
     if !correspondences.par_chunks(1 << 13).any(|some| some.iter().any(may_be)) {
@@ -159,10 +168,11 @@ fn find_again(problem: &Problem, correspondences: &mut [Correspondence], pose: &
     correspondences.par_iter_mut().zip(problem.measured).filter_map(|both| again(both).then_some(())).count()
 }
 
-/// Decides which points take part in the fit; returns how many changed. What does not may be form all the same: [`super::alone`].
+/// Selects the points that take part in the fit, and returns how many changed. A rejected point can still be form:
+/// [`super::alone`].
 ///
-/// An outlier is far from the surface and from its neighbours: a smooth form error, however large, is neither noise nor a
-/// mistake of the probe. Beyond four times the limit its neighbours are no longer asked.
+/// An outlier is far from the surface and from its neighbours. A smooth form error, however large, is neither noise nor
+/// a fault of the probe. Beyond four times the limit a point is an outlier whatever its neighbours are.
 fn screen(problem: &Problem, options: &Options, correspondences: &mut [Correspondence], both_ways: bool) -> usize {
     let (median, sigma) = sigma_of(correspondences);
     let limit = options.outlier_sigmas * sigma;
@@ -188,15 +198,15 @@ fn screen(problem: &Problem, options: &Options, correspondences: &mut [Correspon
     changed
 }
 
-/// For each suspect, whether its distance departs by more than a limit from the median of eight neighbours.
+/// Returns for each suspect true if its distance differs by more than a limit from the median of eight neighbours.
 ///
-/// Neighbours nearer than half the mean spacing are twins, repeats of the same place that repeat its mistake; they are not
-/// asked. A suspect with nothing but twins around it is isolated.
+/// Neighbours nearer than half the mean spacing are twins: repeats of the same place with the same fault. They are left
+/// out. A suspect with only twins around it is isolated.
 fn isolated(measured: &[Point], correspondences: &[Correspondence], suspects: &[usize], limit_mm: f64) -> Vec<bool> {
     const ASKED: usize = 8;
     const NEAREST: u32 = 64;
     let tree = Nearest::of(measured.iter().copied());
-    // Points spread over a square of rms size s stand s sqrt(6 / n) apart.
+    // Points spread over a square of rms size s are s sqrt(6 / n) apart.
     let twin_mm = 0.5 * middle_and_size(measured).1 * (6.0 / measured.len() as f64).sqrt();
     let is_isolated = |&k: &usize| {
         let others = tree.to(&measured[k], NEAREST).filter(|(_, square)| *square > twin_mm * twin_mm);

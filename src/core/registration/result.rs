@@ -1,4 +1,4 @@
-//! What a registration found.
+//! Result of a registration.
 
 use crate::geometry::Pose;
 use crate::surface::Side;
@@ -7,44 +7,44 @@ use super::deviation::{Counts, Deviation, PointStatus};
 use super::iterate::Iteration;
 use super::verdict::Verdict;
 
-/// What a registration found.
+/// Result of a registration.
 #[derive(Clone, Debug)]
 pub struct Registration {
-    /// Takes model coordinates to CMM coordinates: the paper's g.
+    /// Pose that maps model coordinates to CMM coordinates: g in the paper.
     pub cmm_from_model: Pose,
-    /// One for each measured point, in the order given.
+    /// Deviations, one per measured point, in the given order.
     pub deviations: Vec<Deviation>,
-    /// The trace of the iteration, steps taken back included.
+    /// Trace of the iteration, including the steps that were undone.
     pub trace: Vec<Iteration>,
-    /// The side on which the probe was.
+    /// Side of the nominal surface on which the probe was.
     pub side: Side,
-    /// How well the pose is known, and what to think of it.
+    /// Uncertainty of the pose, figures and warnings.
     pub verdict: Verdict,
 }
 
-/// The figures of the deviations with those points that were left out although they lie on the part.
+/// Figures of the deviations that include the outliers on the part.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WithLeftOut {
-    /// How many were left out.
+    /// Number of outliers.
     pub points: usize,
-    /// Root mean square of the deviations of the points used and of these, in millimetres.
+    /// Root mean square of the deviations of all points on the part, in millimetres.
     pub rms_mm: f64,
-    /// Largest less least of them, in millimetres.
+    /// Largest minus smallest deviation of these points, in millimetres.
     pub pv_mm: f64,
-    /// The first of them with their places in the model frame and their deviations, in words.
+    /// Text that names the first outliers, with their places in the model frame and their deviations.
     pub places: String,
 }
 
-/// Points left out that are named one by one; the rest are counted.
+/// Number of outliers that are named one by one; the rest are counted.
 const NAMED: usize = 5;
 
 impl Registration {
-    /// Returns the points that were left out as outliers, by their number.
+    /// Returns the outliers, each with its index.
     pub fn left_out(&self) -> impl Iterator<Item = (usize, &Deviation)> {
         self.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Outlier)
     }
 
-    /// Returns the figures with the outliers; none where there are none.
+    /// Returns the figures that include the outliers; `None` if there are no outliers.
     pub fn with_left_out(&self) -> Option<WithLeftOut> {
         let points = Counts::of(&self.deviations).outliers;
         if points == 0 {

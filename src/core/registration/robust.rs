@@ -1,4 +1,4 @@
-//! What a point far from the surface may do to the fit: nothing, or less than its square.
+//! Robust losses: a point far from the surface has less influence on the fit than its square, or none.
 
 use serde::{Deserialize, Serialize};
 
@@ -23,7 +23,7 @@ pub(crate) struct ScaledLoss {
     limit_mm: f64,
 }
 
-/// The median of |d| times this is the standard deviation of Gaussian errors: 1 / Phi^-1(3/4).
+/// Standard deviation of Gaussian errors per median of |d|: 1 / Phi^-1(3/4).
 const SIGMA_PER_MAD: f64 = 1.482_602_218_505_602;
 
 impl ScaledLoss {
@@ -36,7 +36,7 @@ impl ScaledLoss {
         Self { loss, limit_mm: tuning * sigma_mm }
     }
 
-    /// Returns the weight of a distance and its share of the objective, which is d^2 near zero for every loss.
+    /// Returns the weight of a distance and its share of the objective. The share is d^2 near zero for every loss.
     #[inline]
     pub(crate) fn weigh(&self, distance: f64) -> (f64, f64) {
         let square = distance * distance;
@@ -58,7 +58,7 @@ impl ScaledLoss {
     }
 }
 
-/// Returns the robust standard deviation of distances about their median, by the median absolute deviation.
+/// Returns the median of the distances, and their robust standard deviation from the median absolute deviation.
 pub(crate) fn robust_sigma(distances: impl Iterator<Item = f64>) -> (f64, f64) {
     let mut values: Vec<f64> = distances.collect();
     if values.is_empty() {

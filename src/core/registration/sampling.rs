@@ -1,22 +1,23 @@
-//! Directions that only the sampling of the nominal surface sees.
+//! Directions that only the sampling of the nominal surface determines.
 //!
-//! A cap about z is the same however it is turned about z, but its points lie on a grid, and what stands between them is not quite the same.
-//! The rank test takes that for something that holds the part: weakly, and wrongly. So a direction that is seen by next to nothing is looked
-//! at once more on every second node of the grid. What the part itself says of it stays; what the sampling says becomes another.
+//! A cap about z is the same for any rotation about z. But its points lie on a grid, and the surface between them
+//! differs slightly with the rotation. The rank test wrongly takes this as a weak determination of the rotation. So a
+//! direction with a very small singular value is examined again on every second node of the grid. The contribution of
+//! the part itself stays the same; the contribution of the sampling changes.
 
 use super::correspond::Correspondence;
 use super::iterate::{Descent, Problem, free_directions};
 use super::solve::Spectrum;
 use crate::surface::{OffsetSurface, Place};
 
-/// Directions that are seen by a larger share than this are not doubted.
+/// Share of the singular value above which a direction is not examined.
 const DOUBTED: f64 = 1e-4;
-/// What changes by more than this share of itself is the sampling's.
+/// Relative change above which a direction comes from the sampling.
 const CHANGED: f64 = 0.5;
-/// Points that are looked at, at most.
+/// Most points that are examined.
 const MOST: usize = 400;
 
-/// Returns the share below which directions are the sampling's; none where all that are seen are the part's.
+/// Returns the share below which directions come from the sampling; `None` if the part itself determines all of them.
 pub(super) fn least_share(problem: &Problem, descent: &Descent, correspondences: &[Correspondence]) -> Option<f64> {
     let free = free_directions(&problem.locked, &descent.scaling);
     let gram = descent.sums.gram();
@@ -48,7 +49,7 @@ pub(super) fn least_share(problem: &Problem, descent: &Descent, correspondences:
     };
     let doubted = (0..descent.rank).rev().take_while(|k| share(*k) <= DOUBTED).filter(is_of_the_sampling);
     let last = doubted.last()?;
-    // Between the strongest of them and the next that is seen.
+    // Between the largest of them and the next larger singular value.
     let next = if last == 0 { 1.0 } else { share(last - 1) };
     Some((share(last) * next).sqrt())
 }

@@ -1,20 +1,21 @@
-//! The ball-constrained linear least-squares problem, eq. (15): A m = b subject to |m| <= alpha.
+//! Ball-constrained linear least-squares problem, eq. (15): A m = b subject to |m| <= alpha.
 
 use nalgebra::{Matrix6, SymmetricEigen, Vector6};
 
-/// The singular values and right singular vectors of A, from its normal matrix.
+/// Singular values and right singular vectors of A, from its normal matrix.
 #[derive(Clone, Debug)]
 pub(crate) struct Spectrum {
-    /// Squared singular values, in falling order.
+    /// Squared singular values, in descending order.
     pub(crate) squares: Vector6<f64>,
-    /// Right singular vectors, a column each.
+    /// Right singular vectors, one per column.
     pub(crate) directions: Matrix6<f64>,
 }
 
 impl Spectrum {
     /// Decomposes A^T A = V S^2 V^T.
     ///
-    /// The columns of A are centred and scaled beforehand, so squaring loses no more than the surface itself hides.
+    /// The columns of A are centred and scaled beforehand. So squaring loses no more than the surface itself leaves
+    /// undetermined.
     pub(crate) fn new(gram: &Matrix6<f64>) -> Self {
         let eigen = SymmetricEigen::new(*gram);
         let mut order: [usize; 6] = std::array::from_fn(|k| k);
@@ -25,18 +26,20 @@ impl Spectrum {
         }
     }
 
-    /// Returns how many directions the surface sees: squared singular values above the square of a share of a whole.
+    /// Returns the number of directions that the surface determines: squared singular values above `whole *
+    /// least_share^2`.
     ///
-    /// The whole is the sum of the squares before any direction was locked; of the rounding that a lock leaves nothing is seen.
+    /// `whole` is the sum of the squares before any direction was locked. So the rounding that a lock leaves does not
+    /// count as a direction.
     pub(crate) fn rank(&self, least_share: f64, whole: f64) -> usize {
         let limit = whole * least_share * least_share;
         (0..6).take_while(|&k| self.squares[k] > limit).count()
     }
 
-    /// Minimises |A m - b| over |m| <= alpha within the leading `rank` directions.
+    /// Minimises |A m - b| over |m| <= alpha within the leading `rank` directions, and returns m.
     ///
-    /// Equation: m(mu) = sum_k v_k (v_k . A^T b) / (s_k^2 + mu), with mu = 0 where that lies in the ball and else the root of
-    /// the secular equation |m(mu)| = alpha (Golub and Van Loan, Matrix Computations, 12.1.2).
+    /// Equation: m(mu) = sum_k v_k (v_k . A^T b) / (s_k^2 + mu). Here mu = 0 if that m lies in the ball; otherwise mu
+    /// is the root of the secular equation |m(mu)| = alpha (Golub and Van Loan, Matrix Computations, 12.1.2).
     pub(crate) fn step(&self, right: &Vector6<f64>, rank: usize, alpha: f64) -> Vector6<f64> {
         let along = self.directions.transpose() * right;
         let step = |mu: f64| {
@@ -53,8 +56,8 @@ impl Spectrum {
         step(self.multiplier(&along, rank, alpha))
     }
 
-    /// Solves 1/|m(mu)| = 1/alpha by Newton's method; in this form the function is nearly straight and the iteration rises to
-    /// the root from below without overshooting.
+    /// Solves 1/|m(mu)| = 1/alpha for mu by Newton's method. In this form the function is nearly straight, and the
+    /// iteration rises to the root from below without overshooting.
     fn multiplier(&self, along: &Vector6<f64>, rank: usize, alpha: f64) -> f64 {
         let mut mu = 0.0;
         for _ in 0..60 {

@@ -1,9 +1,10 @@
-//! Where to begin when nobody knows where the part is.
+//! Search for the initial pose when the pose of the part is unknown.
 //!
-//! A free-form surface is told from itself by its curvature. Some measured points are fitted locally; each is laid on the places
-//! of the offset surface that bend alike, in the two ways in which principal directions can be matched. With the principal axes
-//! of the whole clouds laid on each other in all ways, and the identity, these are the candidates. Each is scored on a few
-//! points, the best are refined on some hundred, and the best of those wins; others that fit as well are reported.
+//! The curvature distinguishes the places of a free-form surface. The search fits some measured points locally. It lays
+//! each of them on the places of the offset surface with similar curvature, in the two ways in which the principal
+//! directions can match. Further candidates lay the principal axes of the whole clouds on each other in all ways, and
+//! one is the identity. The search scores each candidate on a few points and refines the best on some hundred. The best
+//! of those wins; others that fit as well are reported.
 
 use rayon::prelude::*;
 
@@ -17,62 +18,66 @@ use super::options::{Options, Start};
 use super::part::Part;
 use super::robust::{Loss, ScaledLoss, robust_sigma};
 
-/// Where the registration begins.
+/// Initial pose of a registration.
 #[derive(Clone, Debug)]
 pub(crate) struct InitialPose {
     pub(crate) cmm_from_model: Pose,
     pub(crate) side: Side,
-    /// Whether the side was given, or told by the data; else it was assumed.
+    /// True if the side was given, or determined by the data. Otherwise it was assumed.
     pub(crate) side_known: bool,
-    /// Whether the pose was refined already, so that outliers can be told at once.
+    /// True if the pose is already refined, so that outliers can be detected at once.
     pub(crate) near: bool,
-    /// Poses that are different and fit about as well.
+    /// Other poses, clearly different, that fit about as well.
     pub(crate) alternatives: Vec<Candidate>,
 }
 
-/// A pose and how well some points fit under it.
+/// A pose, and how well a sample of the points fits under it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Candidate {
     pub(crate) cmm_from_model: Pose,
-    /// Root mean square of the nearest nine tenths of the distances, in millimetres.
+    /// Root mean square of the smallest nine tenths of the distances, in millimetres.
     pub(crate) rms_mm: f64,
-    /// The same of the points on the part alone.
+    /// The same over the points on the part only.
     on_part_rms_mm: f64,
-    /// Share of the points whose feet lie beyond the edge.
+    /// Share of the points whose projections lie beyond the edge.
     off_part: f64,
     side: Side,
 }
 
 impl Candidate {
-    /// The better fit first; of two that fit alike the one with more points on the part.
+    /// Orders candidates by fit, the better first. Of two that fit alike, the one with more points on the part is
+    /// first.
     fn by_fit(&self, other: &Self) -> std::cmp::Ordering {
         let badness = |c: &Self| c.rms_mm * (1.0 + 4.0 * c.off_part);
         badness(self).total_cmp(&badness(other))
     }
 }
 
-/// Points that a candidate is glanced at with, scored on, refined on, and compared on.
+/// Numbers of points for the first look at a candidate, its score, its refinement and the comparison.
 const GLANCED: usize = 10;
 const SCORED: usize = 40;
 const REFINED: usize = 160;
 const COMPARED: usize = 640;
-/// Candidates that a glance leaves.
+/// Number of candidates after the first look.
 const PROMISING: usize = 300;
-/// Measured places that are laid on the surface, and places of the surface that each is laid on.
+/// Number of measured places to lay on the surface, and of places of the surface for each.
 const LAID: usize = 24;
 const PLACES: usize = 36;
-/// Candidates that are refined.
+/// Number of candidates to refine.
 const KEPT: usize = 24;
-/// Candidates that are compared on both sides.
+/// Most candidates to compare on both sides.
 const COMPARED_AT_MOST: usize = 6;
 
-/// A side fits better only if its rms is this many times smaller; the part's own form error keeps the two apart by less.
+/// Smallest ratio of the two rms at which one side fits better. Form error alone gives a smaller ratio.
 const SIDE_RATIO: f64 = 2.0;
 
-/// A side does not fit better by having more of the points off the part than this share.
+/// Largest excess of the share of points off the part at which a side still fits better.
 const SIDE_OFF_PART: f64 = 0.05;
 
-/// Chooses the pose to begin from and the side of the probe.
+/// Returns the initial pose and the side of the probe.
+///
+/// # Errors
+/// A given side that fits much worse than the other, and a search without any candidate.
 pub(crate) fn initial_pose(
     part: &Part,
     measured: &[Point],
@@ -85,18 +90,18 @@ pub(crate) fn initial_pose(
     }
 }
 
-/// Returns the rms to which the mirrored cloud fits; `None` if it cannot be registered at all.
+/// Returns the rms in mm of the best fit of the mirrored cloud; `None` if it cannot be registered at all.
 pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &Options, side: Side) -> Option<f64> {
     searched_rms(part, &mirrored(measured), options, side)
 }
 
-/// Returns the rms to which the cloud fits as it was measured, with nothing held.
+/// Returns the rms in mm of the best fit of the cloud as measured, with nothing locked.
 pub(crate) fn free_rms(part: &Part, measured: &[Point], options: &Options, side: Side) -> Option<f64> {
     let some: Vec<Point> = spread(measured, 4 * COMPARED).copied().collect();
     searched_rms(part, &some, options, side)
 }
 
-/// Returns the rms of the cloud as measured and mirrored, if it fits mirrored and does not as it is.
+/// Returns the rms of the cloud as measured and mirrored, in mm, if only the mirrored cloud fits; otherwise `None`.
 pub(crate) fn mirror_image(part: &Part, measured: &[Point], options: &Options) -> Option<(f64, f64)> {
     let sides = options.side.given().map_or(vec![Side::Normal, Side::Opposite], |side| vec![side]);
     let best = |points: &[Point]| {
@@ -108,19 +113,21 @@ pub(crate) fn mirror_image(part: &Part, measured: &[Point], options: &Options) -
     (mirrored_rms_mm < 0.3 * rms_mm).then_some((rms_mm, mirrored_rms_mm))
 }
 
-/// Some points mirrored in the plane x = 0 of the CMM frame: which plane does not matter to a search over all poses.
+/// Returns a sample of the points, mirrored in the plane x = 0 of the CMM frame. The choice of the plane does not
+/// matter to a search over all poses.
 fn mirrored(measured: &[Point]) -> Vec<Point> {
     spread(measured, 4 * COMPARED).map(|p| Point::new(-p.x, p.y, p.z)).collect()
 }
 
-/// Returns the rms to which a search over all poses fits points on one side, with nothing held.
+/// Returns the rms in mm of the best fit on one side over all poses, with nothing locked.
 fn searched_rms(part: &Part, points: &[Point], options: &Options, side: Side) -> Option<f64> {
     let options = Options { side: side.into(), locked: [false; 6], ..*options };
     let search = Search::new(part, points, &options);
     search.compared(&search.candidates(side), side).first().map(|c| c.rms_mm)
 }
 
-/// Some of the points, evenly along their order; jittered, so that the choice does not run along one column of a grid.
+/// Returns a sample of the points, evenly along their order. The sample is jittered, so that it does not follow one
+/// column of a grid.
 pub(super) fn spread(points: &[Point], count: usize) -> impl Iterator<Item = &Point> {
     let n = points.len();
     let take = count.min(n);
@@ -143,9 +150,9 @@ impl<'a> Search<'a> {
         Self { part, options, measured, few: sample(SCORED), some: sample(REFINED), many: sample(COMPARED) }
     }
 
-    /// Takes a pose as given and finds the side on which the points fit.
+    /// Keeps a given pose and determines the side on which the points fit.
     fn side_at(&self, pose: Pose) -> Result<InitialPose, RegistrationError> {
-        // A given pose may be meant for either side.
+        // A given pose can refer to either side.
         let at = |side: Side| {
             let as_given = self.refine(pose, side, &self.some, 2, 8);
             if as_given.rms_mm <= self.part.rms_limit_mm(self.options) {
@@ -168,10 +175,11 @@ impl<'a> Search<'a> {
         if above.count() * 2 >= self.many.len() { Side::Normal } else { Side::Opposite }
     }
 
-    /// Tries many poses and takes the best.
+    /// Tries many poses and returns the best.
     ///
-    /// The candidates are refined on one side of the surface: on the other the probe centres lie two radii away, which is
-    /// little against the differences between right and wrong poses. Only the best are compared on both.
+    /// The candidates are refined on one side of the surface. On the other side the probe centres lie two radii away, a
+    /// small distance compared with the differences between right and wrong poses. Only the best candidates are
+    /// compared on both sides.
     fn search(&self) -> Result<InitialPose, RegistrationError> {
         let side = self.options.side.given().unwrap_or_default();
         let candidates = self.candidates(side);
@@ -192,7 +200,8 @@ impl<'a> Search<'a> {
         Ok(InitialPose { cmm_from_model: best.cmm_from_model, side, side_known, near: true, alternatives })
     }
 
-    /// Decides between the best fits on the two sides, and whether they could be told apart.
+    /// Selects the side from the best fits on the two sides. Returns the side, its candidate, and true if the side is
+    /// certain.
     fn choose_side(
         &self,
         normal: Candidate,
@@ -200,7 +209,7 @@ impl<'a> Search<'a> {
     ) -> Result<(Side, Candidate, bool), RegistrationError> {
         // Without an offset the two sides are one surface.
         let told = |better: &Candidate, worse: &Candidate| {
-            // How far points lie beyond the edge tells nothing of the side.
+            // The distance of the points beyond the edge says nothing about the side.
             let is_nearer = better.on_part_rms_mm * SIDE_RATIO < worse.on_part_rms_mm;
             self.part.offset_mm == 0.0 || is_nearer && better.off_part <= worse.off_part + SIDE_OFF_PART
         };
@@ -209,7 +218,7 @@ impl<'a> Search<'a> {
             None => Ok((Side::Normal, normal, told(&normal, &opposite))),
             Some(side) => {
                 let (given, other) = if side == Side::Normal { (normal, opposite) } else { (opposite, normal) };
-                // Clearly better there, and by more than a form error could explain.
+                // Much better on the other side, by more than a form error explains.
                 if other.rms_mm * 4.0 * SIDE_RATIO < given.rms_mm && self.part.offset_mm > 0.0 {
                     return Err(RegistrationError::WrongSide { rms_mm: given.rms_mm, other_rms_mm: other.rms_mm });
                 }
@@ -218,7 +227,8 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// A pose for one side from a pose for the other: the surface is shifted by two radii along its mean normal.
+    /// Returns the pose for one side from the pose for the other: the surface is shifted by two radii along its mean
+    /// normal.
     fn across_to(&self, pose: Pose, side: Side) -> Pose {
         let mean = self.part.nominal.mean_normal();
         let shift = mean * (-2.0 * self.part.offset_mm * side.sign());
@@ -251,7 +261,7 @@ impl<'a> Search<'a> {
         refined
     }
 
-    /// Refines the best candidates fully on one side; the best first, each pose once.
+    /// Refines the best candidates fully on one side. Returns them with the best first, each pose once.
     fn compared(&self, candidates: &[Candidate], side: Side) -> Vec<Candidate> {
         let best = &candidates[..candidates.len().min(COMPARED_AT_MOST)];
         let mut compared: Vec<Candidate> =
@@ -266,7 +276,8 @@ impl<'a> Search<'a> {
         distinct
     }
 
-    /// How far two poses carry the cloud apart, in units of its size.
+    /// Returns the difference of two poses: the rotation in radians plus the shift of the cloud's centroid in units of
+    /// its size.
     fn apart(&self, a: &Pose, b: &Pose) -> f64 {
         let between = a.inverse() * *b;
         let centre = self.few.iter().map(|p| p.coords).sum::<Vector>() / self.few.len() as f64;
@@ -274,19 +285,20 @@ impl<'a> Search<'a> {
         between.angle_rad() + shift / self.part.size_mm
     }
 
-    /// Distances beyond this no longer make a candidate worse.
+    /// Returns the distance in mm above which a point makes a candidate no worse.
     fn truncation_mm(&self) -> f64 {
         0.1 * self.part.size_mm
     }
 
-    /// Root mean square of the truncated distances from the part itself, not from its continuation.
+    /// Returns the root mean square, in mm, of the truncated distances from the part itself, not from its continuation.
     fn score(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> f64 {
         let limit2 = self.truncation_mm().powi(2);
         let sum: f64 = self.squares(surface, cmm_from_model, points).map(|d2| d2.min(limit2)).sum();
         (sum / points.len() as f64).sqrt()
     }
 
-    /// Looks how well points fit under a pose: by the nearest nine tenths of them, which outliers in the rest do not spoil.
+    /// Returns how well points fit under a pose, from the smallest nine tenths of the distances. Outliers in the rest
+    /// have no influence.
     fn looked_at(&self, surface: &OffsetSurface, cmm_from_model: Pose, points: &[Point]) -> Candidate {
         let inverse = cmm_from_model.inverse();
         let (mut all, mut on_part) = (Vec::with_capacity(points.len()), Vec::with_capacity(points.len()));
@@ -308,7 +320,7 @@ impl<'a> Search<'a> {
         Candidate { cmm_from_model, rms_mm, on_part_rms_mm, off_part, side: surface.side() }
     }
 
-    /// Squared distances from the part itself, what lies beyond its edge included.
+    /// Returns the squared distances from the part itself in mm^2, including the distance beyond its edge.
     fn squares<'b>(
         &self,
         surface: &'b OffsetSurface,
@@ -323,7 +335,7 @@ impl<'a> Search<'a> {
         })
     }
 
-    /// Descends under a loss that forgets gross outliers, its scale following the distances down.
+    /// Descends under a loss that ignores gross outliers. Its scale follows the distances as they decrease.
     fn refine(&self, start: Pose, side: Side, points: &[Point], rounds: usize, iterations: usize) -> Candidate {
         let (middle, size_mm) = middle_and_size(points);
         let mut problem = Problem {
@@ -351,22 +363,22 @@ impl<'a> Search<'a> {
         self.looked_at(&problem.surface, pose, points)
     }
 
-    /// Returns the pose that is turned least from the frame of the file, of those that fit as well as the best: where the surface does not tell
-    /// how it lies, nothing but that frame does.
+    /// Returns the pose with the smallest rotation from the frame of the file, among those that fit as well as the
+    /// best. If the surface does not determine a rotation, only that frame does.
     fn nearest_to_the_frame(&self, best: Candidate, all: &[Candidate]) -> Candidate {
-        /// By how much a fit may be worse by chance.
+        /// Largest ratio of two rms that differ by chance.
         const ALIKE: f64 = 1.1;
-        /// No two fits are told apart by less.
+        /// Smallest difference of rms that distinguishes two fits, in mm.
         const LEAST_MM: f64 = 1e-5;
-        /// The same of a fit that is not at its end.
+        /// Largest ratio of rms for a fit that is not yet converged.
         const AT_MOST: f64 = 3.0;
-        /// Poses less apart are one.
+        /// Difference below which two poses are the same.
         const APART: f64 = 0.01;
         let nominal = self.part.nominal.sample(REFINED);
         let middle_of = |points: &[Point]| points.iter().map(|p| p.coords).sum::<Vector>() / points.len().max(1) as f64;
         let offset = self.part.nominal.mean_normal() * (best.side.sign() * self.part.offset_mm);
         let centred = middle_of(&self.many) - middle_of(&nominal) - offset;
-        // Mostly these starts lead to nothing, or to the best pose: a few points tell.
+        // These starts mostly lead to nothing, or to the best pose. So a few points decide first.
         let refined = |translation_mm: Vector| {
             let start = Pose { translation_mm, ..Pose::identity() };
             let glanced = self.refine(start, best.side, &self.some, 2, 6);
@@ -384,7 +396,7 @@ impl<'a> Search<'a> {
         least.filter(|c| self.apart(&c.cmm_from_model, &best.cmm_from_model) > APART).copied().unwrap_or(best)
     }
 
-    /// Other poses that fit nearly as well as the best.
+    /// Returns other poses that fit nearly as well as the best.
     fn alternatives(&self, best: &Candidate, all: &[Candidate]) -> Vec<Candidate> {
         all.iter()
             .filter(|c| {
@@ -395,7 +407,8 @@ impl<'a> Search<'a> {
             .collect()
     }
 
-    /// The principal axes of the two clouds on each other: both faces, in steps of 15 degrees about the least axis.
+    /// Returns poses that lay the principal axes of the two clouds on each other: both faces, in steps of 15 degrees
+    /// about the shortest axis.
     fn by_principal_axes(&self, side: Side) -> Vec<Pose> {
         const TURNS: usize = 24;
         let frame = |points: &[Point]| {
@@ -422,7 +435,7 @@ impl<'a> Search<'a> {
         starts
     }
 
-    /// Measured places laid on places of the offset surface that bend alike.
+    /// Returns poses that lay measured places on places of the offset surface with similar curvature.
     fn by_curvature(&self, side: Side) -> Vec<Pose> {
         let on_nominal = self.part.nominal.features();
         if on_nominal.len() < PLACES {
@@ -435,14 +448,15 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Leaves out the points beyond the edge, unless the pose is so far off that most of them are.
+/// Rejects the points beyond the edge, unless the pose is so far off that at least half of them are beyond it.
 fn leave_out_what_is_off_the_part(correspondences: &mut [Correspondence]) {
     let off = correspondences.iter().filter(|t| t.is_off_part()).count();
     let may_be = 2 * off < correspondences.len();
     correspondences.iter_mut().for_each(|t| t.used = !(may_be && t.is_off_part()));
 }
 
-/// The features whose two curvatures differ most, so that their directions are sure; half of them, spread over all.
+/// Returns the features whose two curvatures differ most, because their directions are certain: a sample spread over
+/// the better half.
 fn most_telling(mut features: Vec<Feature>) -> Vec<Feature> {
     features.sort_by(|a, b| b.anisotropy().total_cmp(&a.anisotropy()));
     features.truncate((features.len() / 2).max(LAID));
@@ -450,7 +464,8 @@ fn most_telling(mut features: Vec<Feature>) -> Vec<Feature> {
     features.into_iter().step_by(stride).collect()
 }
 
-/// Lays a measured feature on the places of the surface that bend most alike, in both ways.
+/// Returns poses that lay a measured feature on the places of the surface with the most similar curvature, in both
+/// directions.
 fn laid_on(measured: &Feature, offset: &[Feature]) -> Vec<Pose> {
     let unlike = |f: &Feature| {
         (f.curvatures[0] - measured.curvatures[0]).powi(2) + (f.curvatures[1] - measured.curvatures[1]).powi(2)
@@ -469,7 +484,7 @@ fn laid_on(measured: &Feature, offset: &[Feature]) -> Vec<Pose> {
         .collect()
 }
 
-/// An origin and a right-handed set of axes.
+/// Origin and right-handed axes.
 struct Frame {
     origin: Point,
     axes: nalgebra::Matrix3<f64>,
@@ -481,7 +496,7 @@ impl Frame {
         Self { origin, axes: nalgebra::Matrix3::from_columns(&[first, second, normal]) }
     }
 
-    /// The pose that lays another frame on this one.
+    /// Returns the pose that maps another frame to this one.
     fn from(&self, other: &Frame) -> Pose {
         let rotation = self.axes * other.axes.transpose();
         Pose { rotation, translation_mm: self.origin.coords - rotation * other.origin.coords }.orthonormalised()

@@ -1,4 +1,4 @@
-//! How well the pose is known, which way it is not, and what each deviation is worth.
+//! Uncertainty of the pose, its weak directions, and the uncertainty of each deviation.
 
 use std::collections::HashMap;
 
@@ -18,52 +18,56 @@ use super::part::Part;
 use super::solve::Spectrum;
 use super::start::InitialPose;
 
-/// What to think of a registration.
+/// Quality of a registration: figures, uncertainty of the pose, and warnings.
 #[derive(Clone, Debug)]
 pub struct Verdict {
-    /// Number of points that count.
+    /// Number of points used: the inliers.
     pub used: usize,
     /// Sum of the squared deviations of the points used, in mm^2; eq. (7).
     pub objective_mm2: f64,
     /// Root mean square of the deviations of the points used, in millimetres.
     pub rms_mm: f64,
-    /// Largest less least deviation of the points used, in millimetres.
+    /// Largest minus smallest deviation of the points used, in millimetres.
     pub pv_mm: f64,
-    /// Standard deviation of the residuals, with the degrees of freedom counted, in millimetres.
+    /// Standard deviation of the residuals in millimetres, corrected for the degrees of freedom.
     pub residual_sigma_mm: f64,
-    /// Covariance of the pose: of the twist [v; omega] in the model frame that takes the true pose to the one found by
-    /// multiplication on the right. Units mm^2, mm rad, rad^2. Directions that are held or locked have no variance here.
+    /// Covariance of the pose: of the twist [v; omega] in the model frame. Multiplied on the right, the twist takes the
+    /// true pose to the estimated one. Units: mm^2, mm rad, rad^2. Directions that are undetermined or locked have no
+    /// variance here.
     ///
     /// Equation: s^2 (A^T A)^-1 with s^2 the residual variance (GUM, F.1; Golub and Van Loan, 5.5).
     pub covariance: Matrix6<f64>,
-    /// Largest singular value of A over the least that is free, with lengths in units of the cloud's rms size; 1 where none is free.
+    /// Largest singular value of A divided by the smallest of the determined directions, with lengths in units of the
+    /// cloud's rms size; 1 if no direction is determined.
     pub condition: f64,
-    /// Directions that the surface cannot see, and those it sees worse than a single point is measured.
+    /// Directions that the surface does not determine, and those with a larger uncertainty than a single point.
     pub weak_directions: Vec<WeakDirection>,
-    /// Share of the nominal surface that points which were used lie on, from 0 to 1.
+    /// Share of the nominal surface that has points used on it, from 0 to 1.
     pub coverage: f64,
-    /// Other poses that fit about as well, with their rms over some hundred points in millimetres.
+    /// Other poses that fit about as well, each with its rms over some hundred points in millimetres.
     pub alternatives: Vec<(Pose, f64)>,
-    /// What a person should know before trusting the pose, in words; empty when there is nothing to say.
+    /// Warnings to read before one trusts the pose; empty if there are none.
     pub warnings: Vec<String>,
-    /// Turns of the iteration, steps taken back included.
+    /// Number of steps of the iteration, including those that were undone.
     pub iterations: usize,
-    /// Whether the last descent converged; a registration that did not is an error.
+    /// True if the last descent converged. A registration that does not converge is an error.
     pub converged: bool,
 }
 
-/// A direction in which the pose is badly known.
+/// Direction in which the pose is poorly determined.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct WeakDirection {
-    /// In words: "x and y shift: found again to 3.4 mm only".
+    /// Description, for example "x and y shift: found again to 3.4 mm only".
     pub words: String,
-    /// Whether the direction could not be seen at all and was held where it began.
+    /// True if the surface does not determine the direction at all. The pose then stays at its start value in this
+    /// direction.
     pub held: bool,
-    /// Standard uncertainty of a shift in millimetres, or of the rim for a rotation; absent where it is held.
+    /// Standard uncertainty of a shift, or of the rim under a rotation, in millimetres; `None` if the direction is
+    /// undetermined.
     pub sigma_mm: Option<f64>,
 }
 
-/// Judges the end of an iteration.
+/// Returns the verdict on the end of an iteration, with the coverage still at 0.
 pub(crate) fn judge(
     problem: &Problem,
     descent: &Descent,
@@ -75,7 +79,7 @@ pub(crate) fn judge(
     let free = free_directions(&problem.locked, &descent.scaling);
     let spectrum = Spectrum::new(&(free * descent.sums.gram() * free));
     let rank = descent.rank;
-    // The weights of a robust loss leave out what the outliers would add.
+    // The weights of a robust loss exclude the contribution of outliers.
     let residual2 = descent.sums.objective_mm2 / n.saturating_sub(rank).max(1) as f64;
     let scaled = scaled_covariance(&spectrum, rank, residual2);
     let to_twist = descent.scaling.to_twist();
@@ -83,7 +87,7 @@ pub(crate) fn judge(
     let held = spectrum.directions.columns(rank, 6 - rank).into_owned();
     let mut weak_directions = held_directions(&(free * held), 6 - rank - locked.min(6 - rank), &descent.scaling);
     weak_directions.extend(weakly_seen(&scaled, residual2.sqrt(), &descent.scaling, !weak_directions.is_empty()));
-    // Where a direction is held the surface fits in any pose along it, and that is said already.
+    // If a direction is undetermined, the surface fits in any pose along it. That is reported already.
     let all_seen = rank + locked >= 6;
     let alternatives: Vec<(Pose, f64)> =
         initial.alternatives.iter().filter(|_| all_seen).map(|c| (c.cmm_from_model, c.rms_mm)).collect();
@@ -104,7 +108,7 @@ pub(crate) fn judge(
     }
 }
 
-/// What the distances of the points used come to.
+/// Sums and extremes of the distances of the points used.
 #[derive(Clone, Copy)]
 struct Spread {
     used: usize,
@@ -124,7 +128,7 @@ impl Spread {
             high_mm: sum.high_mm.max(d),
         };
         let part = |c: &[Correspondence]| c.iter().filter(|t| t.used).map(|t| t.distance_mm).fold(Self::NONE, add);
-        // In chunks that are added in order: the same bits on any number of threads.
+        // Chunks are added in order, so the bits are the same on any number of threads.
         let parts: Vec<Self> = correspondences.par_chunks(1 << 14).map(part).collect();
         parts.iter().fold(Self::NONE, |a, b| Self {
             used: a.used + b.used,
@@ -135,7 +139,7 @@ impl Spread {
     }
 }
 
-/// Tells what the numbers alone do not.
+/// Returns warnings about facts that the figures alone do not show.
 fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64)], rms_mm: f64) -> Vec<String> {
     let mut warnings = Vec::new();
     if !initial.side_known {
@@ -162,7 +166,7 @@ fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64
     warnings
 }
 
-/// s^2 (A^T A)^-1 over the directions that are seen, in scaled coordinates.
+/// Returns s^2 (A^T A)^-1 over the determined directions, in scaled coordinates.
 fn scaled_covariance(spectrum: &Spectrum, rank: usize, variance: f64) -> Matrix6<f64> {
     (0..rank)
         .map(|k| {
@@ -172,12 +176,12 @@ fn scaled_covariance(spectrum: &Spectrum, rank: usize, variance: f64) -> Matrix6
         .sum()
 }
 
-/// Tells in words which motions leave every distance as it is.
+/// Describes the motions that change no distance.
 fn held_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scaling: &Scaling) -> Vec<WeakDirection> {
     if count == 0 {
         return Vec::new();
     }
-    // Locked directions were projected to nothing; what remains spans the held ones.
+    // The projection removed the locked directions. The rest spans the undetermined ones.
     let svd = DMatrix::from_column_slice(6, basis.ncols(), basis.as_slice()).svd(true, false);
     let span = svd.u.expect("asked for").columns(0, count).into_owned();
     let omega = span.rows(3, 3).into_owned();
@@ -189,7 +193,7 @@ fn held_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scaling: &Sca
     };
     let turns = turn.singular_values.iter().filter(|s| **s > 1e-3).count();
     let rotations: Vec<Vector6<f64>> = (0..turns).map(combined).collect();
-    // An orthonormal complement for the shifts: v_t may have fewer rows than the span has columns.
+    // Orthonormal complement for the shifts, because v_t can have fewer rows than the span has columns.
     let shifts = shifts(&span, &rotations);
     let mut words = Vec::new();
     if !shifts.is_empty() {
@@ -212,7 +216,7 @@ fn held_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scaling: &Sca
         .collect()
 }
 
-/// An orthonormal basis of the pure shifts within a span of scaled motions.
+/// Returns an orthonormal basis of the pure shifts within a span of scaled motions.
 fn shifts(span: &DMatrix<f64>, rotations: &[Vector6<f64>]) -> Vec<Vector6<f64>> {
     let mut basis: Vec<Vector6<f64>> = rotations.to_vec();
     let mut found = Vec::new();
@@ -232,7 +236,7 @@ fn shifts(span: &DMatrix<f64>, rotations: &[Vector6<f64>]) -> Vec<Vector6<f64>> 
     found
 }
 
-/// The point that rotations about three independent axes leave where it is.
+/// Returns the point that rotations about three independent axes leave fixed.
 fn common_centre(rotations: &[Vector6<f64>], scaling: &Scaling) -> Point {
     let (mut gram, mut right) = (nalgebra::Matrix3::zeros(), Vector::zeros());
     for r in rotations {
@@ -267,7 +271,8 @@ fn direction_name(v: &Vector) -> String {
     format!("({:.3}, {:.3}, {:.3})", u.x, u.y, u.z)
 }
 
-/// Tells which shifts and rotations are known less well than a single point: about the middle of the cloud, on the model's axes.
+/// Describes the shifts and rotations that are less certain than a single point: along and about the model's axes, at
+/// the centroid of the cloud. Returns nothing if a direction is undetermined.
 fn weakly_seen(scaled: &Matrix6<f64>, sigma_mm: f64, scaling: &Scaling, some_held: bool) -> Vec<WeakDirection> {
     let at_rim: [f64; 6] = std::array::from_fn(|k| scaled[(k, k)].sqrt() * scaling.size_mm);
     let weak = |k: &usize| at_rim[*k] > sigma_mm && !some_held;
@@ -297,7 +302,7 @@ fn weakly_seen(scaled: &Matrix6<f64>, sigma_mm: f64, scaling: &Scaling, some_hel
     found
 }
 
-/// A length with two digits in the unit that suits it.
+/// Formats a length with about two digits, in a suitable unit.
 pub(super) fn length(mm: f64) -> String {
     match mm {
         l if l >= 10.0 => format!("{l:.0} mm"),
@@ -309,14 +314,14 @@ pub(super) fn length(mm: f64) -> String {
     }
 }
 
-/// Returns the share of the surface that points which were used lie on.
+/// Returns the share of the surface that has points used on it, from 0 to 1.
 ///
-/// Of many points it is counted in cubes with an edge of a fifteenth of the surface's rms size, small enough to see a missing corner. Of
-/// few a place is covered that has a point within little more than the distance at which as many points would lie all over it: a full
-/// pattern leaves no gap, and a line covers no more than its own strip.
+/// For many points it counts cubes with an edge of a fifteenth of the surface's rms size, small enough to show a
+/// missing corner. For few points, a place is covered if a point is near: within 1.1 times the spacing of that number
+/// of points spread evenly over the surface. So a full pattern leaves no gap, and a line covers only its own strip.
 pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     const MOST: usize = 50_000;
-    // A disc and a rectangle have an area of some 2.5^2 times the square of their rms size.
+    // A disc and a rectangle have an area of about 2.5^2 times the square of their rms size.
     const SIDE: f64 = 2.5;
     const WITHIN: f64 = 1.1;
     let size = nominal.size_mm();
@@ -335,7 +340,7 @@ pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     sample.iter().filter(|p| cells.is_touched(p)).count() as f64 / sample.len() as f64
 }
 
-/// The share of some places that have a point within a distance.
+/// Returns the share of the places that have a point within a distance.
 fn covered_within(within_mm: f64, places: &[Point], used: &[&Deviation]) -> f64 {
     let cell = |p: &Point| [p.x, p.y, p.z].map(|c| (c / within_mm).floor() as i64);
     let mut points: HashMap<[i64; 3], Vec<Point>> = HashMap::new();
@@ -353,7 +358,7 @@ fn covered_within(within_mm: f64, places: &[Point], used: &[&Deviation]) -> f64 
     places.iter().filter(near).count() as f64 / places.len().max(1) as f64
 }
 
-/// Cubes around some points, and which of them were touched.
+/// Grid of cubes around some points, with a flag for each cube that contains a used point.
 struct Cells {
     low: [i32; 3],
     counts: [usize; 3],
@@ -362,7 +367,8 @@ struct Cells {
 }
 
 impl Cells {
-    /// Cells along an axis at most; beyond, where a point far from all others has drawn them out, the rest share the last one.
+    /// Most cells along an axis. If a point far from all others extends the range beyond this, the last cell covers the
+    /// rest.
     const MOST: i64 = 256;
 
     fn around(points: &[Point], edge_mm: f64) -> Self {
@@ -383,13 +389,13 @@ impl Cells {
         [p.x, p.y, p.z].map(|c| (c * per_mm).floor() as i32)
     }
 
-    /// The number of the cell of a point; `None` where there is none.
+    /// Returns the index of the cell of a point; `None` if the point lies outside the cells.
     fn index(&self, p: &Point) -> Option<usize> {
         let at = Self::cell(p, self.per_mm);
         let mut index = 0;
         for (c, at) in at.into_iter().enumerate() {
             let k = i64::from(at) - i64::from(self.low[c]);
-            // The last cell is that of all beyond only where the cells are as many as there may be.
+            // The last cell covers everything beyond it only if the number of cells is at the limit.
             let k = if self.counts[c] == Self::MOST as usize { k.min(Self::MOST - 1) } else { k };
             if k < 0 || k >= self.counts[c] as i64 {
                 return None;
@@ -410,7 +416,7 @@ impl Cells {
     }
 }
 
-/// What turns a foot into a deviation that is reported.
+/// Conversion of a projection to a reported deviation.
 pub(crate) struct Reporter<'a> {
     nominal: &'a Nominal,
     /// Covariance of the pose in scaled coordinates.

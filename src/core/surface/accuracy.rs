@@ -1,11 +1,13 @@
-//! How exact distances to a nominal surface will be, found from its points alone (section 3.1 of the paper).
+//! Accuracy of the distances to a nominal surface, estimated from its points alone (section 3.1 of the paper).
 //!
-//! Points are left out: two coarser samplings are made of what is kept, and the distance of the points left out from them is
-//! measured. They lie on the surface, so that the distance is the error. The errors of the two samplings give the order p at which
-//! the error falls with the spacing, and with it the error of the whole sampling and of any other.
+//! The method withholds points. It builds two coarser samplings from the other points and measures the distance of the
+//! withheld points from each. The withheld points lie on the surface, so that this distance is the error of the coarser
+//! sampling. The errors of the two samplings give the order p at which the error falls with the spacing. From p follows
+//! the error of the whole sampling, and the error at any other spacing.
 //!
-//! Of a grid every third and every sixth node is kept along each axis, and not every second: the points left out between
-//! those lie on edges alone, where the curved distance is of a higher order than within the triangles.
+//! On a grid the coarser samplings keep every third and every sixth node along each axis, not every second. With every
+//! second node all withheld points lie on edges of the triangles, where the curved distance is of a higher order than
+//! inside the triangles.
 
 use rayon::prelude::*;
 
@@ -19,40 +21,43 @@ use super::normals::tangents;
 use super::offset::{Distance, OffsetSurface, Place};
 use super::projection::{Map, Projection, is_line};
 
-/// The spacings of the two coarser samplings of a grid, in spacings of the whole one.
+/// Spacings of the two coarser samplings of a grid, in spacings of the whole grid.
 const OF_GRID: [usize; 2] = [3, 6];
 
-/// One of so many scattered points is kept in the two coarser samplings: of many points, and of fewer than so many.
+/// Scattered points are thinned to one point in 4 and one in 16. Clouds of less than `FEW` points are thinned as in
+/// `OF_FEW`.
 const OF_SCATTERED: [usize; 2] = [4, 16];
 const OF_FEW: [usize; 2] = [2, 4];
 const FEW: usize = 600;
 
-/// The order that is believed of an observed one: below, something else than the spacing makes the error.
+/// Range of the order p that the estimate uses; an observed order is clamped to it. If the observed order is lower, the
+/// spacing is not the main cause of the error.
 const ORDERS: [f64; 2] = [1.5, 4.5];
 
-/// The orders of the two distances on a smooth surface, less what a form with features of many sizes takes away.
+/// Lowest plausible orders of the flat and of the curved distance. They are the orders on a smooth surface, reduced for
+/// a form with features of many sizes.
 const LEAST_ORDER: [f64; 2] = [1.2, 1.8];
 
-/// Left-out points that are measured at most.
+/// Maximum number of withheld points that are measured.
 const MEASURED: usize = 150_000;
 
-/// A place counts as inside if the sampling goes on for that many of its spacings all around.
+/// Width of the border, in spacings. A place is inside if the sampling continues at least this far in all directions.
 const BORDER: f64 = 2.0;
 
-/// Places a sampling must have inside to be judged by.
+/// Minimum number of places inside that an estimate needs.
 const LEAST_INSIDE: usize = 30;
 
-/// What a nominal surface is made of.
+/// Points that a nominal surface is made from.
 #[derive(Clone, Copy, Debug)]
 pub enum Samples<'a> {
-    /// Points in any order, a grid or scattered; also the vertices of a mesh.
+    /// Points in any order, on a grid or scattered; also the vertices of a mesh.
     Points {
         /// The points in the model frame, in millimetres.
         points: &'a [Point],
-        /// What scattered points are projected onto.
+        /// Projection in which scattered points are triangulated.
         projection: Projection,
     },
-    /// A grid with known normals, row by row; NaN where there is no node.
+    /// Grid with known normals, row by row; NaN at a node that does not exist.
     Grid {
         /// Nodes along the first direction.
         columns: usize,
@@ -65,75 +70,77 @@ pub enum Samples<'a> {
     },
 }
 
-/// How exact distances to a nominal surface are.
+/// Estimated errors of the distances to a nominal surface.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Accuracy {
     /// Number of points.
     pub points: usize,
     /// Mean spacing of the points, in millimetres.
     pub spacing_mm: f64,
-    /// Of the flat distance, eq. (2).
+    /// Errors of the flat distance, eq. (2).
     pub flat: Estimate,
-    /// Of the curved distance.
+    /// Errors of the curved distance.
     pub curved: Estimate,
 }
 
-/// How exact one kind of distance is.
+/// Estimated errors of one kind of distance, flat or curved.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Estimate {
     /// Errors away from the border.
     pub inside: Figures,
     /// Errors within two spacings of the border of the sampling.
     pub border: Figures,
-    /// Where the error is largest.
+    /// Place of the largest error.
     pub worst: Worst,
-    /// The order p that the estimate is made with: the error falls as the p-th power of the spacing.
+    /// Order p that the estimate uses: the error is proportional to the p-th power of the spacing.
     pub order: f64,
-    /// The order as observed.
+    /// Order as observed, before it is clamped.
     pub observed_order: f64,
-    /// How far the estimate may be trusted.
+    /// Reliability of the estimate.
     pub trust: Trust,
     spacing_mm: f64,
-    /// Spacing of the coarsest sampling looked at.
+    /// Spacing of the coarser of the two samplings, in millimetres.
     coarsest_mm: f64,
 }
 
 /// Errors of a distance, in millimetres.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Figures {
-    /// Largest less least.
+    /// Peak to valley: the largest error minus the smallest.
     pub pv_mm: f64,
     /// Root mean square.
     pub rms_mm: f64,
-    /// Largest in size.
+    /// Largest absolute error.
     pub max_mm: f64,
 }
 
-/// The place of the largest error.
+/// Place of the largest error.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Worst {
-    /// Where, in the model frame.
+    /// Position in the model frame.
     pub at: Point,
-    /// How large, in millimetres; signed.
+    /// Signed error, in millimetres.
     pub error_mm: f64,
-    /// Whether it lies within two spacings of the border of the sampling.
+    /// True if the place lies within two spacings of the border of the sampling.
     pub near_border: bool,
 }
 
-/// How far an estimate may be trusted.
+/// Reliability of an estimate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Trust {
-    /// The error falls with the spacing as it should.
+    /// The error falls with the spacing as expected.
     Extrapolated,
-    /// The error hardly falls: the points are rounded or scatter, and the estimate is what they scatter by.
+    /// The error hardly falls with the spacing: the points contain rounding or noise, and the estimate is the size of
+    /// that noise.
     Rounding,
-    /// The coarser samplings are too coarse for the features of the surface: the estimate is a guess.
+    /// The coarser samplings do not resolve the features of the surface: the estimate is a guess.
     TooCoarse,
 }
 
 impl Estimate {
-    /// Returns the spacing at which the PV error inside is a wanted one, in millimetres; `None` where no spacing brings it
-    /// because the points are not exact enough. It is never coarser than the coarsest sampling that was looked at.
+    /// Returns the spacing at which the PV error inside equals `wanted_pv_mm`, in millimetres. Returns `None` if the
+    /// points are not exact enough for it at any spacing. The result is never coarser than the coarser of the two
+    /// samplings.
     pub fn spacing_for(&self, wanted_pv_mm: f64) -> Option<f64> {
         if self.trust == Trust::Rounding {
             return (self.inside.pv_mm <= wanted_pv_mm).then_some(self.spacing_mm);
@@ -143,12 +150,12 @@ impl Estimate {
     }
 }
 
-/// Estimates how exact distances to the surface through some points are.
+/// Estimates how exact the distances to the surface through these points are.
 ///
 /// Frame: model. Units: millimetres.
 ///
 /// # Errors
-/// Points that make no surface, and fewer than it takes to leave most of them out.
+/// Returns an error if the points make no surface, or if there are too few points to withhold most of them.
 pub fn accuracy(samples: Samples) -> Result<Accuracy, SurfaceError> {
     let (points, [factor, coarsest], [mut fine, mut coarse]) = match samples {
         Samples::Grid { columns, rows, points, normals } => {
@@ -157,7 +164,7 @@ pub fn accuracy(samples: Samples) -> Result<Accuracy, SurfaceError> {
             (points, OF_GRID.map(|stride| stride as f64), [level(OF_GRID[0])?, level(OF_GRID[1])?])
         }
         Samples::Points { points, projection } => {
-            // Whatever is wrong with the points is said of all of them, not of those that happen to be kept.
+            // Check all points here, so that an error refers to the whole list and not to the points that are kept.
             if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
                 return Err(SurfaceError::NotFinite { index });
             }
@@ -169,7 +176,7 @@ pub fn accuracy(samples: Samples) -> Result<Accuracy, SurfaceError> {
     let least = count.max(1).saturating_mul(4);
     let is_border = [&fine, &coarse].iter().any(|errors| errors.inside.len() < LEAST_INSIDE);
     if is_border {
-        // A few points are all near the border, so the estimate takes the border in.
+        // With few points nearly all places are near the border, so the estimate includes the border.
         [&mut fine, &mut coarse].into_iter().for_each(Errors::take_the_border_in);
     }
     if [&fine, &coarse].iter().any(|errors| errors.inside.len() < LEAST_INSIDE) {
@@ -184,7 +191,7 @@ pub fn accuracy(samples: Samples) -> Result<Accuracy, SurfaceError> {
     Ok(Accuracy { points: count, spacing_mm, flat, curved })
 }
 
-/// Errors measured at the points that a coarser sampling leaves out.
+/// Errors measured at the points that a coarser sampling withholds.
 struct Errors {
     inside: Vec<Measured>,
     border: Vec<Measured>,
@@ -198,13 +205,13 @@ impl Errors {
     }
 }
 
-/// A point left out: its error by the flat and by the curved distance.
+/// Withheld point with its errors by the flat and by the curved distance.
 struct Measured {
     at: Point,
     errors_mm: [f64; 2],
 }
 
-/// Every n-th node along both axes, with the normals of the whole grid.
+/// Measures the errors of the sampling by every n-th node along both axes, with the normals of the whole grid.
 fn defined_grid_level(
     columns: usize,
     rows: usize,
@@ -222,12 +229,13 @@ fn defined_grid_level(
     Ok(measure(&coarse, points, &left_out))
 }
 
-/// The nodes that stay when every n-th is kept along both axes.
+/// Returns the nodes that remain when every n-th node along both axes is kept.
 fn coarse_nodes(columns: usize, rows: usize, stride: usize) -> impl Iterator<Item = usize> {
     (0..rows).step_by(stride).flat_map(move |j| (0..columns).step_by(stride).map(move |i| j * columns + i))
 }
 
-/// Chooses what to keep for the two coarser samplings; returns their spacings in spacings of the whole sampling.
+/// Chooses the points of the two coarser samplings. Returns their spacings, in spacings of the whole sampling, and the
+/// indices of the points they keep.
 fn kept_of_points(points: &[Point], projection: Projection) -> Result<([f64; 2], [Vec<u32>; 2]), SurfaceError> {
     let on_plane = matches!(projection, Projection::Auto | Projection::Xy);
     if let Some(order) = recognise_grid(points).filter(|_| on_plane) {
@@ -250,8 +258,8 @@ fn kept_of_points(points: &[Point], projection: Projection) -> Result<([f64; 2],
     Ok((of.map(|one_of| (one_of as f64).sqrt()), of.map(every)))
 }
 
-/// Puts points in the order of Morton's curve through the plane of a projection: neighbours in it are neighbours there, so
-/// that every fourth is a quarter of them well spread.
+/// Returns the indices of the points in the order of a Morton curve in the plane of the projection. Neighbours on the
+/// curve are neighbours in the plane, so that every fourth point gives a well spread quarter of them.
 fn along_the_plane(points: &[Point], map: &Map) -> Vec<u32> {
     let placed: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0).collect();
     let [low, high] = bounds(placed.iter().copied());
@@ -269,7 +277,7 @@ fn along_the_plane(points: &[Point], map: &Map) -> Vec<u32> {
     coded.into_iter().map(|(_, k)| k).collect()
 }
 
-/// The sampling of the points that are kept, its normals fitted as those of the whole sampling are.
+/// Measures the errors of the sampling by the kept points. Its normals are fitted like those of the whole sampling.
 fn kept_level(points: &[Point], kept: &[u32], projection: Projection) -> Result<Errors, SurfaceError> {
     let coarse = Nominal::from_points(kept.iter().map(|&k| points[k as usize]).collect(), projection)?;
     let mut left_out = vec![true; points.len()];
@@ -277,11 +285,11 @@ fn kept_level(points: &[Point], kept: &[u32], projection: Projection) -> Result<
     Ok(measure(&coarse, points, &left_out))
 }
 
-/// Measures the distances of points left out from a coarser sampling.
+/// Measures the distances of the withheld points from a coarser sampling.
 fn measure(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Errors {
     let surface = OffsetSurface::new(coarse, 0.0, Side::Normal).expect("a radius of 0 is one");
     let (flat, curved) = (surface.with_distance(Distance::Triangle), surface.with_distance(Distance::Curved));
-    // An odd stride that divides no common number of columns.
+    // Odd, so that the stride does not divide a common number of columns.
     let stride = (points.len() / MEASURED) | 1;
     let one = |k: usize| {
         let at = points[k];
@@ -305,7 +313,7 @@ fn measure(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Errors {
     Errors { inside: strip(inside), border: strip(border), spacing_mm }
 }
 
-/// Extrapolates from two coarser samplings to the whole one.
+/// Extrapolates the errors of two coarser samplings to the whole sampling.
 fn estimate(fine: &Errors, coarse: &Errors, kind: usize, [factor, step]: [f64; 2], spacing_mm: f64) -> Estimate {
     let [inside_fine, inside_coarse] = [fine, coarse].map(|errors| figures(&errors.inside, kind));
     let [border_fine, border_coarse] = [fine, coarse].map(|errors| figures(&errors.border, kind));
@@ -336,16 +344,17 @@ fn estimate(fine: &Errors, coarse: &Errors, kind: usize, [factor, step]: [f64; 2
     }
 }
 
-/// The order at which the error fell from one sampling to the next, whose spacing is so many times as small.
+/// Returns the order at which the error fell from the coarse to the fine sampling; `step` is the ratio of their
+/// spacings.
 fn observed(fine: &Figures, coarse: &Figures, step: f64) -> f64 {
     let ratio = coarse.rms_mm / fine.rms_mm;
     if ratio > 0.0 && ratio.is_finite() { ratio.log2() / step.log2() } else { ORDERS[0] }
 }
 
 fn trust(observed_order: f64, least: f64, rms_mm: f64, spacing_mm: f64) -> Trust {
-    /// Rounding and scatter tilt the surface by less than this; features between the points by more.
+    /// Upper limit of the tilt that rounding and noise cause; features between the points cause more.
     const LARGEST_TILT: f64 = 1e-4;
-    /// The arithmetic itself is no more exact on a part of a metre.
+    /// Limit of the floating-point accuracy on a part of one metre.
     const EXACT_MM: f64 = 1e-11;
     match observed_order {
         _ if rms_mm < EXACT_MM => Trust::Extrapolated,

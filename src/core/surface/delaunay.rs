@@ -11,34 +11,36 @@ use super::error::SurfaceError;
 use super::mesh::BORDER;
 use super::projection::Map;
 
-/// Triangles and the neighbours across the edge opposite to each corner.
+/// Triangles and, for each corner, the neighbour across the opposite edge.
 pub(crate) struct Triangles {
     pub(crate) corners: Vec<[u32; 3]>,
     pub(crate) neighbours: Vec<[u32; 3]>,
 }
 
-/// A border triangle flatter than this (height over border edge) is a needle of the convex hull, not a piece of surface.
+/// Limit of height over border edge: a flatter border triangle is a needle of the convex hull, not a piece of surface.
 const NEEDLE: f64 = 0.05;
 
-/// A triangle whose longest edge is this many times what is usual around its corners bridges a hole.
+/// Limit of the longest edge over the usual length around its corners: a triangle with a longer edge bridges a hole.
 const BRIDGE: f64 = 6.0;
 
-/// Points that reach farther than so many sides of a square of as many of them are looked at for one that is none of them.
+/// Limit of the extent of the points over the side of a square of as many points at the usual distance. A wider cloud
+/// is searched for a point that is far off the others.
 const WIDE: f64 = 100.0;
 
-/// Two points nearer than this share of what is usual are twins.
+/// Limit of the distance of two points over the usual length: nearer points are near-duplicates.
 const TWINS: f64 = 1e-4;
 
-/// Coordinates beyond this (2^201) are refused: their fourth powers would leave what a number can hold.
+/// Largest accepted coordinate (2^201): the fourth powers of larger ones would overflow.
 const LARGEST: f64 = 3.2e60;
 
-/// Triangulates scattered points in the plane of a map, without the needles at the hull and the bridges over holes.
+/// Triangulates scattered points in the plane of a map, and removes the needles at the hull and the bridges over holes.
 ///
-/// Shapes: returns the points in an order in which neighbours in the plane are mostly neighbours in memory, and triangles whose
-/// corners index them, counter-clockwise in the plane.
+/// Shapes: returns the points in an order in which neighbours in the plane are mostly neighbours in memory, and
+/// triangles whose corners index these points, counter-clockwise in the plane.
 ///
 /// # Errors
-/// Two points at one place of the plane, or no three points off one line.
+/// Returns an error if a coordinate is not finite or too large, if two points coincide or nearly coincide in the plane,
+/// if all points lie on one line, or if one point is far off the others.
 pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Triangles), SurfaceError> {
     let places: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0.map(lifted)).collect();
     if let Some(index) = places.iter().position(|p| !(p[0].abs() <= LARGEST && p[1].abs() <= LARGEST)) {
@@ -72,12 +74,13 @@ pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Tr
     Ok((along.par_iter().map(|(_, index)| points[*index as usize]).collect(), triangles))
 }
 
-/// Returns the keys and the numbers of places in the order of a Z-curve; places of one key by u, then v.
+/// Returns the keys and the indices of the places in the order of a Z-curve. Places with equal keys are ordered by u,
+/// then by v.
 pub(crate) fn along_a_z_curve(places: &[[f64; 2]]) -> Vec<(u64, u32)> {
     let [low, high] = bounds(places.iter().copied());
     let per_mm = [0, 1].map(|k: usize| f64::from(u32::MAX) / (high[k] - low[k]));
     let key = |p: &[f64; 2]| {
-        // Rounding keeps the order, so that of two cells the lower has the lower places.
+        // Rounding is monotonic, so that the lower of two cells holds the lower places.
         let [u, v] = [0, 1].map(|k| ((p[k] - low[k]) * per_mm[k]) as u32);
         spread_bits(u) | spread_bits(v) << 1
     };
@@ -93,7 +96,7 @@ pub(crate) fn along_a_z_curve(places: &[[f64; 2]]) -> Vec<(u64, u32)> {
     along
 }
 
-/// Puts a zero before each bit.
+/// Inserts a zero before each bit.
 fn spread_bits(bits: u32) -> u64 {
     let mut bits = u64::from(bits);
     bits = (bits | bits << 16) & 0x0000_FFFF_0000_FFFF;
@@ -103,7 +106,8 @@ fn spread_bits(bits: u32) -> u64 {
     (bits | bits << 1) & 0x5555_5555_5555_5555
 }
 
-/// Products of coordinates closer to zero than this vanish; those are zero to us, and so is -0.
+/// Returns 0 for a coordinate closer to zero than 1e-40, whose products would underflow, and for -0; returns other
+/// coordinates unchanged.
 fn lifted(coordinate: f64) -> f64 {
     if coordinate.abs() < 1e-40 { 0.0 } else { coordinate }
 }
@@ -116,7 +120,7 @@ fn first_duplicate(points: &[Point], places: &[[f64; 2]]) -> SurfaceError {
     SurfaceError::DuplicatePoints { first: pair.0, second: pair.1, at: points[pair.0].into() }
 }
 
-/// The shortest and the longest edge of each triangle, and the median of the longest.
+/// Shortest and longest edge of each triangle, and the median of the longest edges.
 struct Lengths {
     shortest: Vec<f64>,
     longest: Vec<f64>,
@@ -134,7 +138,7 @@ impl Lengths {
     }
 }
 
-/// Finds two points so near each other that the surface between them is made of rounding.
+/// Returns two points so near each other that the surface between them consists of rounding errors.
 fn twins(t: &Triangles, lengths: &Lengths, places: &[[f64; 2]]) -> Option<[u32; 2]> {
     let least = TWINS * lengths.usual;
     let facet = lengths.shortest.par_iter().position_first(|shortest| *shortest < least)?;
@@ -172,7 +176,7 @@ fn drop_facet(t: &mut Triangles, dropped: &mut [bool], facet: u32, open: &mut Ve
     t.neighbours[facet as usize] = [BORDER; 3];
 }
 
-/// Squared lengths of the edges opposite to each corner.
+/// Returns the squared length of the edge opposite to each corner.
 fn squared_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
     let at = corners.map(|c| places[c as usize]);
     [(1, 2), (2, 0), (0, 1)].map(|(a, b): (usize, usize)| {
@@ -181,7 +185,7 @@ fn squared_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
     })
 }
 
-/// Finds triangles far longer than is usual around their corners.
+/// Returns the triangles that are far longer than is usual around their corners.
 fn bridges(t: &Triangles, lengths: &Lengths) -> Vec<u32> {
     let suspects: Vec<u32> = (0..t.corners.len() as u32)
         .into_par_iter()
@@ -200,11 +204,12 @@ fn bridges(t: &Triangles, lengths: &Lengths) -> Vec<u32> {
         .collect()
 }
 
-/// Returns what is usual at the corners of some triangles: the lower quartile of the longest edges around each, since at the
-/// rim of a hole half of its triangles may be bridges.
+/// Returns the usual length at the corners of some triangles. It is the lower quartile of the longest edges of the
+/// triangles around a corner, because at the rim of a hole half of these triangles may be bridges.
 ///
-/// Triangles between a dense and a sparse side are as long as is usual on the sparse side. So the largest of the corners
-/// counts. A stray point would speak for its own bridges: a corner counts for no more than the second largest of its neighbours.
+/// Triangles between a dense and a sparse region have the usual length of the sparse region, so the caller compares
+/// with the largest value of the three corners. A stray point would justify its own bridges. Therefore the value of a
+/// corner is limited to the second largest value of its neighbours.
 fn usual_around(t: &Triangles, lengths: &Lengths, suspects: &[u32]) -> HashMap<u32, f64> {
     let neighbours = triangles_at(t, suspects.iter().flat_map(|&f| t.corners[f as usize]));
     let around = triangles_at(t, neighbours.values().flatten().flat_map(|&f| t.corners[f as usize]));
@@ -225,7 +230,7 @@ fn usual_around(t: &Triangles, lengths: &Lengths, suspects: &[u32]) -> HashMap<u
     neighbours.iter().map(confirmed).collect()
 }
 
-/// The triangles at some vertices.
+/// Returns the triangles at each of some vertices.
 fn triangles_at(t: &Triangles, vertices: impl Iterator<Item = u32>) -> HashMap<u32, Vec<u32>> {
     let mut is_wanted = vec![false; t.corners.par_iter().flatten_iter().max().map_or(0, |most| *most as usize + 1)];
     vertices.for_each(|c| is_wanted[c as usize] = true);
@@ -267,13 +272,13 @@ fn compacted(t: Triangles, dropped: &[bool]) -> Triangles {
     }
 }
 
-/// The middle one of many values.
+/// Returns the median of the values.
 fn median(values: &[f64]) -> f64 {
     const SAMPLE: usize = 1024;
     let middle = values.len() / 2;
     let mut sample: Vec<f64> = values.iter().step_by(values.len().div_ceil(SAMPLE)).copied().collect();
     sample.sort_unstable_by(f64::total_cmp);
-    // It lies where it does in a sample, near enough; what is outside is counted only.
+    // The median of all values lies near that of a sample. Values outside the middle of the sample are only counted.
     let [low, high] = [4, 6].map(|tenths| sample[sample.len() * tenths / 10]);
     let below = values.par_iter().filter(|v| **v < low).count();
     let mut within: Vec<f64> = values.par_iter().copied().filter(|v| (low..=high).contains(v)).collect();
@@ -355,7 +360,7 @@ mod tests {
             values[values.len() / 2]
         };
         let fractions = |count: usize| (0..count).map(|k| (k as f64 * 0.618_033_988_749_895).fract());
-        // The last misleads a sample of every third value.
+        // The last one misleads a sample of every third value.
         let periodic = (0..3000).map(|k| if k % 3 == 0 { 0.0 } else { 1.0 + f64::from(k) });
         for values in [vec![3.0], vec![2.0, 1.0], vec![5.0; 4000], fractions(10_001).collect(), periodic.collect()] {
             assert_eq!(median(&values), exact(values.clone()));

@@ -1,17 +1,18 @@
-//! The Delaunay triangulation of points that stand along a Z-curve: by divide and conquer, on all cores.
+//! Delaunay triangulation of points in the order of a Z-curve: by divide and conquer, on all cores.
 //!
-//! The construction is that of Guibas and Stolfi (Primitives for the manipulation of general subdivisions, 1985) with the cuts
-//! across u and v in turn that Dwyer (1987) found to leave little to merge. A Z-curve has these cuts in it: where the highest
-//! bit changes in which its keys differ, everything before lies below a line of the plane and everything after above it. Halves
-//! know nothing of each other until they are merged, so each can be built by a thread of its own, and what is built does not
-//! depend on how many there are.
+//! The construction is that of Guibas and Stolfi (Primitives for the manipulation of general subdivisions, 1985). The
+//! cuts alternate between u and v; Dwyer (1987) found that this leaves little to merge. A Z-curve contains these cuts.
+//! At the highest bit in which the keys of a range differ, all points before the change lie below a line of the plane
+//! and all points after it lie above. The two halves are independent until they are merged. So a thread can build each,
+//! and the result does not depend on the number of threads.
 //!
-//! The spade crate judges it in tests and does not replace it: its bulk load of 451,401 points in no order, in tiles of 8,000 with a
-//! halo of 3.5 steps, takes 1.5 times the processor time of all of this even before the seams are checked and the neighbours joined
-//! (0.37 s against 0.24 s on one thread), and its one global load twice that on one thread only.
+//! The tests compare with the spade crate, but spade does not replace this module. For 451,401 unordered points its
+//! bulk load in tiles of 8,000 with a halo of 3.5 steps takes 1.5 times the processor time of this whole module, even
+//! before the seams are checked and the neighbours joined (0.37 s against 0.24 s on one thread). Its single global load
+//! takes twice that, and on one thread only.
 //!
-//! Every decision is exact: a determinant that rounding could have turned over is worked out by the adaptive predicates of
-//! Shewchuk. Four points on one circle are divided as it comes.
+//! Every decision is exact: if rounding could change the sign of a determinant, the adaptive predicates of Shewchuk
+//! compute it. Four points on one circle may be divided along either diagonal.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -21,50 +22,51 @@ use robust::Coord;
 
 use super::mesh::BORDER;
 
-/// Points and their keys in the order of a Z-curve; points of one key by u, then v. No two points at one place.
+/// Points and their keys in the order of a Z-curve; points with equal keys are ordered by u, then by v. All points are
+/// distinct.
 #[derive(Clone, Copy)]
 pub(crate) struct SortedSites<'a> {
     pub(crate) places: &'a [[f64; 2]],
-    /// Bits of v and u in turn, those of v the higher.
+    /// Interleaved bits of v and u; the bit of v is the higher one of each pair.
     pub(crate) keys: &'a [u64],
 }
 
-/// A directed edge of a subdivision of the plane; its other direction is the one whose number differs in the last bit.
+/// Directed edge of a subdivision of the plane. The number of its opposite direction differs in the last bit.
 type Edge = [u32; 3];
 
 const ORIGIN: usize = 0;
-/// The next edge counter-clockwise round the origin.
+/// Index of the next edge counter-clockwise around the origin.
 const AFTER: usize = 1;
-/// The next edge clockwise round the origin.
+/// Index of the next edge clockwise around the origin.
 const BEFORE: usize = 2;
 
-/// The origin of an edge that was deleted, or never made.
+/// Origin of an edge that is deleted or was never made.
 const NOWHERE: u32 = u32::MAX;
 
-/// A planar graph of n vertices has fewer than 3 n edges, each in two directions.
+/// Directed edges per vertex: a planar graph of n vertices has fewer than 3 n edges, each in two directions.
 const PER_VERTEX: usize = 6;
 
-/// So many points are triangulated by one thread.
+/// Maximum number of points that one thread triangulates alone.
 const ALONE: usize = 8192;
 
-/// Across which axis of the plane a cut separates: what lies before it has the smaller coordinate.
+/// Axis of the plane across which a cut separates: the points before the cut have the smaller coordinate.
 #[derive(Clone, Copy, PartialEq)]
 enum Axis {
     U,
     V,
 }
 
-/// A finished part: one vertex, or the edge of a hull that has everything on its left.
+/// Finished part: one vertex, or a hull edge that has the whole part on its left.
 #[derive(Clone, Copy)]
 enum Part {
     Lone(u32),
     Hull(u32),
 }
 
-/// The edges of a triangulation with a number for each inner face.
+/// Directed edges of a triangulation.
 pub(crate) struct Triangulation {
     edges: Vec<Edge>,
-    /// An edge of the hull that has everything on its left.
+    /// Hull edge that has all points on its left.
     hull: u32,
 }
 
@@ -72,7 +74,7 @@ impl Triangulation {
     /// Triangulates at least three points.
     pub(crate) fn new(sites: SortedSites) -> Self {
         let count = sites.places.len();
-        // Zeros come from the system untouched; the threads that build here are the first to touch them.
+        // The system supplies zeroed memory untouched; the threads that build here are the first to touch it.
         let mut edges: Vec<Edge> = vec![[0; 3]; PER_VERTEX * count];
         let (part, unused) = divide(sites, 0..count, &mut edges, 0);
         let Part::Hull(hull) = part else { unreachable!("three points have an edge") };
@@ -80,9 +82,10 @@ impl Triangulation {
         Self { edges, hull }
     }
 
-    /// Returns the corners of the inner faces, counter-clockwise, and the faces across the edge opposite to each corner.
+    /// Returns the corners of the inner faces, counter-clockwise, and for each corner the face across the opposite
+    /// edge.
     ///
-    /// They are numbered as their edges are, and so stand in memory about where their corners do.
+    /// Faces are numbered in the order of their edges, so that in memory they lie about where their corners do.
     pub(crate) fn faces(&self) -> (Vec<[u32; 3]>, Vec<[u32; 3]>) {
         let number: Vec<AtomicU32> = (0..self.edges.len()).into_par_iter().map(|_| AtomicU32::new(0)).collect();
         self.along_the_hull(|e| number[(e ^ 1) as usize].store(BORDER, Ordering::Relaxed));
@@ -129,7 +132,8 @@ impl Triangulation {
     }
 }
 
-/// Triangulates a range of the points in the edges that are set aside for it, of which the first has the number `base`.
+/// Triangulates a range of the points with the edges that are reserved for it. `base` is the number of the first of
+/// these edges.
 fn divide(sites: SortedSites, range: Range<usize>, edges: &mut [Edge], base: u32) -> (Part, Slots) {
     if range.len() <= ALONE {
         let fresh = base..base + edges.len() as u32;
@@ -152,7 +156,8 @@ fn divide(sites: SortedSites, range: Range<usize>, edges: &mut [Edge], base: u32
 }
 
 impl SortedSites<'_> {
-    /// Divides a range of at least two points by a line: where the second part begins, and what it is above in.
+    /// Divides a range of at least two points by a line. Returns the index where the second part begins, and the axis
+    /// along which the second part has the larger coordinates.
     fn cut(&self, range: &Range<usize>) -> (usize, Axis) {
         let keys = &self.keys[range.clone()];
         let differing = keys[0] ^ keys[keys.len() - 1];
@@ -165,14 +170,14 @@ impl SortedSites<'_> {
     }
 }
 
-/// Numbers for edges: those of deleted ones, and those not given out yet.
+/// Unused edge numbers: those of deleted edges, and those not assigned yet.
 struct Slots {
     freed: Vec<u32>,
     fresh: Vec<Range<u32>>,
 }
 
 impl Slots {
-    /// Takes the lower of two numbers that differ in the last bit.
+    /// Takes an unused pair of numbers that differ in the last bit, and returns the lower one.
     fn take(&mut self) -> u32 {
         if let Some(e) = self.freed.pop() {
             return e;
@@ -187,7 +192,7 @@ impl Slots {
         }
     }
 
-    /// Marks the edges whose numbers were not given out.
+    /// Marks the edges whose numbers were never assigned.
     fn mark(&self, edges: &mut [Edge]) {
         for range in &self.fresh {
             edges[range.start as usize..range.end as usize].fill([NOWHERE; 3]);
@@ -195,11 +200,11 @@ impl Slots {
     }
 }
 
-/// A part of the plane being triangulated.
+/// Part of the plane that is being triangulated.
 struct Subdivision<'a> {
     sites: SortedSites<'a>,
     edges: &'a mut [Edge],
-    /// The number of the first of these edges.
+    /// Number of the first edge in `edges`.
     base: u32,
     slots: Slots,
 }
@@ -219,7 +224,7 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Joins three points: to a triangle, or to two edges where they lie on one line.
+    /// Joins three points to a triangle, or to two edges if they lie on one line.
     fn three(&mut self, first: u32) -> Part {
         let mut v = [first, first + 1, first + 2];
         let orientation = self.orient2d(v[0], v[1], v[2]);
@@ -236,7 +241,7 @@ impl Subdivision<'_> {
         Part::Hull(a)
     }
 
-    /// Joins two parts that a line separates, the lower one before the line; returns their common hull.
+    /// Merges two parts that a line separates; the lower part lies before the line. Returns their common hull.
     fn merge(&mut self, lower: Part, upper: Part, axis: Axis) -> Part {
         let mut base = self.tangent(lower, upper, axis);
         loop {
@@ -263,8 +268,8 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Deletes the edges on one side that a circle through the base and the end of the edge shows not to be Delaunay's;
-    /// returns the first that stays.
+    /// Deletes the edges on one side that are not Delaunay: the next vertex lies in the circle through the base and the
+    /// end of the edge. Returns the first edge that remains.
     fn clear(&mut self, mut e: u32, way: usize, left: u32, right: u32) -> u32 {
         loop {
             let next = self.edge(e)[way];
@@ -276,9 +281,10 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Makes the lowest edge between two parts, seen with the line that separates them upright: from the upper to the lower.
+    /// Makes the lowest edge between two parts, seen with the separating line upright. It runs from the upper part to
+    /// the lower.
     fn tangent(&mut self, lower: Part, upper: Part, axis: Axis) -> u32 {
-        // Clockwise along the lower hull and counter-clockwise along the upper one.
+        // The search runs clockwise along the lower hull and counter-clockwise along the upper one.
         let mut l = match lower {
             Part::Lone(_) => None,
             Part::Hull(e) => Some(self.edge(self.farthest(e, |a, b| self.before(axis, a, b).is_lt()))[BEFORE]),
@@ -314,7 +320,7 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Climbs along a hull to the edge out of the vertex that no other is beyond.
+    /// Walks along a hull to its farthest vertex, and returns the hull edge that leaves it.
     fn farthest(&self, mut e: u32, beyond: impl Fn(u32, u32) -> bool) -> u32 {
         let next = |e: u32| self.edge(e ^ 1)[AFTER];
         let previous = |e: u32| self.edge(e)[BEFORE] ^ 1;
@@ -327,12 +333,12 @@ impl Subdivision<'_> {
         e
     }
 
-    /// Orders two vertices across a line that separates parts; along it where that does not tell.
+    /// Compares two vertices across a line that separates parts; ties are ordered along the line.
     fn before(&self, axis: Axis, a: u32, b: u32) -> std::cmp::Ordering {
         let (a, b) = (self.sites.places[a as usize], self.sites.places[b as usize]);
         match axis {
             Axis::U => a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])),
-            // The same turned by a right angle.
+            // The same order, turned by a right angle.
             Axis::V => a[1].total_cmp(&b[1]).then(b[0].total_cmp(&a[0])),
         }
     }
@@ -357,13 +363,13 @@ impl Subdivision<'_> {
         self.edge(e ^ 1)[ORIGIN]
     }
 
-    /// The next edge along the face on the left.
+    /// Returns the next edge along the face on the left.
     #[inline(always)]
     fn left_next(&self, e: u32) -> u32 {
         self.edge(e ^ 1)[BEFORE]
     }
 
-    /// Makes an edge that hangs on nothing.
+    /// Makes an edge that is connected to no other.
     fn make(&mut self, from: u32, to: u32) -> u32 {
         let e = self.slots.take();
         *self.edge_mut(e) = [from, e, e];
@@ -371,7 +377,7 @@ impl Subdivision<'_> {
         e
     }
 
-    /// Hangs an edge that is alone at its origin next to another one, counter-clockwise.
+    /// Inserts an edge that is alone at its origin directly after another one, counter-clockwise.
     #[inline(always)]
     fn put_after(&mut self, e: u32, other: u32) {
         let next = self.edge(other)[AFTER];
@@ -381,7 +387,7 @@ impl Subdivision<'_> {
         (edge[BEFORE], edge[AFTER]) = (other, next);
     }
 
-    /// Makes an edge from the end of one edge to the origin of another, across the face on the left of both.
+    /// Makes an edge from the end of `a` to the origin of `b`, across the face on the left of both.
     fn connect(&mut self, a: u32, b: u32) -> u32 {
         let e = self.make(self.dest(a), self.origin(b));
         self.put_after(e, self.left_next(a));
@@ -410,22 +416,23 @@ impl Subdivision<'_> {
     }
 }
 
-/// Positive where three points turn counter-clockwise, 0 on a line; the sign is exact.
+/// Returns a positive value if three points turn counter-clockwise and 0 if they lie on a line; the sign is exact.
 #[inline(always)]
 fn orient2d([a, b, c]: [[f64; 2]; 3]) -> f64 {
-    // The first filter of Shewchuk's predicate, here so that it is inlined; eps is half the distance from 1 to the next number.
+    // The first filter of Shewchuk's predicate is repeated here so that it is inlined. Its epsilon is half the distance
+    // from 1 to the next number.
     const BOUND: f64 = (3.0 + 16.0 * HALF_EPSILON) * HALF_EPSILON;
     let left = (a[0] - c[0]) * (b[1] - c[1]);
     let right = (a[1] - c[1]) * (b[0] - c[0]);
     let det = left - right;
     let permanent = left.abs() + right.abs();
-    // Nothing but zeros is exact: two of the points are one.
+    // If both products are zero, the determinant is exactly zero.
     if det.abs() > BOUND * permanent || permanent == 0.0 { det } else { robust::orient2d(coord(a), coord(b), coord(c)) }
 }
 
 const HALF_EPSILON: f64 = 0.5 * f64::EPSILON;
 
-/// Whether the fourth point lies within the circle through the others, which turn counter-clockwise; exact.
+/// Returns true if the fourth point lies inside the circle through the others, which turn counter-clockwise; exact.
 #[inline(always)]
 fn in_circle([a, b, c, d]: [[f64; 2]; 4]) -> bool {
     const BOUND: f64 = (10.0 + 96.0 * HALF_EPSILON) * HALF_EPSILON;
@@ -458,7 +465,7 @@ mod tests {
     use super::super::delaunay::along_a_z_curve;
     use super::*;
 
-    /// Numbers between 0 and 1 without any order (splitmix64).
+    /// Returns a generator of pseudorandom numbers between 0 and 1 (splitmix64).
     fn noise(mut seed: u64) -> impl FnMut() -> f64 {
         move || {
             seed = seed.wrapping_add(0x9E37_79B9_7F4A_7C15);
@@ -477,7 +484,7 @@ mod tests {
         (0..columns * rows).map(|k| [(k % columns) as f64 * 0.1, (k / columns) as f64 * 0.1]).collect()
     }
 
-    /// A few points far apart, most of the others within a hair's breadth of one of them.
+    /// Returns points in five clusters that are far apart; most points lie much closer than `breadth` to their centre.
     fn clustered(count: usize, breadth: f64) -> Vec<[f64; 2]> {
         let (centres, mut next) = (scattered(5, 3), noise(4));
         (0..count).map(|k| centres[k % 5].map(|c| c + breadth * next() * next())).collect()
@@ -487,8 +494,8 @@ mod tests {
         along_a_z_curve(places).into_iter().map(|(key, index)| (places[index as usize], key)).unzip()
     }
 
-    /// Triangulates, and proves by robust's predicates and one global load of spade that the triangulation is Delaunay's;
-    /// returns how many triangles there are, and whether others would do as well.
+    /// Triangulates, and proves by robust's predicates and one global load of spade that the triangulation is Delaunay.
+    /// Returns the number of triangles, and true if other Delaunay triangulations exist.
     fn checked(places: &[[f64; 2]]) -> (usize, bool) {
         let (places, keys) = in_order(places);
         let (corners, neighbours) = Triangulation::new(SortedSites { places: &places, keys: &keys }).faces();
@@ -509,7 +516,7 @@ mod tests {
                     assert_eq!([across[(j + 2) % 3], across[(j + 1) % 3]], edge);
                     within = robust::incircle(p, q, r, at(across[j]));
                 }
-                // Locally Delaunay everywhere is Delaunay.
+                // A triangulation that is locally Delaunay at every edge is Delaunay.
                 assert!(within <= 0.0);
                 ambiguous |= within == 0.0;
                 if within < 0.0 {
@@ -534,8 +541,8 @@ mod tests {
         DelaunayTriangulation::bulk_load_stable(places.iter().map(|&[u, v]| Point2::new(u, v)).collect()).unwrap()
     }
 
-    /// The edges that are in every Delaunay triangulation: those of the hull, and those whose two triangles have circles of
-    /// their own.
+    /// Returns the edges that every Delaunay triangulation contains: those of the hull, and those whose two triangles
+    /// have different circumcircles.
     fn certain_of_spade(spade: &DelaunayTriangulation<Point2<f64>>) -> BTreeSet<[u32; 2]> {
         let certain = spade.undirected_edges().filter(|e| {
             let e = e.as_directed();
@@ -565,12 +572,12 @@ mod tests {
         assert!(checked(&grid(150, 110)).1);
         checked(&grid(2, 500));
         checked(&grid(500, 2));
-        // A grid that leans, whose lines are lines to rounding only.
+        // A rotated grid, whose lines are straight only to rounding.
         let (s, c) = 0.3f64.sin_cos();
         checked(&grid(130, 70).iter().map(|[u, v]| [c * u - s * v, s * u + c * v]).collect::<Vec<_>>());
         let circle = |k: usize| [(k as f64).cos(), (k as f64).sin()];
         checked(&(0..5000).map(circle).collect::<Vec<_>>());
-        // All but one on a line: upright, level, leaning.
+        // All points but one on a line: along v, along u, oblique.
         for [du, dv] in [[0.0, 1.0], [1.0, 0.0], [1.0, 3.0]] {
             let line = (0..2000).map(|k| [f64::from(k) * du, f64::from(k) * dv]);
             checked(&line.chain([[500.5, 200.25]]).collect::<Vec<_>>());

@@ -1,8 +1,8 @@
-//! Why a nominal surface or its offset cannot be had.
+//! Errors of a nominal surface and of its offset.
 
 use thiserror::Error;
 
-/// Why a nominal surface or its offset cannot be had.
+/// Reason why a nominal surface or its offset cannot be made.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]

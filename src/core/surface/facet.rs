@@ -1,40 +1,42 @@
-//! The formula of one facet: its corners on the offset surface, the foot of a point on it, and the curved distance there.
+//! Geometry of one facet: its corners on the offset surface, the projection (foot) of a point onto it, and the curved
+//! distance there.
 //!
-//! A corner is offset along its normal, S_e = S + r n, eq. (3). The flat distance is that of the paper, eq. (1) and (2). The
-//! curved distance knows that the surface bulges between its corners: with barycentric weights b and the slope of the surface
-//! along each edge at each of its ends, the height over the flat facet is the cubic
+//! A corner is offset along its normal, S_e = S + r n, eq. (3). The flat distance is that of the paper, eq. (1) and
+//! (2). The curved distance accounts for the bulge of the surface between its corners. With barycentric weights b and
+//! the slope of the surface along each edge at each of its ends, the height over the flat facet is the cubic
 //!
 //! ```text
 //! h(b) = sum over i != j of g_ij b_i^2 b_j + 1/2 b_0 b_1 b_2 sum over i != j of g_ij,   g_ij = -n_i.(p_j - p_i)
 //! ```
 //!
-//! which is the cubic triangle with quadratic precision (Vlachos et al., Curved PN triangles, 2001), its heights taken along
-//! the normals of the surface instead of the normal of the facet. The foot of the perpendicular on the flat facet is off by
-//! the distance times the lean of the surface against the facet, so the distance along the normal n(b) of the surface is
-//! d (N.n(b)) - h(b), with d and N the flat distance and normal: exact to third order in the size of a facet.
+//! This is the cubic triangle with quadratic precision (Vlachos et al., Curved PN triangles, 2001), with its heights
+//! taken along the normals of the surface instead of the normal of the facet. The foot of the perpendicular on the flat
+//! facet is off by the distance times the tilt of the surface against the facet. So the distance along the normal n(b)
+//! of the surface is d (N.n(b)) - h(b), with the flat distance d and the flat normal N. It is exact to third order in
+//! the size of a facet.
 //!
-//! The formula is written once, for one facet or for four side by side: see [`Real`].
+//! The code is generic over [`Real`], so that one text serves one facet or four in parallel lanes.
 
 use crate::geometry::{Point, Vector};
 
 use super::simd::{F64x4, LANES, Real, Vector3x4, cross, dot, minus, times};
 
-/// A point of a surface with its unit normal: side by side, since a point location needs both, and apart they would cost it
-/// twice the cache lines.
+/// Point of a surface with its unit normal. The two are adjacent in memory because a point location needs both; apart
+/// they would cost twice the cache lines.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Vertex {
     pub(crate) point: Point,
     pub(crate) normal: Vector,
 }
 
-/// On which side of the nominal surface the probe travels.
+/// Side of the nominal surface on which the probe travels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Side {
-    /// Where the normals of the nominal surface point: +z for a height over the plane, outwards for a mesh.
+    /// The side that the normals of the nominal surface point to: +z for a height over the plane, outwards for a mesh.
     #[default]
     Normal,
-    /// The other one.
+    /// The opposite side.
     Opposite,
 }
 
@@ -56,29 +58,30 @@ impl Side {
     }
 }
 
-/// What a point location needs of the triangles; counter-clockwise seen from the side of the normals.
+/// Triangles as a point location needs them; counter-clockwise as seen from the side of the normals.
 pub(crate) trait Facets: Sync {
     /// Returns the three corners of a facet.
     fn corners(&self, facet: u32) -> [u32; 3];
 
-    /// Returns the facet to look at next for a point with these barycentric weights; `None` where the surface ends.
+    /// Returns the facet to visit next for a point with these barycentric weights; `None` if the surface ends there.
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32>;
 
-    /// Whether the surface ends at the edge of a facet that lies opposite to a corner.
+    /// Returns true if the surface ends at the edge of a facet that is opposite to a corner.
     fn ends_at(&self, facet: u32, corner: usize) -> bool;
 
-    /// Returns a facet to start from.
+    /// Returns a facet from which to start the search for a point.
     fn start(&self, p: &Point) -> u32;
 }
 
-/// A corner on the offset surface, eq. (3), and its unit normal towards the probe's side.
+/// Corner on the offset surface, eq. (3), and its unit normal towards the probe's side.
 pub(crate) type Corner<T> = ([T; 3], [T; 3]);
 
-/// A facet with its corners on the offset surface, or four of them.
+/// One facet, or four in parallel lanes, with the corners on the offset surface.
 pub(crate) struct Facet<T> {
     x: [[T; 3]; 3],
     n: [[T; 3]; 3],
-    /// Normal of the flat facet, not of unit length, in the sense in which the corners turn, and the square of its length.
+    /// Normal of the flat facet, not of unit length, in the sense in which the corners turn. `squared` is its squared
+    /// length.
     pub(crate) turned: [T; 3],
     pub(crate) squared: T,
     /// +1 on the side of the normals, -1 on the other.
@@ -92,7 +95,7 @@ impl<T: Real> Facet<T> {
         Self { x: [a.0, b.0, c.0], n: [a.1, b.1, c.1], turned, squared: dot(&turned, &turned), sign }
     }
 
-    /// Returns where a point lies, seen from a corner.
+    /// Returns the vector from a corner to a point.
     #[inline(always)]
     pub(crate) fn seen_from(&self, corner: usize, p: &[T; 3]) -> [T; 3] {
         minus(p, &self.x[corner])
@@ -104,7 +107,8 @@ impl<T: Real> Facet<T> {
         minus(&self.x[to], &self.x[from])
     }
 
-    /// Returns the barycentric weights of the foot on the plane of the flat facet, of a point seen from the first corner.
+    /// Returns the barycentric weights of the projection of a point onto the plane of the flat facet. `w` is the vector
+    /// from the first corner to the point.
     #[inline(always)]
     pub(crate) fn weights(&self, w: &[T; 3]) -> [T; 3] {
         let (e1, e2) = (self.edge(0, 1), self.edge(0, 2));
@@ -120,7 +124,7 @@ impl<T: Real> Facet<T> {
         times(&self.turned, self.sign / self.squared.sqrt())
     }
 
-    /// Returns the place of the flat facet with these weights.
+    /// Returns the point of the flat facet with these weights.
     #[inline(always)]
     pub(crate) fn at(&self, b: &[T; 3]) -> [T; 3] {
         weighted(&self.x, b)
@@ -139,7 +143,7 @@ impl<T: Real> Facet<T> {
         let (mut along, mut total) = (zero, zero);
         for (i, j) in [(0, 1), (1, 2), (2, 0)] {
             let edge = self.edge(i, j);
-            // Slope of the surface along the edge, at its beginning and against its direction at its end.
+            // Slope of the surface along the edge at its start, and the slope against the edge's direction at its end.
             let (leaving, arriving) = (zero - dot(&self.n[i], &edge), dot(&self.n[j], &edge));
             along = along + b[i] * b[j] * (b[i] * leaving + b[j] * arriving);
             total = total.plus(leaving, arriving);
@@ -147,14 +151,16 @@ impl<T: Real> Facet<T> {
         along + T::splat(0.5) * total * b[0] * b[1] * b[2]
     }
 
-    /// Returns the flat distance, eq. (2), of a point seen from the first corner, and the flat normal.
+    /// Returns the flat distance of a point, eq. (2), and the flat normal. `w` is the vector from the first corner to
+    /// the point.
     #[inline(always)]
     pub(crate) fn flat_distance(&self, w: &[T; 3]) -> (T, [T; 3]) {
         let flat = self.flat_normal();
         (dot(w, &flat), flat)
     }
 
-    /// Returns the curved distance of a point seen from the first corner, whose foot has these weights, and the normal there.
+    /// Returns the curved distance of a point and the normal at its foot. `w` is the vector from the first corner to
+    /// the point; `b` are the weights of the foot.
     #[inline(always)]
     pub(crate) fn curved_distance(&self, w: &[T; 3], b: &[T; 3]) -> (T, [T; 3]) {
         let (flat_mm, flat) = self.flat_distance(w);
@@ -169,16 +175,17 @@ fn weighted<T: Real>(v: &[[T; 3]; 3], b: &[T; 3]) -> [T; 3] {
     [at(0), at(1), at(2)]
 }
 
-/// Moves a vertex onto the offset surface, eq. (3), its normal turned to the probe's side.
+/// Moves a vertex onto the offset surface, eq. (3), and turns its normal to the probe's side.
 #[inline(always)]
 pub(crate) fn corner<T: Real>((point, normal): ([T; 3], [T; 3]), sign: T, radius_mm: T) -> Corner<T> {
     let normal = times(&normal, sign);
     ([point[0] + normal[0] * radius_mm, point[1] + normal[1] * radius_mm, point[2] + normal[2] * radius_mm], normal)
 }
 
-/// Four vertices side by side: their points and their normals.
+/// Packs four vertices into lanes; returns their points and their normals.
 ///
-/// Every vector is built from registers; built through an array in memory it would wait for four narrow stores.
+/// Every vector is built from registers. If it were built through an array in memory, it would wait for four narrow
+/// stores.
 #[inline(always)]
 pub(crate) fn four_vertices([a, b, c, d]: &[Vertex; LANES]) -> (Vector3x4, Vector3x4) {
     let normal = [
@@ -189,7 +196,7 @@ pub(crate) fn four_vertices([a, b, c, d]: &[Vertex; LANES]) -> (Vector3x4, Vecto
     (side_by_side(&[a.point, b.point, c.point, d.point]), normal)
 }
 
-/// Four points side by side.
+/// Packs four points into lanes.
 #[inline(always)]
 pub(crate) fn side_by_side(points: &[Point; LANES]) -> Vector3x4 {
     let [a, b, c, d] = points;

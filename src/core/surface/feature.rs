@@ -1,4 +1,4 @@
-//! What tells one place of a surface from another whatever its pose: how it bends.
+//! Curvature features: they distinguish the places of a surface whatever its pose.
 
 use rayon::prelude::*;
 
@@ -8,7 +8,7 @@ use super::facet::Side;
 use super::normals::fit;
 use super::projection::principal_axes;
 
-/// A place of a surface with its normal and the way it bends there.
+/// Place of a surface with its normal and its principal curvatures.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Feature {
     pub(crate) point: Point,
@@ -25,7 +25,7 @@ impl Feature {
         self.curvatures[1] - self.curvatures[0]
     }
 
-    /// Returns the same place seen from the other side of the surface.
+    /// Returns the same place as seen from the other side of the surface.
     pub(crate) fn turned_over(&self) -> Self {
         Self {
             point: self.point,
@@ -35,9 +35,9 @@ impl Feature {
         }
     }
 
-    /// Returns the place on the offset surface, its normal towards that side; `None` where the offset folds.
+    /// Returns the place on the offset surface, with its normal towards `side`; `None` if the offset folds there.
     ///
-    /// Equation: a normal curvature k towards the offset's side becomes k / (1 - r k); the directions stay.
+    /// Equation: a normal curvature k towards the offset's side becomes k / (1 - r k); the directions do not change.
     pub(crate) fn offset(&self, radius_mm: f64, side: Side) -> Option<Self> {
         let seen = if side == Side::Normal { *self } else { self.turned_over() };
         let room = seen.curvatures.map(|k| 1.0 - radius_mm * k);
@@ -49,13 +49,13 @@ impl Feature {
     }
 }
 
-/// Neighbours of a local fit.
+/// Number of nearest points that a local fit asks for, the point itself included.
 const NEIGHBOURS: u32 = 25;
 
-/// Fits the curvature at each of some scattered points; with their normals where these are known.
+/// Fits the curvature at each of some scattered points; uses their normals if these are known.
 ///
-/// Neighbours that a first fit contradicts are left out of the second, so that an outlier spoils itself and not the places
-/// around it. Points whose own neighbours are not a surface are left out altogether.
+/// A second fit excludes the neighbours that contradict the first, so that an outlier spoils only itself and not the
+/// places around it. Points whose neighbours do not form a surface are omitted.
 pub(crate) fn features(points: &[Point], normals: Option<&[Vector]>) -> Vec<Feature> {
     let tree = Nearest::of(points.iter().copied());
     (0..points.len())
@@ -89,7 +89,7 @@ fn feature(at: Point, around: &[Point], known: Option<Vector>) -> Option<Feature
     let middle = residuals.len() / 2;
     let median = *residuals.select_nth_unstable_by(middle, f64::total_cmp).1;
     let good = |p: &&Point| distance(p) <= 6.0 * median;
-    // A second fit to the same neighbours would be the first.
+    // With the same neighbours the second fit would equal the first.
     let second =
         if around.iter().all(|p| good(&p)) { first } else { fit(at, mean, around.iter().filter(good).copied()) };
     let finite = second.curvatures.iter().all(|k| k.is_finite()) && second.direction.iter().all(|c| c.is_finite());
@@ -105,7 +105,7 @@ fn feature(at: Point, around: &[Point], known: Option<Vector>) -> Option<Feature
 mod tests {
     use super::*;
 
-    /// A saddle z = x^2/80 - y^2/50 sampled on a grid.
+    /// Returns a saddle z = x^2/80 - y^2/50, sampled on a grid.
     fn saddle() -> Vec<Point> {
         (-15..=15)
             .flat_map(|j| (-15..=15).map(move |i| (f64::from(i) * 0.7, f64::from(j) * 0.7)))

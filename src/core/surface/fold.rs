@@ -1,4 +1,4 @@
-//! Where an offset surface folds: a probe does not fit into a place that is more concave than itself.
+//! Folds of an offset surface: a probe does not fit into a place that is more concave than the probe itself.
 
 use rayon::prelude::*;
 
@@ -11,17 +11,19 @@ use super::offset::{OffsetSurface, Place};
 use super::patch::{Lattice, Patch};
 use super::simd::{F64x4, LANES, Real, Vector3x4, dot, minus, times};
 
-/// Facets of a mesh that are looked at besides those touched: its normals are fitted only where they are needed.
+/// Maximum number of facets of a mesh that are checked in addition to the touched ones. It is limited because a mesh
+/// fits its normals only where they are needed.
 const LOOKED_AT: usize = 2048;
 
-/// A grid is first looked over in steps of two nodes with a probe this much larger; only if that one nearly folds anywhere is
-/// every facet looked at. A surface whose curvature changes by a third between neighbouring nodes is not sampled but guessed.
+/// Step of the first check of a grid, in nodes. This check uses a probe `DOUBT` times as large; every facet is checked
+/// only if that probe nearly folds somewhere. A surface whose curvature changes by a third between neighbouring nodes
+/// is sampled too coarsely to be known.
 const STEP: usize = 2;
 const DOUBT: f64 = 1.4;
 
 impl OffsetSurface<'_> {
-    /// Returns the worst place where the offset surface folds, if it does: over a whole grid, and over a mesh at some thousand
-    /// places.
+    /// Returns the worst place where the offset surface folds, if there is one. Checks a whole grid, and up to
+    /// `LOOKED_AT` facets of a mesh.
     pub(crate) fn fold(&self) -> Option<SurfaceError> {
         if self.radius_mm() == 0.0 {
             return None;
@@ -30,8 +32,8 @@ impl OffsetSurface<'_> {
         self.worst_fold(patches.iter().flat_map(|patch| self.folded(patch).into_iter().map(move |f| (patch, f))))
     }
 
-    /// Returns the worst place where the offset surface folds among those of a mesh that were touched; a grid is looked at
-    /// whole by [`OffsetSurface::fold`].
+    /// Returns the worst place where the offset surface folds among the touched places of a mesh.
+    /// [`OffsetSurface::fold`] checks a grid as a whole.
     pub(crate) fn fold_where_touched(&self, touched: impl Iterator<Item = Place>) -> Option<SurfaceError> {
         let patches = self.nominal().patches();
         let is_mesh = |patch: &Patch| matches!(patch.lattice, Lattice::Mesh(_));
@@ -44,7 +46,7 @@ impl OffsetSurface<'_> {
         self.worst_fold(there.into_iter())
     }
 
-    /// The worst of some facets that fold.
+    /// Returns the worst of some folded facets as an error.
     fn worst_fold<'a>(&self, folded: impl Iterator<Item = (&'a Patch, u32)>) -> Option<SurfaceError> {
         let worst = folded.map(|(p, f)| (self.least_curvature(p, f), p, f));
         let (curvature, patch, facet) = worst.min_by(|a, b| a.0.total_cmp(&b.0))?;
@@ -52,7 +54,7 @@ impl OffsetSurface<'_> {
         Some(SurfaceError::OffsetFolds { at, concave_radius_mm: -1.0 / curvature, probe_radius_mm: self.radius_mm() })
     }
 
-    /// The facets of a patch that fold, among those looked at.
+    /// Returns the folded facets of a patch, among those that are checked.
     fn folded(&self, patch: &Patch) -> Vec<u32> {
         match &patch.lattice {
             Lattice::Grid(grid) => {
@@ -78,7 +80,7 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// The wide facets along a row of nodes.
+    /// Returns the wide facets along a row of nodes.
     fn wide_row<'a>(&self, grid: &GridLattice, nodes: &'a [Vertex], row: usize) -> WideRow<'a> {
         let columns = grid.columns();
         let up = STEP.min(grid.rows() - 1 - row);
@@ -89,7 +91,7 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Whether the offset turns a facet over or flattens it: whether E + r B is no longer positive definite.
+    /// Returns true if the offset turns a facet over or flattens it: E + r B is no longer positive definite.
     #[inline]
     fn folds(&self, patch: &Patch, corners: [u32; 3]) -> bool {
         let (p, q, t) = (patch.vertex(corners[0]), patch.vertex(corners[1]), patch.vertex(corners[2]));
@@ -98,8 +100,8 @@ impl OffsetSurface<'_> {
         not_positive(edges.0, edges.1, (q.normal - p.normal) * reach, (t.normal - p.normal) * reach)
     }
 
-    /// Returns the least normal curvature of a facet in 1/mm, negative where it is concave seen from the probe's side: the
-    /// least eigenvalue of E^-1 B.
+    /// Returns the smallest normal curvature of a facet in 1/mm, negative where it is concave as seen from the probe's
+    /// side. It is the smallest eigenvalue of E^-1 B.
     fn least_curvature(&self, patch: &Patch, facet: u32) -> f64 {
         let ([e, f, g], [l, m, k]) = self.forms(patch, patch.corners(facet));
         let det = e * g - f * f;
@@ -108,10 +110,10 @@ impl OffsetSurface<'_> {
         mean - (mean * mean - gauss).max(0.0).sqrt()
     }
 
-    /// Returns the first and second fundamental forms over two edges of a facet, seen from the probe's side.
+    /// Returns the first and second fundamental forms over two edges of a facet, as seen from the probe's side.
     ///
-    /// The normals change by dn = K e along an edge e, so with E_ij = e_i . e_j and B_ij the symmetric part of e_i . dn_j, K is
-    /// E^-1 B and the offset has the first form E + 2 r B + O(r^2), which is singular where E + r B is.
+    /// Along an edge e the normal changes by dn = K e. With E_ij = e_i . e_j and B_ij the symmetric part of e_i . dn_j,
+    /// K is E^-1 B. The offset has the first form E + 2 r B + O(r^2), which is singular where E + r B is.
     #[inline]
     fn forms(&self, patch: &Patch, [a, b, c]: [u32; 3]) -> ([f64; 3], [f64; 3]) {
         let (a, b, c) = (patch.vertex(a), patch.vertex(b), patch.vertex(c));
@@ -133,7 +135,7 @@ struct WideRow<'a> {
 impl pulp::NullaryFnOnce for WideRow<'_> {
     type Output = bool;
 
-    /// Whether any of them comes near to folding; holes do not.
+    /// Returns true if any of the facets nearly folds; facets at holes do not count.
     #[inline(always)]
     fn call(self) -> bool {
         let (nodes, above) = (self.nodes, &self.above[..self.nodes.len()]);
@@ -159,7 +161,7 @@ impl pulp::NullaryFnOnce for WideRow<'_> {
 }
 
 impl WideRow<'_> {
-    /// Whether E + r B is not positive definite for any of four; see [`not_positive`].
+    /// Returns true if E + r B is not positive definite for any of four facets; see [`not_positive`].
     #[inline(always)]
     fn any_of_four(
         &self,
@@ -182,7 +184,8 @@ impl WideRow<'_> {
     }
 }
 
-/// Whether E + r B is not positive definite, for two edges and r times the change of the normal along each; not so for NaN.
+/// Returns true if E + r B is not positive definite; returns false for NaN. `e1` and `e2` are two edges; `d1` and `d2`
+/// are r times the change of the normal along each.
 #[inline(always)]
 fn not_positive(e1: Vector, e2: Vector, d1: Vector, d2: Vector) -> bool {
     let e = e1.dot(&(e1 + d1));

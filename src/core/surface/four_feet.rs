@@ -1,19 +1,19 @@
-//! The point location and the distance, four points at a time.
+//! Point location and distance for four points at a time.
 //!
-//! Once a registration has settled, nearly every point stays on its facet from one iteration to the next, and over a grid a
-//! point that left it is a jump or two away. The arithmetic of the [facet](super::facet) is then the same straight line of products
-//! and sums for all, which the compiler turns into vector instructions when four points stand side by side. Points that leave
-//! the surface, or have a longer way, are left to the single search; the two agree to rounding.
+//! Once a registration has settled, nearly every point stays on its facet from one iteration to the next. On a grid, a
+//! point that leaves its facet is one or two jumps away. The arithmetic of the [facet](super::facet) is then the same
+//! straight line of products and sums for all points, which the compiler turns into vector instructions over four
+//! lanes. Points that leave the surface, or have a longer way, use the single search. The two agree to rounding.
 
 use super::facet::{Corner, Facet, Facets, corner, four_vertices};
 use super::offset::{Distance, INSIDE, Lookup, OffsetSurface, Place};
 use super::patch::{Lattice, Patch};
 use super::simd::{F64x4, LANES, Real, Vector3x4};
 
-/// Jumps that four points take together over a grid before they are left to the single search.
+/// Maximum number of jumps of four points together over a grid; after that the single search is used.
 const JUMPS: usize = 4;
 
-/// The feet of four points.
+/// Feet of four points: their projections onto the offset surface.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FourFeet {
     pub(crate) distance_mm: F64x4,
@@ -21,15 +21,17 @@ pub(crate) struct FourFeet {
 }
 
 impl OffsetSurface<'_> {
-    /// Whether [`OffsetSurface::four_feet`] answers for this surface: one patch, the curved distance at the foot.
+    /// Returns true if [`OffsetSurface::four_feet`] supports this surface: one patch, and the curved distance at the
+    /// foot.
     pub(crate) fn has_four_feet(&self) -> bool {
         self.nominal().patches().len() == 1 && self.distance() == Distance::Curved && self.lookup() == Lookup::Foot
     }
 
-    /// Finds the feet of four points near the places given, which become those of the feet.
+    /// Finds the feet of four points near the given places, and replaces the places by those of the feet.
     ///
-    /// Returns `None`, and the places mean nothing, where one of them lies beyond the edge or too far away: on a mesh already
-    /// where it is not on its facet, since a walk over one would fit normals on the way.
+    /// Returns `None` if one of the points lies beyond the edge or too far away; the places are then invalid. On a mesh
+    /// it returns `None` as soon as a point is not on its facet, because a walk over a mesh would fit normals on the
+    /// way.
     #[inline(always)]
     pub(crate) fn four_feet(&self, p: &Vector3x4, places: &mut [Place; LANES]) -> Option<FourFeet> {
         let patch = &self.nominal().patches()[0];
@@ -39,7 +41,8 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns where four points may be that follow others as those followed the ones before; `None` where nothing tells.
+    /// Returns the expected places of the next four points: they follow the last ones as those followed the ones
+    /// before. Returns `None` if there is no prediction: on a mesh, or if a last place is unknown.
     pub(crate) fn four_extrapolated_places(
         &self,
         before: &[Place; LANES],
@@ -93,7 +96,7 @@ impl OffsetSurface<'_> {
         Facet::new([first, second, third], F64x4::splat(self.side().sign()))
     }
 
-    /// One corner of each of four facets: its place on the offset surface and its normal.
+    /// Returns one corner of each of four facets: its point on the offset surface and its normal.
     #[inline(always)]
     fn four_corners(&self, patch: &Patch, [a, b, c, d]: [u32; LANES]) -> Corner<F64x4> {
         let four = four_vertices(&[patch.vertex(a), patch.vertex(b), patch.vertex(c), patch.vertex(d)]);
@@ -101,7 +104,8 @@ impl OffsetSurface<'_> {
     }
 }
 
-/// Takes the points that do not stay to the facets their weights point at; false where one of them has none.
+/// Moves the points that do not stay to the facets that their weights point at. Returns false if one of them has no
+/// next facet.
 #[inline(never)]
 fn jumped<F: Facets>(facets: &F, places: &mut [Place; LANES], stays: &[bool; LANES], b: &[F64x4; 3]) -> bool {
     for l in (0..LANES).filter(|&l| !stays[l]) {
@@ -148,7 +152,7 @@ mod tests {
                     };
                     for (l, foot) in feet.iter().enumerate() {
                         assert_eq!(places[l], foot.place);
-                        // Four group a sum otherwise than one: the last bit may differ.
+                        // The four-lane code groups a sum differently: the last bit may differ.
                         assert!((four.distance_mm.0[l] - foot.distance_mm).abs() < 1e-14);
                         assert!((0..3).all(|c| (four.normal[c].0[l] - foot.normal[c]).abs() < 1e-14));
                     }

@@ -1,4 +1,4 @@
-//! A grid of nodes as a surface: two triangles a cell, by arithmetic, without any triangulation.
+//! Grid of nodes as a surface: two triangles per cell, by arithmetic, without any triangulation.
 
 use rayon::prelude::*;
 
@@ -8,21 +8,23 @@ use crate::geometry::{Point, Vector};
 use super::facet::{Facets, Vertex, side_by_side};
 use super::simd::{F64x4, LANES, Real, Vector3x4, cross, minus, times};
 
-/// The triangles of a structured grid, row by row with the column fastest.
+/// Triangles of a structured grid, row by row with the column fastest.
 ///
-/// Facet 2n is the half at the lower right (nodes 00, 10, 11) of the cell whose first node is n, facet 2n + 1 the half at its
-/// upper left (00, 11, 01): numbered by nodes, so that corners cost no division; those of the last column do not exist.
+/// Facet 2n is the lower right half (nodes 00, 10, 11) of the cell whose first node is n; facet 2n + 1 is the upper
+/// left half (00, 11, 01). Facets are numbered by nodes, so that their corners need no division. The facets of the last
+/// column do not exist.
 #[derive(Clone, Debug)]
 pub(crate) struct GridLattice {
     columns: u32,
     rows: u32,
-    /// Which nodes exist; empty when all do.
+    /// True for each node that exists; empty if all nodes exist.
     present: Vec<bool>,
-    /// Corner and nodes per millimetre of a grid that is regular in x and y, to begin a search near its end.
+    /// First corner, and nodes per millimetre, of a grid that is regular in x and y. With them a search begins near its
+    /// end.
     regular: Option<([f64; 2], [f64; 2])>,
 }
 
-/// Returns the points in grid order, NaN where a node has none.
+/// Returns the points in grid order, with NaN at a node that has no point.
 pub(crate) fn in_grid_order(points: Vec<Point>, order: &GridOrder) -> Vec<Point> {
     if order.is_in_order() {
         return points;
@@ -32,7 +34,7 @@ pub(crate) fn in_grid_order(points: Vec<Point>, order: &GridOrder) -> Vec<Point>
 }
 
 impl GridLattice {
-    /// Lays triangles over points that stand row by row, column fastest; NaN points are holes.
+    /// Builds the triangles over points that are ordered row by row, column fastest; NaN points are holes.
     pub(crate) fn new(columns: usize, rows: usize, points: &[Point], regular_in_xy: bool) -> Self {
         let holes = points.par_iter().any(|p| p.x.is_nan());
         let present = if holes { points.iter().map(|p| p.x.is_finite()).collect() } else { Vec::new() };
@@ -44,7 +46,7 @@ impl GridLattice {
         Self { columns: columns as u32, rows: rows as u32, present, regular }
     }
 
-    /// Lays triangles over a grid that is known to be regular in x and y and to have no hole.
+    /// Builds the triangles over a grid that is known to be regular in x and y and to have no hole.
     pub(crate) fn whole(found: &GridInOrder) -> Self {
         let [low, high] = found.corners;
         let per_mm = |k: usize, n: usize| (n - 1) as f64 / (high[k] - low[k]);
@@ -60,7 +62,7 @@ impl GridLattice {
         self.columns as usize
     }
 
-    /// Whether its nodes stand at equal steps of x and y.
+    /// Returns true if the nodes have equal steps in x and y.
     pub(crate) fn is_regular(&self) -> bool {
         self.regular.is_some()
     }
@@ -69,13 +71,13 @@ impl GridLattice {
         self.rows as usize
     }
 
-    /// Returns the lower facets of a row of cells with their corners, holes included.
+    /// Returns the lower facets of a row of cells with their corners, including facets at holes.
     pub(crate) fn row_of_facets(&self, row: usize) -> impl Iterator<Item = (u32, [u32; 3])> {
         let first = row as u32 * self.columns;
         (first..first + self.columns - 1).map(|node| (2 * node, [node, node + 1, node + self.columns + 1]))
     }
 
-    /// Whether a facet lies between nodes that all exist.
+    /// Returns true if the facet is on the grid and all of its nodes exist.
     pub(crate) fn has_facet(&self, facet: u32) -> bool {
         let (i, j) = self.cell_of(facet);
         i + 1 < self.columns && j + 1 < self.rows && self.corners(facet).iter().all(|&c| self.is_present(c as usize))
@@ -85,7 +87,7 @@ impl GridLattice {
         self.present.is_empty() || self.present[node]
     }
 
-    /// Returns the other nodes of the block that reaches so many nodes to all sides of one.
+    /// Returns the other nodes of the block that extends `reach` nodes to all sides of a node, without holes.
     pub(crate) fn block_around(&self, node: u32, reach: u32) -> Vec<u32> {
         let (i, j) = (node % self.columns, node / self.columns);
         let within = |k: u32, count: u32| k.saturating_sub(reach)..(k + reach + 1).min(count);
@@ -93,7 +95,7 @@ impl GridLattice {
         nodes.filter(|&k| k != node && self.is_present(k as usize)).collect()
     }
 
-    /// Returns a facet at a node, or of the nearest whole cell.
+    /// Returns a facet at a node, or a facet of the nearest whole cell.
     pub(crate) fn facet_near(&self, node: u32) -> u32 {
         let (i, j) = (node % self.columns, node / self.columns);
         let (i, j) = self.nearest_whole_cell(i.min(self.columns - 2), j.min(self.rows - 2));
@@ -116,7 +118,8 @@ impl GridLattice {
         (node % self.columns, node / self.columns)
     }
 
-    /// Returns the cell at (u, v) steps from a cell, kept within the grid, and as far towards it as there are whole cells.
+    /// Returns the cell at (u, v) steps from a cell, clamped to the grid. If that cell is not whole, halves the steps
+    /// until they lead to a whole cell; returns `None` if there is none.
     fn cell_towards(&self, (i, j): (u32, u32), u: f64, v: f64) -> Option<(u32, u32)> {
         let clamp =
             |from: u32, step: f64, cells: u32| (f64::from(from) + step).floor().clamp(0.0, f64::from(cells - 1));
@@ -133,7 +136,7 @@ impl GridLattice {
         }
     }
 
-    /// Returns the whole cell nearest to a cell, by rings of growing size.
+    /// Returns the whole cell nearest to a cell; searches in rings of growing size.
     fn nearest_whole_cell(&self, i: u32, j: u32) -> (u32, u32) {
         if self.cell_is_whole(i, j) {
             return (i, j);
@@ -160,7 +163,7 @@ impl Facets for GridLattice {
         if facet & 1 == 0 { [node, node + 1, far] } else { [node, far, far - 1] }
     }
 
-    /// Jumps straight to the cell that the affine continuation of this one points at.
+    /// Jumps directly to the cell that the affine continuation of this facet points at.
     #[inline]
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32> {
         let (u, v) =
@@ -211,8 +214,8 @@ fn extremes(points: &[Point]) -> ([f64; 2], [f64; 2]) {
 
 /// Weights of the first derivative at each place of a window of equally spaced nodes, for windows of 2 to 5 nodes.
 ///
-/// Each row differentiates the polynomial through its window exactly: five nodes a quartic, so that a bi-cubic patch of
-/// surface has its exact normal at every node, at the border too.
+/// Each row differentiates the polynomial through its window exactly. Five nodes determine a quartic, so that a
+/// bi-cubic patch of surface has its exact normal at every node, also at the border.
 #[rustfmt::skip]
 const DERIVATIVES: [&[&[f64]]; 6] = [
     &[],
@@ -230,14 +233,15 @@ const DERIVATIVES: [&[&[f64]]; 6] = [
     ],
 ];
 
-/// Fits the unit normals of a structured grid, on the side where column x row is right-handed, and sets them beside the points.
+/// Fits the unit normals of a structured grid, on the side where column, row and normal are right-handed. Returns them
+/// together with the points.
 ///
-/// Shapes: one vertex a node, in grid order; the normal NaN at holes and at nodes that have no neighbour along one of the two
-/// lines. Equation: the tangents are the derivatives of the bi-quartic through five nodes along each grid line, central inside
-/// and one-sided at the border; the normal is their cross product.
+/// Shapes: one vertex per node, in grid order. The normal is NaN at holes and at nodes that have no neighbour along one
+/// of the two grid lines. Equation: the tangents are the derivatives of the quartics through five nodes along each grid
+/// line, central inside and one-sided at the border; the normal is their cross product.
 pub(crate) fn grid_nodes(points: &[Point], lattice: &GridLattice) -> Vec<Vertex> {
     let arch = pulp::Arch::new();
-    // Whole blocks, written where they stay; the last is filled up with the last node.
+    // Whole blocks are written directly into the result; the last block is filled up with the last node.
     let blocks: Vec<[Vertex; BLOCK]> = (0..points.len().div_ceil(BLOCK))
         .into_par_iter()
         .with_min_len(64)
@@ -248,7 +252,7 @@ pub(crate) fn grid_nodes(points: &[Point], lattice: &GridLattice) -> Vec<Vertex>
     nodes
 }
 
-/// Nodes that are fitted in one call to code for the vector instructions of the machine.
+/// Number of nodes that one call fits with the vector instructions of the machine.
 const BLOCK: usize = 32;
 
 struct Block<'a> {
@@ -284,7 +288,7 @@ impl pulp::NullaryFnOnce for Block<'_> {
 }
 
 impl Block<'_> {
-    /// Four nodes of one row of a whole grid, none of them within two of its border.
+    /// Fits four nodes of one row of a grid without holes, none of them within two nodes of its border.
     #[inline(always)]
     fn four_inside(&self, first: usize, nodes: &mut [Vertex; LANES]) {
         let (u, v) = (self.central_derivative(first, 1), self.central_derivative(first, self.lattice.columns()));
@@ -296,7 +300,8 @@ impl Block<'_> {
         }
     }
 
-    /// The derivative of the quartic through five nodes at the middle one, for four neighbours along a row.
+    /// Returns the derivative at the middle one of five nodes, of the quartic through them, for four neighbours along a
+    /// row.
     #[inline(always)]
     fn central_derivative(&self, node: usize, stride: usize) -> Vector3x4 {
         let near = minus(&self.four_points(node + stride), &self.four_points(node - stride));
@@ -323,7 +328,8 @@ impl Block<'_> {
     }
 }
 
-/// The derivative along one grid line at its `at`-th node of `count`, from the window of present nodes around it.
+/// Returns the derivative along one grid line at its `at`-th node of `count`, from the window of present nodes around
+/// it. Returns NaN if the node is a hole or has no neighbour on the line.
 fn line_derivative(
     points: &[Point],
     lattice: &GridLattice,
@@ -385,7 +391,7 @@ mod tests {
         let lattice = GridLattice::new(7, 4, &points, true);
         let expected = Vector::new(-0.3, 0.1, 1.0).normalize();
         for (node, n) in grid_nodes(&points, &lattice).iter().map(|vertex| vertex.normal).enumerate() {
-            // Node 2 lies in no whole cell: the node above it is the hole.
+            // Node 2 lies in no whole cell: the node above it is a hole.
             if node == 9 || node == 2 {
                 assert!(n.x.is_nan());
             } else {

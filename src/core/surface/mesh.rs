@@ -1,23 +1,23 @@
-//! Triangles in flat arrays: corners, neighbours, and a way round a vertex.
+//! Triangles in flat arrays: corners, neighbours, and iteration around a vertex.
 
 use crate::geometry::{Nearest, Point, Vector};
 
 use super::error::SurfaceError;
 use super::facet::Facets;
 
-/// No neighbour: the surface ends at this edge.
+/// Marks an edge without a neighbour: the surface ends there.
 pub(crate) const BORDER: u32 = u32::MAX;
 
-/// At most this many facets are entered in the tree that a search without a past begins from.
+/// Maximum number of facets in the tree that gives a start to a search without an earlier place.
 const STARTS: usize = 1 << 15;
 
-/// A triangle mesh whose facets know their neighbours.
+/// Triangle mesh in which each facet knows its neighbours.
 #[derive(Debug)]
 pub(crate) struct MeshLattice {
     corners: Vec<[u32; 3]>,
-    /// Across the edge opposite to corner k; [`BORDER`] where there is none.
+    /// Facet across the edge opposite to corner k; [`BORDER`] if there is none.
     neighbours: Vec<[u32; 3]>,
-    /// One facet at each vertex, the first one counter-clockwise where the vertex lies on the border.
+    /// One facet at each vertex; at a vertex on the border, the first one counter-clockwise.
     facet_of: Vec<u32>,
     starts: Nearest,
     start_facets: Vec<u32>,
@@ -27,7 +27,8 @@ impl MeshLattice {
     /// Joins triangles edge to edge.
     ///
     /// # Errors
-    /// An index out of range, an edge shared by three triangles, neighbours of opposite orientation, no triangle at all.
+    /// Returns an error if there is no triangle, an index is out of range, three triangles share an edge, a triangle is
+    /// there twice, or neighbours have opposite orientation.
     pub(crate) fn new(points: &[Point], corners: Vec<[u32; 3]>) -> Result<Self, SurfaceError> {
         if corners.is_empty() {
             return Err(SurfaceError::NoTriangles);
@@ -35,12 +36,12 @@ impl MeshLattice {
         if let Some(&vertex) = corners.iter().flatten().find(|&&c| c as usize >= points.len()) {
             return Err(SurfaceError::VertexOutOfRange { vertex, points: points.len() });
         }
-        // A doubled triangle breaks a rule of edges; what it is helps more.
+        // A doubled triangle also breaks a rule of edges; the error that names it helps more.
         let neighbours = neighbours(&corners, points).map_err(|error| doubled(&corners, points).unwrap_or(error))?;
         Self::from_parts(points, corners, neighbours)
     }
 
-    /// Takes over triangles whose neighbours are known.
+    /// Builds the mesh from triangles whose neighbours are known.
     pub(crate) fn from_parts(
         points: &[Point],
         corners: Vec<[u32; 3]>,
@@ -64,7 +65,7 @@ impl MeshLattice {
         Ok(Self { corners, neighbours, facet_of, starts, start_facets })
     }
 
-    /// Whether no triangle has a border: the mesh goes around a whole solid.
+    /// Returns true if no triangle has a border edge: the mesh encloses a whole solid.
     pub(crate) fn is_closed(&self) -> bool {
         self.neighbours.iter().flatten().all(|neighbour| *neighbour != BORDER)
     }
@@ -73,19 +74,19 @@ impl MeshLattice {
         self.corners.len() as u32
     }
 
-    /// Calls `visit` with each facet around a vertex and the place of the vertex in it, counter-clockwise.
+    /// Calls `visit` with each facet around a vertex and the index of the vertex in it, counter-clockwise.
     #[inline]
     pub(crate) fn around(&self, vertex: u32, mut visit: impl FnMut(u32, usize)) {
         let first = self.facet_of[vertex as usize];
         let mut facet = first;
-        // A fan is finite, but a mesh from a file may close on itself in strange ways.
+        // A fan is finite, but a mesh from a file may be connected to itself in invalid ways.
         for _ in 0..1024 {
             if facet == BORDER {
                 return;
             }
             let Some(k) = self.corners[facet as usize].iter().position(|&c| c == vertex) else { return };
             visit(facet, k);
-            // Counter-clockwise round corner k lies the edge from k to k + 2, opposite to corner k + 1.
+            // Counter-clockwise around corner k, the next edge runs from k to k + 2; it is opposite to corner k + 1.
             facet = self.neighbours[facet as usize][(k + 1) % 3];
             if facet == first {
                 return;
@@ -103,7 +104,7 @@ impl MeshLattice {
             visit(self.corners[facet as usize][(k + 1) % 3]);
             last = Some((facet as usize, k));
         });
-        // Where the facets do not close on themselves the last one has a neighbour of its own.
+        // If the facets do not close around the vertex, the last one has one more neighbour.
         if let Some((facet, k)) = last
             && self.neighbours[facet][(k + 1) % 3] == BORDER
         {
@@ -113,10 +114,12 @@ impl MeshLattice {
 }
 
 impl MeshLattice {
-    /// Collects the neighbours of a vertex, counter-clockwise, and behind them their further neighbours, each once; returns how many
-    /// there are with the first ring and with both. `None` where the surface ends within them or they do not find room.
+    /// Collects the neighbours of a vertex counter-clockwise, and after them their further neighbours, each once.
+    /// Returns the number of vertices in the first ring and in both rings together. Returns `None` if the surface ends
+    /// within the rings or `ring` is too small.
     ///
-    /// A neighbour is gone round on the side away from the vertex only, from beyond one edge of the first ring to beyond the next.
+    /// The facets around a neighbour are visited only on the side away from the vertex: from beyond one edge of the
+    /// first ring to beyond the next.
     #[inline(always)]
     pub(crate) fn two_rings<const N: usize>(&self, vertex: u32, ring: &mut [u32; N]) -> Option<[usize; 2]> {
         let place = |facet: u32, of: u32| self.corners[facet as usize].iter().position(|&c| c == of);
@@ -140,7 +143,7 @@ impl MeshLattice {
         for k in 0..first {
             let (of, after) = (ring[k], beyond[k]);
             let mut facet = before;
-            // A mesh from a file may close on itself in strange ways.
+            // A mesh from a file may be connected to itself in invalid ways.
             for _ in 0..N {
                 if facet == BORDER {
                     return None;
@@ -168,7 +171,7 @@ impl Facets for MeshLattice {
         self.corners[facet as usize]
     }
 
-    /// Crosses the edge that the point lies farthest beyond, of those that can be crossed.
+    /// Crosses the edge that the point lies farthest beyond, among the edges that have a neighbour.
     #[inline]
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32> {
         let across = &self.neighbours[facet as usize];
@@ -188,7 +191,7 @@ impl Facets for MeshLattice {
     }
 }
 
-/// Finds the facet across each edge by sorting the edges.
+/// Returns the facet across each edge; finds it by sorting the edges.
 fn neighbours(corners: &[[u32; 3]], points: &[Point]) -> Result<Vec<[u32; 3]>, SurfaceError> {
     let mut edges: Vec<(u32, u32, u32)> = Vec::with_capacity(3 * corners.len());
     for (facet, c) in corners.iter().enumerate() {
@@ -217,7 +220,7 @@ fn neighbours(corners: &[[u32; 3]], points: &[Point]) -> Result<Vec<[u32; 3]>, S
     Ok(neighbours)
 }
 
-/// Tells triangles that are there twice.
+/// Returns an error that names the triangles that are there twice, if there are any.
 fn doubled(corners: &[[u32; 3]], points: &[Point]) -> Option<SurfaceError> {
     let mut sorted: Vec<[u32; 3]> = corners.to_vec();
     sorted.iter_mut().for_each(|corners| corners.sort_unstable());
@@ -228,12 +231,13 @@ fn doubled(corners: &[[u32; 3]], points: &[Point]) -> Option<SurfaceError> {
     Some(SurfaceError::DoubledTriangles { count, at: points[first as usize].into() })
 }
 
-/// One facet at each vertex; at a border the one from which going counter-clockwise meets all the others.
+/// Returns one facet at each vertex. At the border it is the facet from which the counter-clockwise order visits all
+/// the others.
 fn first_facets(vertices: usize, corners: &[[u32; 3]], neighbours: &[[u32; 3]]) -> Vec<u32> {
     let mut first = vec![BORDER; vertices];
     for (facet, c) in corners.iter().enumerate() {
         for k in 0..3 {
-            // Clockwise of this facet round corner k lies the edge opposite to corner k + 2.
+            // Clockwise from this facet around corner k, the shared edge is opposite to corner k + 2.
             let at_border = neighbours[facet][(k + 2) % 3] == BORDER;
             if first[c[k] as usize] == BORDER || at_border {
                 first[c[k] as usize] = facet as u32;
@@ -247,7 +251,7 @@ fn first_facets(vertices: usize, corners: &[[u32; 3]], neighbours: &[[u32; 3]]) 
 mod tests {
     use super::*;
 
-    /// A square of four points and its centre, as a fan.
+    /// Returns a square of four points and its centre, as a fan.
     fn fan() -> (Vec<Point>, Vec<[u32; 3]>) {
         let points = [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0], [1.0, 1.0]].map(|[x, y]| Point::new(x, y, 0.0));
         (points.to_vec(), vec![[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
@@ -302,7 +306,7 @@ mod tests {
         let one_edge = vec![[0, 1, 4], [1, 0, 3], [0, 1, 2]];
         assert!(matches!(MeshLattice::new(&points, one_edge), Err(SurfaceError::NonManifold { .. })));
         let (_, once) = fan();
-        // Whichever corner it begins with, and whichever way it turns.
+        // The result does not depend on the first corner or on the turning sense.
         for again in [[0, 1, 4], [4, 0, 1], [1, 0, 4]] {
             let twice = MeshLattice::new(&points, [&once[..], &[again]].concat());
             assert!(matches!(twice, Err(SurfaceError::DoubledTriangles { count: 1, .. })), "{again:?}");

@@ -1,4 +1,5 @@
-//! Nominal surfaces: what the part should be, as points with normals, and the surface at a probe's radius from it.
+//! Nominal surfaces: the intended form of the part, as points with normals, and the offset surface at a probe's radius
+//! from it.
 //!
 //! ```text
 //!  points --+-- regular grid? ----------------> grid lattice   (no triangulation; normals from the grid lines)
@@ -9,7 +10,7 @@
 //!                                                     OffsetSurface: foot, distance, normal of any point
 //! ```
 //!
-//! Pure: no file, no clock, no randomness. Frame: everything here is in the model frame {M}. Units: millimetres.
+//! Pure: no file, no clock, no randomness. Frame: all coordinates are in the model frame {M}. Units: millimetres.
 
 pub mod accuracy;
 pub mod analytic;

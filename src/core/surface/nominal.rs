@@ -1,4 +1,4 @@
-//! A nominal surface: made from points, a grid, a mesh or several patches, and what it tells of itself.
+//! A nominal surface, made from points, a grid, a mesh or several patches, and its properties.
 
 use std::sync::OnceLock;
 
@@ -19,21 +19,21 @@ use super::patch::{Lattice, Patch};
 use super::projection::{Projection, is_line, principal_axes};
 use super::roughness;
 
-/// A nominal surface: one or several patches of points with normals, ready for distances.
+/// Nominal surface: one or several patches of points with normals, ready for distances.
 #[derive(Debug)]
 pub struct Nominal {
     patches: Vec<Patch>,
     kind: NominalKind,
     outline: Option<Aperture>,
-    /// Where it bends how, worked out when a pose is searched for.
+    /// Curvature features at some places; computed when a pose is searched for.
     features: OnceLock<Vec<Feature>>,
-    /// Rms distances of its points from their middle and from their best plane.
+    /// Rms distances of the points from their centroid and from their best-fit plane.
     extent_mm: OnceLock<[f64; 2]>,
-    /// Some of its points and a facet at each, made when a search for a foot is begun anew.
+    /// Some of the points and a facet at each; made when a search for a foot has no start.
     starts: OnceLock<(Nearest, Vec<Place>)>,
 }
 
-/// What a nominal surface was made from.
+/// Source that a nominal surface was made from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NominalKind {
     /// Points on a regular grid, or a grid of (u, v) parameters.
@@ -52,19 +52,19 @@ pub enum NominalKind {
     Mesh,
     /// Several patches.
     Patches {
-        /// How many.
+        /// Number of patches.
         count: usize,
     },
 }
 
 impl Nominal {
-    /// Makes a surface from points in any order: a regular grid in xy is used as it is, anything else is triangulated.
+    /// Makes a surface from points in any order. A regular grid in xy is used as it is; other points are triangulated.
     ///
     /// Shapes: at least 9 points. The order of the points does not matter.
     ///
     /// # Errors
-    /// Too few points, a coordinate that is not finite, two points at one place, points on one line, or no projection that
-    /// is one-to-one.
+    /// Returns an error if there are too few points, a coordinate is not finite, two points coincide, the points lie on
+    /// one line, one point is far off the others, or no projection is one-to-one.
     pub fn from_points(points: Vec<Point>, projection: Projection) -> Result<Self, SurfaceError> {
         const LEAST: usize = 9;
         if points.len() < LEAST {
@@ -84,10 +84,10 @@ impl Nominal {
         Self::scattered(points, projection)
     }
 
-    /// Makes a surface from points by triangulation, even where they would make a grid.
+    /// Makes a surface from points by triangulation, even if they form a grid.
     ///
     /// # Errors
-    /// As [`Nominal::from_points`].
+    /// Returns the same errors as [`Nominal::from_points`].
     pub fn scattered(points: Vec<Point>, projection: Projection) -> Result<Self, SurfaceError> {
         if points.len() > 3 && is_line(&points) {
             return Err(SurfaceError::Collinear { points: points.len() });
@@ -100,11 +100,11 @@ impl Nominal {
 
     /// Makes a surface from a structured grid of points, one for each pair of parameters (u, v).
     ///
-    /// Shapes: `columns * rows` points, row by row with u fastest; a NaN point is a hole. The normal is on the side where
-    /// u, v and normal are right-handed.
+    /// Shapes: `columns * rows` points, row by row with u fastest; a NaN point is a hole. The normal is on the side
+    /// where u, v and the normal are right-handed.
     ///
     /// # Errors
-    /// A number of points other than announced, or fewer than 3 nodes on an axis.
+    /// Returns an error if the number of points is not `columns * rows`, or if an axis has fewer than 3 nodes.
     pub fn from_parameter_grid(columns: usize, rows: usize, points: Vec<Point>) -> Result<Self, SurfaceError> {
         check_grid(columns, rows, points.len())?;
         Ok(Self::grid(GridLattice::new(columns, rows, &points, false), &points))
@@ -113,7 +113,7 @@ impl Nominal {
     /// Makes a surface from a regular xy grid of points whose unit normals are known.
     ///
     /// # Errors
-    /// As [`Nominal::from_parameter_grid`].
+    /// Returns the same errors as [`Nominal::from_parameter_grid`].
     pub fn from_grid_with_normals(
         columns: usize,
         rows: usize,
@@ -126,10 +126,11 @@ impl Nominal {
         Ok(Self::of(Patch::grid(nodes, lattice), NominalKind::Grid { columns, rows }))
     }
 
-    /// Makes a surface from a mesh; the normals are on the side from which its triangles turn counter-clockwise.
+    /// Makes a surface from a mesh. The normals are on the side from which the triangles turn counter-clockwise.
     ///
     /// # Errors
-    /// No triangle, an index out of range, more than two triangles at an edge, neighbours that turn opposite ways.
+    /// Returns an error if a coordinate is not finite, there is no triangle, an index is out of range, more than two
+    /// triangles share an edge, a triangle is there twice, or neighbours turn opposite ways.
     pub fn from_mesh(points: Vec<Point>, triangles: Vec<[u32; 3]>) -> Result<Self, SurfaceError> {
         if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
             return Err(SurfaceError::NotFinite { index });
@@ -138,10 +139,10 @@ impl Nominal {
         Ok(Self::of(Patch::mesh(points, lattice), NominalKind::Mesh))
     }
 
-    /// Joins several surfaces into one of several patches; a point belongs to the patch that its foot lies on.
+    /// Joins several surfaces into one of several patches. A point belongs to the patch that its foot lies on.
     ///
     /// # Errors
-    /// An empty list.
+    /// Returns an error if the list is empty.
     pub fn from_patches(surfaces: Vec<Nominal>) -> Result<Self, SurfaceError> {
         let patches: Vec<Patch> = surfaces.into_iter().flat_map(|s| s.patches).collect();
         if patches.is_empty() {
@@ -158,7 +159,7 @@ impl Nominal {
         })
     }
 
-    /// States the outline of the part in xy: a point whose foot lies outside it is off the part.
+    /// Sets the outline of the part in xy: a point whose foot lies outside it is off the part.
     pub fn with_outline(self, outline: Aperture) -> Self {
         Self { outline: Some(outline), ..self }
     }
@@ -179,10 +180,10 @@ impl Nominal {
         }
     }
 
-    /// Refuses a mesh that goes around a whole solid: a part's face has a border.
+    /// Rejects a mesh that encloses a whole solid: the face of a part has a border.
     ///
     /// # Errors
-    /// A closed solid.
+    /// Returns an error if a patch is a closed solid.
     pub fn check_is_open(&self) -> Result<(), SurfaceError> {
         match self.patches.iter().find_map(Patch::closed_triangles) {
             Some(triangles) => Err(SurfaceError::ClosedSolid { triangles }),
@@ -195,7 +196,7 @@ impl Nominal {
         self.kind
     }
 
-    /// Returns the outline of the part, where one was stated.
+    /// Returns the outline of the part, if one was set.
     pub fn outline(&self) -> Option<&Aperture> {
         self.outline.as_ref()
     }
@@ -204,7 +205,7 @@ impl Nominal {
         &self.patches
     }
 
-    /// Returns every point of the surface, holes left out.
+    /// Returns every point of the surface, without holes.
     pub fn points(&self) -> impl Iterator<Item = &Point> {
         self.patches
             .iter()
@@ -212,7 +213,7 @@ impl Nominal {
             .filter(|p| p.x.is_finite())
     }
 
-    /// Returns every point moved along its normal by a length in millimetres, eq. (3); holes left out.
+    /// Returns every point moved along its normal by a length in millimetres, eq. (3), without holes.
     pub fn offset_points(&self, by_mm: f64) -> impl Iterator<Item = Point> {
         let moved = move |vertex: Vertex| vertex.point + vertex.normal * by_mm;
         self.patches
@@ -221,12 +222,12 @@ impl Nominal {
             .filter(|p| p.x.is_finite())
     }
 
-    /// Returns the number of points, holes left out.
+    /// Returns the number of points, without holes.
     pub fn len(&self) -> usize {
         self.points().count()
     }
 
-    /// Whether there is no point; never so for a surface that was made.
+    /// Returns true if there is no point; the constructors never return such a surface.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -241,7 +242,7 @@ impl Nominal {
             .collect()
     }
 
-    /// Returns the steepest slope against the plane of x and y that some places spread over the surface have, in radians.
+    /// Returns the steepest slope against the xy plane among some places spread over the surface, in radians.
     pub fn steepest_rad(&self) -> f64 {
         let normals = self.sampled_vertices(SAMPLE).into_iter().map(|(_, n)| n.z.clamp(-1.0, 1.0).acos());
         normals.fold(0.0, f64::max)
@@ -253,12 +254,13 @@ impl Nominal {
         self.patches.iter().flat_map(|patch| patch.sample(share).map(|v| *patch.point(v))).collect()
     }
 
-    /// Returns the rms distance of the points from their middle, in millimetres.
+    /// Returns the rms distance of the points from their centroid, in millimetres.
     pub fn size_mm(&self) -> f64 {
         self.extent_mm()[0]
     }
 
-    /// Returns the rms distance of the points from their best plane, in millimetres: how much shape there is to register by.
+    /// Returns the rms distance of the points from their best-fit plane, in millimetres: a measure of the shape that a
+    /// registration can use.
     pub(crate) fn relief_mm(&self) -> f64 {
         self.extent_mm()[1]
     }
@@ -272,15 +274,15 @@ impl Nominal {
         })
     }
 
-    /// Returns the mean of the normals, of unit length; z for a closed surface, which has none.
+    /// Returns the unit mean of the normals; returns z for a closed surface, which has no mean normal.
     pub(crate) fn mean_normal(&self) -> Vector {
         let sum: Vector = self.sampled_vertices(512).iter().map(|(_, n)| n).sum();
         if sum.norm() > 1e-6 { sum.normalize() } else { Vector::z() }
     }
 
-    /// Returns how wrong fitted normals may be, in radians: 0 for a grid and for normals that are given.
+    /// Returns the estimated error of fitted normals, in radians; 0 for a grid and for given normals.
     ///
-    /// Estimated as the rms change of the normal when its fit takes in one ring of neighbours more.
+    /// The estimate is the rms change of the normal when the fit asks for twice as many neighbours.
     pub(crate) fn normal_error(&self) -> f64 {
         let (mut sum, mut count) = (0.0, 0);
         for patch in self.patches.iter().filter(|p| p.has_scattered_normals()) {
@@ -294,14 +296,16 @@ impl Nominal {
         if count == 0 { 0.0 } else { (sum / f64::from(count)).sqrt() }
     }
 
-    /// Returns the standard deviation by which its points scatter along the normal about a smooth surface, in millimetres; 0 where they tell of none.
+    /// Returns the standard deviation of the noise of the points along the normal, about a smooth surface, in
+    /// millimetres; 0 if the points show no noise.
     pub(crate) fn scatter_mm(&self) -> f64 {
         roughness::scatter_mm(&self.patches)
     }
 
-    /// Returns facets at the points of the surface that lie nearest to a place, in space and not along any projection.
+    /// Returns facets at the points of the surface that are nearest to a place, by distance in space and not along a
+    /// projection.
     pub(crate) fn places_near(&self, p: &Point) -> impl Iterator<Item = Place> {
-        /// Points that are kept for it, and how many of them are told.
+        /// Number of points in the search tree, and number of places returned.
         const KEPT: usize = 20_000;
         const TOLD: u32 = 3;
         let (nearest, places) = self.starts.get_or_init(|| {
@@ -316,7 +320,8 @@ impl Nominal {
         nearest.to(p, TOLD).map(|(k, _)| places[k])
     }
 
-    /// Returns the surface by every second node of its grid; none where it is not one grid, or one of too few nodes.
+    /// Returns the surface made of every second node of its grid; `None` if it is not a single grid or would have too
+    /// few nodes.
     pub(crate) fn every_second(&self) -> Option<Self> {
         let [patch] = &self.patches[..] else { return None };
         let Lattice::Grid(grid) = &patch.lattice else { return None };
@@ -327,7 +332,7 @@ impl Nominal {
         Some(Self::grid(GridLattice::new(columns, rows, &points, grid.is_regular()), &points))
     }
 
-    /// Returns how the surface bends at some places spread over it.
+    /// Returns the curvature features at some places spread over the surface.
     pub(crate) fn features(&self) -> &[Feature] {
         self.features.get_or_init(|| {
             let (points, normals): (Vec<_>, Vec<_>) = self.sampled_vertices(FEATURES).into_iter().unzip();
@@ -336,7 +341,7 @@ impl Nominal {
     }
 }
 
-/// Points that a size is taken from, and places that a pose is searched by.
+/// Number of points for the size of the surface, and number of places for the search of a pose.
 const SAMPLE: usize = 4096;
 const FEATURES: usize = 3000;
 

@@ -1,4 +1,4 @@
-//! Normals of scattered points: a local cubic through each vertex, fitted to its neighbours in the triangulation.
+//! Normals of scattered points: a local cubic at each vertex, fitted to its neighbours in the triangulation.
 
 use crate::geometry::{Point, Vector};
 
@@ -6,17 +6,18 @@ use super::facet::Facets;
 use super::mesh::MeshLattice;
 use super::simd::{F64x4, LANES, Real, Vector3x4};
 
-/// How many neighbours a fit asks for: nine unknowns and some to spare. Two rings of a triangulation have eighteen, at a border
-/// about ten, so that a third ring is taken in there.
+/// Number of neighbours that a fit asks for: nine unknowns and a margin. Two rings of a triangulation have eighteen; at
+/// a border they have about ten, so that a third ring is added there.
 pub(crate) const NEIGHBOURS: usize = 14;
 
-/// Most neighbours a fit takes in.
+/// Maximum number of neighbours in a fit.
 const MOST: usize = 64;
 
-/// A pivot this much smaller than the first marks neighbours that do not determine the cubic.
+/// Smallest accepted ratio of a pivot to the largest diagonal entry. A smaller pivot means that the neighbours do not
+/// determine the cubic.
 const WEAK_PIVOT: f64 = 1e-9;
 
-/// What a local fit finds out about the surface at a vertex.
+/// Result of a local fit: the surface at a vertex.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LocalFit {
     /// Unit normal on the side from which the triangles turn counter-clockwise.
@@ -27,11 +28,12 @@ pub(crate) struct LocalFit {
     pub(crate) direction: Vector,
 }
 
-/// Fits w = p u + q v + cubic terms through a vertex, by weighted least squares over its rings of neighbours.
+/// Fits w = p u + q v + quadratic and cubic terms through a vertex, by weighted least squares over its rings of
+/// neighbours.
 ///
-/// Frame: the mean normal of the facets around the vertex and two tangents. Weights fall with distance as
-/// 1/(1 + (s/h)^2) with h the mean distance, so that a far neighbour of an uneven ring bends the fit less. Neighbours that do
-/// not determine a cubic (a border, a line) get a quadric, then a plane.
+/// Frame: the mean normal of the facets around the vertex and two tangents. Weights fall with distance s as 1/(1 +
+/// (s/h)^2), where h is the mean distance, so that a far neighbour in an uneven ring affects the fit less. If the
+/// neighbours do not determine a cubic (at a border, on a line), the fit is a quadric, then a plane.
 pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshLattice, vertex: u32, wanted: usize) -> LocalFit {
     let mut ring = [0u32; MOST];
     let found = neighbours(mesh, vertex, wanted, &mut ring);
@@ -39,7 +41,7 @@ pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshLattice, vertex: u32, wan
     fit(points[vertex as usize], mean, ring[..found].iter().map(|&i| points[i as usize]))
 }
 
-/// The fit of [`fit_to_ring`] for neighbours found by other means, about an approximate normal.
+/// Fits like [`fit_to_ring`] to neighbours from another source, about an approximate normal.
 pub(crate) fn fit(at: Point, mean: Vector, neighbours: impl Iterator<Item = Point>) -> LocalFit {
     let [tu, tv] = tangents(&mean);
     let mut local = [[0.0; 3]; MOST];
@@ -61,8 +63,8 @@ pub(crate) fn fit(at: Point, mean: Vector, neighbours: impl Iterator<Item = Poin
     LocalFit::new(&mean, &tu, &tv, &[c[0], c[1], c[2] / h, c[3] / h, c[4] / h])
 }
 
-/// Fits the normals of four vertices side by side, as [`fit_to_ring`] does to rounding; what comes out for one does not depend
-/// on which the others are.
+/// Fits the normals of four vertices in parallel lanes. Each agrees with [`fit_to_ring`] to rounding and does not
+/// depend on the other three vertices.
 #[inline(always)]
 pub(crate) fn four_normals(points: &[Point], mesh: &MeshLattice, vertices: &[u32; LANES]) -> [Vector; LANES] {
     let mut rings = Rings { local: [[F64x4::splat(0.0); 3]; MOST], most: 0 };
@@ -86,14 +88,15 @@ pub(crate) fn four_normals(points: &[Point], mesh: &MeshLattice, vertices: &[u32
     })
 }
 
-/// The neighbours of four vertices in the frame of each, in units of their mean distance; zeros fill up the shorter rings.
+/// Neighbours of four vertices, each in the frame of its vertex and in units of their mean distance; shorter rings are
+/// padded with zeros.
 struct Rings {
     local: [Vector3x4; MOST],
     most: usize,
 }
 
 impl Rings {
-    /// Enters the neighbours of a vertex in a lane; returns its mean normal and tangents.
+    /// Writes the neighbours of a vertex into a lane; returns its mean normal and tangents.
     #[inline(always)]
     fn add(&mut self, points: &[Point], mesh: &MeshLattice, vertex: u32, lane: usize) -> [Vector; 3] {
         let mut ring = [0u32; MOST];
@@ -116,16 +119,16 @@ impl Rings {
         [mean, tu, tv]
     }
 
-    /// Enters in a lane what the one before it holds.
+    /// Copies the previous lane into a lane.
     fn repeat(&mut self, lane: usize) {
         for c in self.local[..self.most].iter_mut().flatten() {
             c.0[lane] = c.0[lane - 1];
         }
     }
 
-    /// Returns the slopes along u and v of the cubics, and in which lanes the neighbours determine one.
+    /// Returns the slopes along u and v of the cubics, and true for each lane whose neighbours determine a cubic.
     ///
-    /// The normal equations hold only 25 different numbers: the weighted sums of the monomials of the degrees 2 to 6.
+    /// The normal equations contain only 25 different numbers: the weighted sums of the monomials of degrees 2 to 6.
     #[inline(always)]
     fn slopes(&self) -> ([F64x4; 2], [bool; LANES]) {
         let one = F64x4::splat(1.0);
@@ -155,10 +158,10 @@ impl Rings {
 /// Powers of u and v in the cubic, in the order of [`solve`].
 const TERMS: [[usize; 2]; 9] = [[1, 0], [0, 1], [2, 0], [1, 1], [0, 2], [3, 0], [2, 1], [1, 2], [0, 3]];
 
-/// Monomials of u and v of the degrees 2 to 6.
+/// Number of monomials of u and v of degrees 2 to 6.
 const MOMENTS: usize = 25;
 
-/// Continues the three monomials of the second degree by those of higher ones, u^n first and v^n last in each.
+/// Extends the three monomials of the second degree to higher degrees; each degree begins with u^n and ends with v^n.
 #[inline(always)]
 fn monomials<const N: usize>(squares: [F64x4; 3], u: F64x4, v: F64x4) -> [F64x4; N] {
     let mut all = [F64x4::splat(0.0); N];
@@ -174,7 +177,7 @@ fn monomials<const N: usize>(squares: [F64x4; 3], u: F64x4, v: F64x4) -> [F64x4;
     all
 }
 
-/// Solves four systems for their first two unknowns, and tells which of them have a solution.
+/// Solves four systems for their first two unknowns, and returns true for each system that has a solution.
 #[inline(always)]
 fn solve_side_by_side<const N: usize>(mut m: [[F64x4; N]; N], mut x: [F64x4; N]) -> ([F64x4; 2], [bool; LANES]) {
     let least_pivot: [f64; LANES] =
@@ -186,7 +189,7 @@ fn solve_side_by_side<const N: usize>(mut m: [[F64x4; N]; N], mut x: [F64x4; N])
             pivot = pivot - *factor * *factor;
         }
         for l in 0..LANES {
-            // Not for NaN either.
+            // NaN is not determined either.
             determined[l] &= pivot.0[l] > least_pivot[l];
         }
         let inverse = F64x4::splat(1.0) / F64x4(pivot.0.map(f64::sqrt));
@@ -212,7 +215,7 @@ fn solve_side_by_side<const N: usize>(mut m: [[F64x4; N]; N], mut x: [F64x4; N])
 }
 
 impl LocalFit {
-    /// Reads normal and curvature off w = p u + q v + a u^2 + b uv + c v^2.
+    /// Computes normal and curvature from w = p u + q v + a u^2 + b uv + c v^2.
     fn new(mean: &Vector, tu: &Vector, tv: &Vector, [p, q, a, b, c]: &[f64; 5]) -> Self {
         let root = (1.0 + p * p + q * q).sqrt();
         let normal = (mean - tu * *p - tv * *q) / root;
@@ -230,23 +233,25 @@ impl LocalFit {
     }
 }
 
-/// Returns the direction (x, y) that the symmetric singular matrix [[a, b], [b, c]] sends to nothing.
+/// Returns the direction (x, y) in the null space of the singular symmetric matrix `[[a, b], [b, c]]`.
 fn null_direction(a: f64, b: f64, c: f64) -> (f64, f64) {
     let (x, y) = if a.abs() > c.abs() { (-b, a) } else { (c, -b) };
     let norm = x.hypot(y);
     if norm > 0.0 { (x / norm, y / norm) } else { (1.0, 0.0) }
 }
 
-/// Two unit vectors at right angles to a unit vector and to each other, right-handed.
+/// Returns two unit vectors perpendicular to a unit vector and to each other, right-handed.
 pub(crate) fn tangents(n: &Vector) -> [Vector; 2] {
     let axis = if n.x.abs() < 0.6 { Vector::x() } else { Vector::y() };
     let tu = (axis - n * n.dot(&axis)).normalize();
     [tu, n.cross(&tu)]
 }
 
-/// Solves the weighted normal equations of the first N monomials; `None` where the neighbours do not determine them.
+/// Solves the weighted normal equations of the first N monomials; returns `None` if the neighbours do not determine
+/// them.
 ///
-/// Plain arrays with fixed bounds: the compiler unrolls and vectorises them, which makes the fit several times faster.
+/// The arrays have fixed bounds: the compiler unrolls and vectorises the loops, which makes the fit several times
+/// faster.
 fn solve<const N: usize>(local: &[[f64; 3]]) -> Option<[f64; 9]> {
     if local.len() < N {
         return None;
@@ -273,8 +278,8 @@ fn solve<const N: usize>(local: &[[f64; 3]]) -> Option<[f64; 9]> {
     Some(solution)
 }
 
-/// Puts the lower factor of a symmetric matrix into its lower half and returns the inverses of its pivots; `None` at a pivot
-/// below the limit.
+/// Computes the Cholesky factor of a symmetric matrix in place, in its lower half, and returns the inverses of its
+/// pivots; `None` if a pivot is not above the limit.
 #[inline(always)]
 fn cholesky<const N: usize>(m: &mut [[f64; N]; N], least_pivot: f64) -> Option<[f64; N]> {
     let mut inverse_pivots = [0.0; N];
@@ -305,14 +310,14 @@ fn substitute<const N: usize>(l: &[[f64; N]; N], inverse_pivots: &[f64; N], x: &
     }
 }
 
-/// Returns at least so many neighbours of a vertex, ring by ring; fewer where there are no more, and no more than a fit takes in.
+/// Returns at least `wanted` neighbours of a vertex, ring by ring: fewer if there are no more, and at most `MOST`.
 pub(super) fn ring_around(mesh: &MeshLattice, vertex: u32, wanted: usize) -> Vec<u32> {
     let mut ring = [0; MOST];
     let found = neighbours(mesh, vertex, wanted, &mut ring);
     ring[..found].to_vec()
 }
 
-/// Collects whole rings of neighbours round a vertex until there are as many as wanted; returns how many.
+/// Collects whole rings of neighbours around a vertex until there are at least `wanted`; returns their number.
 fn neighbours(mesh: &MeshLattice, vertex: u32, wanted: usize, ring: &mut [u32; MOST]) -> usize {
     let (mut begin, mut count) = match mesh.two_rings(vertex, ring) {
         Some([first, _]) if first >= wanted => return first,
@@ -329,7 +334,7 @@ fn neighbours(mesh: &MeshLattice, vertex: u32, wanted: usize, ring: &mut [u32; M
     count
 }
 
-/// Adds the neighbours of one vertex that are not in the ring yet; returns how many there are then.
+/// Adds the neighbours of one vertex that are not in the ring yet; returns the new number.
 #[inline(always)]
 fn add_around(mesh: &MeshLattice, of: u32, vertex: u32, ring: &mut [u32; MOST], mut count: usize) -> usize {
     mesh.neighbours_of(of, |candidate| {
@@ -341,7 +346,7 @@ fn add_around(mesh: &MeshLattice, of: u32, vertex: u32, ring: &mut [u32; MOST], 
     count
 }
 
-/// The unit mean of the normals of the facets round a vertex, each counted by its area.
+/// Returns the unit mean of the normals of the facets around a vertex, weighted by area; z if there is none.
 fn mean_facet_normal(points: &[Point], mesh: &MeshLattice, vertex: u32) -> Vector {
     let mut sum = Vector::zeros();
     mesh.around(vertex, |facet, _| {
@@ -398,7 +403,7 @@ mod tests {
 
     #[test]
     fn neighbours_that_do_not_determine_a_cubic_get_less() {
-        // Points on a line: not even a plane; the mean normal stands.
+        // Points on a line do not determine even a plane: the fit returns the mean normal.
         let line = (1..30).map(|k| Point::new(f64::from(k) * 0.1, 0.0, 0.0));
         assert_eq!(fit(Point::origin(), Vector::z(), line).normal, Vector::z());
         // Six points: a quadric.
@@ -446,7 +451,7 @@ mod tests {
             let four = four_normals(&points, &mesh, &[v, v / 2, v, 0]);
             let one = fit_to_ring(&points, &mesh, v, NEIGHBOURS).normal;
             assert!((four[0] - one).norm() < 1e-9, "{v}: {}", four[0] - one);
-            // Whatever stands beside it.
+            // The result does not depend on the other lanes.
             assert_eq!(four[0], four[2]);
             assert_eq!(four[0], four_normals(&points, &mesh, &[v; LANES])[3]);
         }

@@ -1,4 +1,5 @@
-//! The surface on which the centre of a probe travels, and where the foot of a point on it is; the formula is in [`super::facet`].
+//! The offset surface, on which the centre of a probe travels, and the foot of a point on it: its projection. The
+//! formulas are in [`super::facet`].
 
 use crate::geometry::{Point, Vector};
 
@@ -20,17 +21,17 @@ pub enum Distance {
     Triangle,
 }
 
-/// Which facet a point belongs to.
+/// Rule that assigns a point to a facet.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Lookup {
-    /// The one that holds the foot of its perpendicular.
+    /// The facet that holds the foot of the point's perpendicular.
     #[default]
     Foot,
-    /// The one above or below which it lies along z, as in section 2.1 of the paper.
+    /// The facet that the point lies above or below along z, as in section 2.1 of the paper.
     Projection,
 }
 
-/// The offset of a nominal surface: a view that holds no points of its own.
+/// Offset of a nominal surface: a view that holds no points of its own.
 #[derive(Clone, Copy, Debug)]
 pub struct OffsetSurface<'a> {
     nominal: &'a Nominal,
@@ -41,7 +42,7 @@ pub struct OffsetSurface<'a> {
     lookup: Lookup,
 }
 
-/// Where a search for a foot begins: the facet where the last one ended.
+/// Start of a search for a foot: the facet where the last search ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Place {
     patch: u32,
@@ -49,15 +50,15 @@ pub struct Place {
 }
 
 impl Place {
-    /// Nothing known yet.
+    /// Unknown place: the search chooses its own start.
     pub const UNKNOWN: Self = Self { patch: 0, facet: u32::MAX };
 
-    /// A facet of a patch.
+    /// Returns the place of a facet of a patch.
     pub(crate) fn on(patch: u32, facet: u32) -> Self {
         Self { patch, facet }
     }
 
-    /// A facet of a surface of one patch.
+    /// Returns the place of a facet of a surface with a single patch.
     pub(crate) fn on_first_patch(facet: u32) -> Self {
         Self { patch: 0, facet }
     }
@@ -71,35 +72,37 @@ impl Place {
     }
 }
 
-/// The foot of a point on the offset surface.
+/// Foot of a point on the offset surface.
 #[derive(Clone, Copy, Debug)]
 pub struct Foot {
-    /// The facet that holds it.
+    /// Facet that holds the foot.
     pub place: Place,
     /// Signed distance of the point from the offset surface, in millimetres; positive on the probe's side.
     pub distance_mm: f64,
     /// Unit normal at the foot, towards the probe's side.
     pub normal: Vector,
-    /// How far the foot lies beyond the edge of the surface, in millimetres; 0 on the part.
+    /// Distance of the foot beyond the edge of the surface, in millimetres; 0 on the part.
     pub beyond_mm: f64,
-    /// How far that is in steps of the nominal sampling.
+    /// The same distance, in steps of the nominal sampling.
     pub beyond_steps: f64,
 }
 
 impl Foot {
-    /// The one that is least beyond an edge first; of those on the part the nearest.
+    /// Orders feet by their distance beyond an edge, then by the absolute distance of the point.
     fn by_nearness(&self, other: &Self) -> std::cmp::Ordering {
         self.beyond_mm.total_cmp(&other.beyond_mm).then(self.distance_mm.abs().total_cmp(&other.distance_mm.abs()))
     }
 }
 
-/// A foot this many steps of the sampling beyond the edge is still on the part: the curved facet continues that far.
+/// Largest distance beyond the edge, in steps of the sampling, at which the curved facet is continued. A foot within it
+/// counts as on the part.
 const EDGE_REACH: f64 = 0.5;
 
-/// Steps after which a search gives up and takes the facet it is at: far more than any search that converges needs.
+/// Maximum number of steps of a search; then it takes the facet it has reached. A search that converges needs far
+/// fewer.
 const MOST_STEPS: usize = 4096;
 
-/// Weights that far below zero count as inside.
+/// Weights count as inside down to this negative value.
 pub(super) const INSIDE: f64 = -1e-10;
 
 impl<'a> OffsetSurface<'a> {
@@ -108,7 +111,7 @@ impl<'a> OffsetSurface<'a> {
     /// Units: millimetres. A radius of 0 is the nominal surface itself.
     ///
     /// # Errors
-    /// A radius that is negative or not finite.
+    /// Returns an error if the radius is negative or not finite.
     pub fn new(nominal: &'a Nominal, radius_mm: f64, side: Side) -> Result<Self, SurfaceError> {
         if !(radius_mm >= 0.0 && radius_mm.is_finite()) {
             return Err(SurfaceError::ProbeRadius { radius_mm });
@@ -116,12 +119,12 @@ impl<'a> OffsetSurface<'a> {
         Ok(Self { nominal, radius_mm, side, distance: Distance::default(), lookup: Lookup::default() })
     }
 
-    /// Chooses how the surface runs between the corners.
+    /// Sets how the surface runs between the corners.
     pub fn with_distance(self, distance: Distance) -> Self {
         Self { distance, ..self }
     }
 
-    /// Chooses which facet a point belongs to.
+    /// Sets the rule that assigns a point to a facet.
     pub(crate) fn with_lookup(self, lookup: Lookup) -> Self {
         Self { lookup, ..self }
     }
@@ -144,22 +147,23 @@ impl<'a> OffsetSurface<'a> {
         self.lookup
     }
 
-    /// Returns the side of the nominal surface.
+    /// Returns the side of the nominal surface on which the probe travels.
     pub fn side(&self) -> Side {
         self.side
     }
 
-    /// Returns the step of the nominal sampling at a place, in millimetres: the side of a square of two of its facets.
+    /// Returns the step of the nominal sampling at a place, in millimetres: the side of a square with the area of two
+    /// of its facets.
     pub(crate) fn spacing_mm(&self, place: Place) -> f64 {
         let patch = &self.nominal.patches()[place.patch as usize];
         let [a, b, c] = patch.corners(place.facet).map(|v| *patch.point(v));
         (b - a).cross(&(c - a)).norm().sqrt()
     }
 
-    /// Finds the foot of a point given in the model frame, starting from where the last search for it ended.
+    /// Finds the foot of a point in the model frame; starts from the place where the last search for it ended.
     ///
-    /// Beyond the edge the surface is continued: by its own facet for half a step of the sampling, then by the tangent plane
-    /// at the nearest place of the edge.
+    /// Beyond the edge the surface is continued: by its own facet for half a step of the sampling, then by the tangent
+    /// plane at the nearest point of the edge.
     #[inline]
     pub fn foot(&self, p: &Point, start: Place) -> Foot {
         match self.nominal.patches() {
@@ -168,10 +172,11 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// The foot on the patch that a point belongs to: the nearest one that has it inside, else the one it is least beyond.
+    /// Returns the foot on the patch that a point belongs to: the nearest foot inside a patch, otherwise the foot that
+    /// is least beyond an edge.
     ///
-    /// The offsets of patches that only touch leave a gap over a convex seam. A foot that is a little beyond two of them at one height lies in that
-    /// gap, and on the part.
+    /// The offsets of patches that only touch leave a gap over a convex seam. If a foot is slightly beyond two patches
+    /// at about the same height, it lies in that gap, and therefore on the part.
     fn nearest_foot(&self, patches: &[Patch], p: &Point, start: Place) -> Foot {
         let feet: Vec<Foot> =
             patches.iter().enumerate().map(|(k, patch)| self.foot_on(patch, k as u32, p, start)).collect();
@@ -188,9 +193,11 @@ impl<'a> OffsetSurface<'a> {
         best
     }
 
-    /// Searches for the foot of a point anew, from the places of the surface nearest to it, and returns the nearest one that is found.
+    /// Searches for the foot of a point from the places of the surface nearest to it, without an earlier place; returns
+    /// the nearest foot found.
     ///
-    /// A search walks downhill, and in a gutter from the wrong wall: it ends where no neighbour is nearer, at a foot on the other side.
+    /// A search walks downhill. In a gutter that starts from the wrong wall, it ends at a foot on the other side, where
+    /// no neighbour is nearer.
     #[cold]
     pub(crate) fn foot_from_anywhere(&self, p: &Point) -> Foot {
         let found = self
@@ -209,8 +216,8 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Walks over the flat facets of the nominal surface to about where the foot is, without a normal having to be fitted on
-    /// the way: the point is brought back to the surface along the normal of each facet.
+    /// Walks over the flat facets of the nominal surface to about where the foot is, and returns that facet. No normal
+    /// has to be fitted on the way: the point is moved back to the surface along the normal of each facet.
     #[inline]
     fn approach<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: u32) -> u32 {
         let mut facet = if start == u32::MAX { facets.start(p) } else { start };
@@ -235,12 +242,12 @@ impl<'a> OffsetSurface<'a> {
         facet
     }
 
-    /// Finds a facet of the first patch near the foot of a point, without its normals.
+    /// Finds a facet of the first patch near the foot of a point, without fitting its normals.
     pub(super) fn place_near<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: Place) -> Place {
         Place { patch: 0, facet: self.approach(patch, facets, p, start.facet) }
     }
 
-    /// Walks from facet to facet until one holds the foot, then measures there.
+    /// Walks from facet to facet until one holds the foot, then measures the distance there.
     #[inline]
     fn search<F: Facets>(&self, patch: &Patch, facets: &F, number: u32, p: &Point, start: u32) -> Foot {
         let mut facet = self.approach(patch, facets, p, start);
@@ -251,14 +258,14 @@ impl<'a> OffsetSurface<'a> {
             let inside = weights[0].min(weights[1]).min(weights[2]) >= INSIDE;
             let next = if inside { None } else { facets.advance(facet, &weights) };
             match next {
-                // Two facets that point at each other: the foot lies on their common edge, in the gap that prisms over a
-                // convex edge leave.
+                // Two facets point at each other: the foot lies on their common edge, in the gap between the prisms
+                // over a convex edge.
                 Some(next) if next != before => {
                     before = facet;
                     facet = next;
                 }
                 _ => {
-                    // Two that point at each other at the border have the foot between them only along it.
+                    // At the border this holds only along the common edge: a foot beyond a border edge is not inside.
                     let is_beyond = |k: usize| weights[k] < INSIDE && facets.ends_at(facet, k);
                     let inside = inside || next.is_some() && !(0..3).any(is_beyond);
                     return self.foot_in(&here, p, weights, inside, Place { patch: number, facet });
@@ -269,7 +276,7 @@ impl<'a> OffsetSurface<'a> {
         self.foot_in(&here, p, self.weights(&here, p), true, Place { patch: number, facet })
     }
 
-    /// A facet with its corners on the offset surface.
+    /// Returns a facet with its corners on the offset surface.
     #[inline(always)]
     fn facet(&self, patch: &Patch, corners: [u32; 3]) -> Facet<f64> {
         let sign = self.side.sign();
@@ -277,7 +284,7 @@ impl<'a> OffsetSurface<'a> {
         Facet::new([a, b, c].map(|vertex| corner(vertex, sign, self.radius_mm)), sign)
     }
 
-    /// Barycentric weights of the foot on the plane of the flat facet.
+    /// Returns the barycentric weights of the foot on the plane of the flat facet.
     #[inline(always)]
     fn weights(&self, facet: &Facet<f64>, p: &Point) -> [f64; 3] {
         let mut w = facet.seen_from(0, &p.coords.into());
@@ -308,7 +315,7 @@ impl<'a> OffsetSurface<'a> {
         Foot { place, distance_mm, normal: normal.into(), beyond_mm, beyond_steps }
     }
 
-    /// The distance from the tangent plane at a place of the edge, and its normal.
+    /// Returns the distance from the tangent plane at a place of the edge, and the normal of that plane.
     #[cold]
     fn over_tangent_plane(&self, facet: &Facet<f64>, p: &Point, at: &[f64; 3]) -> (f64, Vector) {
         let (on_flat, flat) = (Vector::from(facet.at(at)), Vector::from(facet.flat_normal()));
@@ -320,7 +327,7 @@ impl<'a> OffsetSurface<'a> {
     }
 }
 
-/// Weights of the nearest place of a facet for a point that lies beyond its most negative edge.
+/// Returns the weights of the nearest place of a facet for a point that lies beyond its most negative edge.
 fn clamped(facet: &Facet<f64>, p: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
     let k = (0..3).min_by(|&i, &j| b[i].total_cmp(&b[j])).expect("three weights");
     let (i, j) = ((k + 1) % 3, (k + 2) % 3);

@@ -1,8 +1,8 @@
 //! One patch of a nominal surface: points, unit normals, and the triangles between them.
 //!
-//! A grid has its triangles by arithmetic and its normals ready, each beside its point; a mesh keeps its triangles in flat
-//! arrays and fits a normal when a triangle is first touched, so that the work done is that of the measured region, not of the
-//! whole cloud.
+//! A grid computes its triangles by arithmetic and has all its normals, each stored next to its point. A mesh stores
+//! its triangles in flat arrays and fits a normal when a triangle is first touched. So the work depends on the measured
+//! region and not on the whole cloud.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -16,17 +16,17 @@ use super::mesh::MeshLattice;
 use super::normals;
 use super::simd::LANES;
 
-/// A smooth piece of surface that one lattice of triangles covers.
+/// Smooth piece of surface that one lattice of triangles covers.
 #[derive(Debug)]
 pub(crate) struct Patch {
     pub(crate) lattice: Lattice,
     vertices: Vertices,
 }
 
-/// How the triangles of a patch are known.
+/// Triangles of a patch.
 #[derive(Debug)]
 pub(crate) enum Lattice {
-    /// Two triangles a cell, by arithmetic.
+    /// Two triangles per cell, by arithmetic.
     Grid(GridLattice),
     /// Triangles and their neighbours in flat arrays.
     Mesh(MeshLattice),
@@ -39,12 +39,12 @@ enum Vertices {
 }
 
 impl Patch {
-    /// Joins a grid with its nodes, whose normals are all known.
+    /// Makes a patch from a grid and its nodes, whose normals are all known.
     pub(crate) fn grid(nodes: Vec<Vertex>, lattice: GridLattice) -> Self {
         Self { lattice: Lattice::Grid(lattice), vertices: Vertices::Ready(nodes) }
     }
 
-    /// Returns how many triangles a mesh has, if it has no border.
+    /// Returns the number of triangles of a mesh that has no border; `None` for other patches.
     pub(crate) fn closed_triangles(&self) -> Option<usize> {
         match &self.lattice {
             Lattice::Mesh(mesh) if mesh.is_closed() => Some(mesh.facet_count() as usize),
@@ -52,7 +52,7 @@ impl Patch {
         }
     }
 
-    /// Joins a mesh with normals that are fitted when a triangle is first touched.
+    /// Makes a patch from a mesh whose normals are fitted when a triangle is first touched.
     pub(crate) fn mesh(points: Vec<Point>, lattice: MeshLattice) -> Self {
         let cells = points.par_iter().map(|_| NormalCell::unknown()).collect();
         Self { lattice: Lattice::Mesh(lattice), vertices: Vertices::WhenTouched(points, cells) }
@@ -94,7 +94,7 @@ impl Patch {
         }
     }
 
-    /// Returns about so many vertices, spread over the patch, holes left out.
+    /// Returns about `count` vertices, spread over the patch, without holes.
     pub(crate) fn sample(&self, count: usize) -> impl Iterator<Item = u32> {
         let n = self.len();
         let (columns, step_i, step_j) = match &self.lattice {
@@ -110,8 +110,7 @@ impl Patch {
             .filter(|&v| self.point(v).x.is_finite() && (self.has_scattered_normals() || self.normal(v).x.is_finite()))
     }
 
-    /// Whether normals were given or exact rather than fitted to scattered neighbours.
-    /// Returns a facet at a vertex, or next to one at which there is none.
+    /// Returns a facet at a vertex, or near a vertex that has no facet.
     pub(crate) fn facet_at(&self, vertex: u32) -> u32 {
         match &self.lattice {
             Lattice::Grid(grid) => grid.facet_near(vertex),
@@ -119,11 +118,12 @@ impl Patch {
         }
     }
 
+    /// Returns true if the normals are fitted to scattered neighbours, and not given or exact.
     pub(crate) fn has_scattered_normals(&self) -> bool {
         matches!(self.vertices, Vertices::WhenTouched(..))
     }
 
-    /// Returns the nodes of a grid, whose normals are all known; of a mesh none.
+    /// Returns the nodes of a grid, whose normals are all known; returns an empty slice for a mesh.
     pub(crate) fn nodes(&self) -> &[Vertex] {
         match &self.vertices {
             Vertices::Ready(nodes) => nodes,
@@ -131,7 +131,7 @@ impl Patch {
         }
     }
 
-    /// Returns the points of a mesh; of a grid, where they stand among the nodes, none.
+    /// Returns the points of a mesh; returns an empty slice for a grid, whose points are stored in its nodes.
     pub(crate) fn mesh_points(&self) -> &[Point] {
         match &self.vertices {
             Vertices::Ready(_) => &[],
@@ -147,10 +147,10 @@ impl Patch {
         }
     }
 
-    /// Fits the normals of many vertices that are not known yet: on all cores and four at a time, several times faster than
-    /// one by one when they are touched, and to the same bits.
+    /// Fits the normals of many vertices that are not known yet, on all cores and four at a time. This is several times
+    /// faster than one by one when they are touched, and gives the same bits.
     pub(crate) fn fit_normals(&self, vertices: &[u32]) {
-        /// Vertices that a task takes at a time.
+        /// Number of vertices per task.
         const CHUNK: usize = 256;
         let (Vertices::WhenTouched(_, cells), Lattice::Mesh(mesh)) = (&self.vertices, &self.lattice) else { return };
         let arch = pulp::Arch::new();
@@ -175,7 +175,7 @@ impl Patch {
     }
 }
 
-/// The normals of four vertices, in a form that is compiled once for each set of vector instructions.
+/// Fit of the normals of four vertices, in a form that is compiled once for each set of vector instructions.
 struct Four<'a> {
     patch: &'a Patch,
     mesh: &'a MeshLattice,
@@ -185,16 +185,17 @@ struct Four<'a> {
 impl pulp::NullaryFnOnce for Four<'_> {
     type Output = [Vector; LANES];
 
-    // Inlined into the caller that has the instructions; a call from it would be to code without them.
+    // This must be inlined into the caller that has the instructions: a function that is called runs code without them.
     #[inline(always)]
     fn call(self) -> Self::Output {
         normals::four_normals(self.patch.mesh_points(), self.mesh, &self.vertices)
     }
 }
 
-/// A normal that is worked out once, by whichever thread first needs it.
+/// Normal that is computed once, by the thread that first needs it.
 ///
-/// Every thread that finds it unknown computes the same value, so a race costs time and changes nothing; NaN means unknown.
+/// Every thread that finds it unknown computes the same value, so that a race costs time but changes nothing. NaN means
+/// unknown.
 #[derive(Debug)]
 struct NormalCell([AtomicU64; 3]);
 

@@ -1,7 +1,7 @@
-//! Prefetching: about where the feet of many points will be, and the normals there, before any foot is asked for.
+//! Prefetching: finds the approximate feet of many points and fits the normals there, before any foot is requested.
 //!
-//! A scattered surface fits a normal where it is first touched. One by one, as the search for each foot meets them, that is the
-//! most expensive part of a registration; all at once it runs four at a time on all cores.
+//! A scattered surface fits a normal when it is first touched. One by one, as the search for each foot meets them,
+//! these fits are the most expensive part of a registration. All together they run four at a time on all cores.
 
 use rayon::prelude::*;
 
@@ -11,20 +11,20 @@ use super::facet::Facets;
 use super::offset::{OffsetSurface, Place};
 use super::patch::Lattice;
 
-/// Points that a task takes at a time.
+/// Number of points per task.
 const CHUNK: usize = 512;
 
-/// From a neighbour so many steps of the sampling away a walk is shorter than a look into the tree.
+/// Distance in steps of the sampling up to which a walk from the last point is shorter than a search in the tree.
 const NEAR_STEPS: f64 = 24.0;
 
 impl OffsetSurface<'_> {
-    /// Whether normals are fitted where the surface is touched, so that it is well to touch little of it.
+    /// Returns true if normals are fitted where the surface is touched, so that it is best to touch little of it.
     pub(crate) fn fits_normals(&self) -> bool {
         self.nominal().patches().iter().any(|patch| patch.has_scattered_normals())
     }
 
-    /// Fits the normals that the feet of points will need, all at once, and returns places to start from for each point, given
-    /// in the model frame; nothing where normals are ready, or where several patches contend for a point.
+    /// Fits the normals that the feet of some points in the model frame will need, all together. Returns a start place
+    /// for each point. Returns an empty list if the normals are ready already, or if there are several patches.
     pub(crate) fn prefetch(&self, points: &[Point]) -> Vec<Place> {
         let [patch] = self.nominal().patches() else { return Vec::new() };
         let Lattice::Mesh(mesh) = &patch.lattice else { return Vec::new() };

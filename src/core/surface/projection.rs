@@ -1,4 +1,4 @@
-//! A plane in which a surface can be triangulated: one place of the plane for one place of the surface.
+//! Projections to a plane in which a surface can be triangulated: one place of the plane for each place of the surface.
 
 use nalgebra::{Matrix3, Matrix4, SymmetricEigen, Vector4};
 use serde::{Deserialize, Serialize};
@@ -25,23 +25,23 @@ pub enum Projection {
     Spherical,
 }
 
-/// A projection made ready for one cloud.
+/// Projection with its parameters for one cloud.
 #[derive(Clone, Debug)]
 pub(crate) enum Map {
-    /// Origin, the two directions of the plane, and the direction of the height.
+    /// Origin of the plane, its two directions, and the direction of the height.
     Plane { origin: Point, axes: [Vector; 3] },
-    /// Centre, radius, and two directions at right angles to the pole, then the pole.
+    /// Centre, radius, and the axes: two directions perpendicular to the pole, then the pole.
     Sphere { centre: Point, radius_mm: f64, axes: [Vector; 3] },
 }
 
-/// More bins than this share that hold two sheets, and the projection is not one-to-one.
+/// Largest accepted share of bins that hold two sheets; above it the projection is not one-to-one.
 const FOLDED_SHARE: f64 = 0.05;
 
 impl Projection {
-    /// Returns the map for these points, and which projection it is.
+    /// Returns the projection that is used for these points, and its map.
     ///
     /// # Errors
-    /// The wanted projection folds the surface, or with `Auto` every projection does.
+    /// Returns an error if the requested projection folds the surface, or if with `Auto` every projection does.
     pub(crate) fn prepare(self, points: &[Point]) -> Result<(Self, Map), SurfaceError> {
         let candidates: &[Self] = match self {
             Self::Auto => &[Self::Xy, Self::BestFit, Self::Spherical],
@@ -83,7 +83,7 @@ fn describe(shares: &[(Projection, f64)]) -> String {
 }
 
 impl Map {
-    /// Returns the place of a point in the plane and its height over it.
+    /// Returns the place of a point in the plane, and its height over the plane.
     pub(crate) fn project(&self, p: &Point) -> ([f64; 2], f64) {
         match self {
             Self::Plane { origin, axes } => {
@@ -93,7 +93,7 @@ impl Map {
             Self::Sphere { centre, radius_mm, axes } => {
                 let d = p - centre;
                 let r = d.norm();
-                // Stereographic from the far pole: 2 tan(colatitude / 2) at the longitude.
+                // Stereographic from the opposite pole: 2 tan(colatitude / 2) at the longitude.
                 let scale = 2.0 * radius_mm / (r + d.dot(&axes[2])).max(1e-9 * r);
                 ([scale * d.dot(&axes[0]), scale * d.dot(&axes[1])], r - radius_mm)
             }
@@ -102,8 +102,8 @@ impl Map {
 
     /// Returns the share of small neighbourhoods in the plane whose heights do not lie on one sheet.
     ///
-    /// In a neighbourhood of size s a smooth sheet departs from its tangent plane by a small part of s, even where it is
-    /// steep; two sheets depart from any plane by half their distance.
+    /// In a neighbourhood of size s a smooth sheet deviates from its tangent plane by a small part of s, even where it
+    /// is steep. Two sheets deviate from any plane by half their distance.
     fn folded_share(&self, points: &[Point]) -> f64 {
         let stride = points.len().div_ceil(200_000);
         let placed: Vec<_> = points.iter().step_by(stride).map(|p| self.project(p)).collect();
@@ -124,7 +124,7 @@ impl Map {
     }
 }
 
-/// Sums for the plane through the heights of one neighbourhood.
+/// Sums for the least-squares plane through the heights of one neighbourhood.
 #[derive(Clone, Default)]
 struct Sheet {
     gram: Matrix4<f64>,
@@ -138,7 +138,7 @@ impl Sheet {
         self.count += 1;
     }
 
-    /// Returns the rms residual about the plane, or `None` with too few points to tell.
+    /// Returns the rms residual about the plane, or `None` if there are too few points.
     fn residual(&self) -> Option<f64> {
         if self.count < 6 {
             return None;
@@ -155,14 +155,14 @@ fn best_fit_plane(points: &[Point]) -> Map {
     let (origin, eigen) = principal_axes(points);
     let least = eigen.eigenvalues.imin();
     let mut normal: Vector = eigen.eigenvectors.column(least).into();
-    // The side of +z, or of the largest component for a part that stands upright.
+    // The normal points to the side of +z, or along its largest component for an upright part.
     let sign = if normal.z.abs() > 0.1 { normal.z } else { normal[normal.iamax()] };
     normal *= sign.signum();
     let [tu, tv] = tangents(&normal);
     Map::Plane { origin, axes: [tu, tv, normal] }
 }
 
-/// The centroid and the eigenvectors of the scatter about it.
+/// Returns the centroid and the eigendecomposition of the scatter matrix about it.
 pub(crate) fn principal_axes(points: &[Point]) -> (Point, SymmetricEigen<f64, nalgebra::Const<3>>) {
     let centroid = centroid(points);
     let scatter = points.iter().map(|p| p - centroid).map(|d| d * d.transpose()).sum::<Matrix3<f64>>();
@@ -173,7 +173,7 @@ pub(crate) fn centroid(points: &[Point]) -> Point {
     Point::from(points.iter().map(|p| p.coords).sum::<Vector>() / points.len() as f64)
 }
 
-/// The algebraic least-squares sphere: |p|^2 = 2 c.p + (r^2 - |c|^2), linear in its four unknowns.
+/// Fits the algebraic least-squares sphere: |p|^2 = 2 c.p + (r^2 - |c|^2), linear in its four unknowns.
 fn best_fit_sphere(points: &[Point]) -> Option<Map> {
     let middle = centroid(points);
     let (mut gram, mut right) = (Matrix4::zeros(), Vector4::zeros());
@@ -186,16 +186,17 @@ fn best_fit_sphere(points: &[Point]) -> Option<Map> {
     let solution = gram.cholesky()?.solve(&right);
     let offset = Vector::new(solution[0], solution[1], solution[2]);
     let radius_mm = (solution[3] + offset.norm_squared()).sqrt();
-    // The pole points from the centre to the middle of the cloud; a whole sphere has none, and any will do.
+    // The pole points from the centre to the centroid of the cloud. A whole sphere has no such direction, and any pole
+    // works.
     let pole = if offset.norm() > 1e-6 * radius_mm { -offset.normalize() } else { Vector::z() };
     let [tu, tv] = tangents(&pole);
     radius_mm.is_finite().then(|| Map::Sphere { centre: middle + offset, radius_mm, axes: [tu, tv, pole] })
 }
 
-/// Whether points lie on one line to rounding.
+/// Returns true if the points lie on one line to rounding.
 pub(crate) fn is_line(points: &[Point]) -> bool {
     const FEW: usize = 4096;
-    // Points of which some are on no line are on none.
+    // If a sample does not lie on a line, all points do not either.
     let some: Vec<Point> = points.iter().step_by(points.len().div_ceil(FEW).max(1)).copied().collect();
     are_on_line(&some) && (some.len() == points.len() || are_on_line(points))
 }
@@ -211,7 +212,7 @@ fn are_on_line(points: &[Point]) -> bool {
 mod tests {
     use super::*;
 
-    /// Points on a sphere of radius 20 about (5, -3, 40), to a polar angle from +z, spread like a sunflower.
+    /// Returns points on a sphere of radius 20 about (5, -3, 40), up to a polar angle from +z, spread like a sunflower.
     fn cap(polar_deg: f64, count: usize) -> Vec<Point> {
         let lowest = polar_deg.to_radians().cos();
         (0..count)

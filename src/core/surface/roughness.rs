@@ -1,7 +1,7 @@
-//! How far the points of a nominal surface scatter about a smooth one.
+//! Noise of the points of a nominal surface about a smooth surface.
 //!
-//! A cubic is fitted to a few neighbours of a point and to twice as many. What it leaves of a smooth surface grows with the fourth power of
-//! the distance; what it leaves of points that scatter is the same both times.
+//! A cubic is fitted to a few neighbours of a point and to about twice as many. The residual of a smooth surface grows
+//! with the fourth power of the distance; the residual of noise is the same in both fits.
 
 use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
@@ -10,15 +10,16 @@ use super::normals::{NEIGHBOURS, ring_around, tangents};
 use super::patch::{Lattice, Patch};
 use crate::geometry::Point;
 
-/// Terms of a cubic in two variables.
+/// Number of terms of a cubic in two variables.
 const TERMS: usize = 10;
-/// Points that are looked at.
+/// Number of points that are checked.
 const LOOKED_AT: usize = 100;
-/// The surface itself leaves more than this factor more beside many neighbours than beside few.
+/// Limit of the residual with many neighbours over that with few. A larger ratio means that the residual is the form of
+/// the surface itself.
 const GROWS: f64 = 2.0;
 
-/// Returns the standard deviation by which the points scatter along the normal, in millimetres; 0 where the surface is smooth as far as its
-/// points tell.
+/// Returns the standard deviation of the noise of the points along the normal, in millimetres; 0 if the points show
+/// only a smooth surface.
 pub(super) fn scatter_mm(patches: &[Patch]) -> f64 {
     let some = |patch| Patch::sample(patch, (LOOKED_AT / patches.len()).max(1)).map(move |vertex| (patch, vertex));
     let vertices: Vec<(&Patch, u32)> = patches.iter().flat_map(some).collect();
@@ -30,15 +31,15 @@ pub(super) fn scatter_mm(patches: &[Patch]) -> f64 {
     if many > GROWS * few { 0.0 } else { many }
 }
 
-/// Returns the mean squares that cubics leave of few neighbours and of many.
+/// Returns the mean squared residuals of cubics that are fitted to few neighbours and to many.
 fn left_at(patch: &Patch, vertex: u32) -> Option<[f64; 2]> {
     let around = around(patch, vertex);
-    // With the point itself the fewest that leave a few degrees of freedom.
+    // The point itself is included; these are the smallest numbers that leave a few degrees of freedom.
     let of = |count: usize| around.get(..count).and_then(left_by_a_cubic);
     Some([of(NEIGHBOURS + 3)?, of(2 * NEIGHBOURS + 3)?])
 }
 
-/// A point and its neighbours along two tangents and the normal, the nearest first.
+/// Returns a point and its neighbours in coordinates along two tangents and the normal, the nearest first.
 fn around(patch: &Patch, vertex: u32) -> Vec<[f64; 3]> {
     let wanted = 2 * NEIGHBOURS + 3;
     let others: Vec<u32> = match &patch.lattice {
@@ -56,7 +57,8 @@ fn around(patch: &Patch, vertex: u32) -> Vec<[f64; 3]> {
     around
 }
 
-/// Returns the mean square that the best cubic leaves, by its degrees of freedom; none where the places do not determine one.
+/// Returns the sum of squared residuals of the best cubic, divided by the degrees of freedom; `None` if the places do
+/// not determine a cubic.
 fn left_by_a_cubic(places: &[[f64; 3]]) -> Option<f64> {
     let size = places.last().map(|[u, v, _]| u.hypot(*v)).filter(|size| *size > 0.0)?;
     let mut normal = SMatrix::<f64, TERMS, TERMS>::zeros();
@@ -86,7 +88,8 @@ mod tests {
     use crate::geometry::Point;
     use crate::surface::{Nominal, Projection};
 
-    /// Points 1 mm apart, jittered so that they are no grid or not, on a wave, with a scatter of so much.
+    /// Returns a wavy surface from points 1 mm apart with the given noise; a jitter other than 0 makes them scattered
+    /// points and not a grid.
     fn nominal(jitter_mm: f64, scatter_mm: f64) -> Nominal {
         let mut state = 1u64;
         let mut uniform = || {
@@ -95,7 +98,7 @@ mod tests {
         };
         let points = (0..60 * 40).map(|k| {
             let [x, y] = [(k % 60) as f64 + jitter_mm * uniform(), (k / 60) as f64 + jitter_mm * uniform()];
-            // Uniform from -sqrt 3 to sqrt 3 has a standard deviation of 1.
+            // A uniform variable from -sqrt 3 to sqrt 3 has a standard deviation of 1.
             Point::new(x, y, (0.1 * x).sin() + 0.01 * y * y + scatter_mm * 12f64.sqrt() * uniform())
         });
         Nominal::from_points(points.collect(), Projection::Xy).unwrap()

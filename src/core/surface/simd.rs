@@ -1,33 +1,34 @@
-//! The arithmetic of four numbers side by side, which the compiler turns into vector instructions, and what it has in common with
-//! that of one: a formula written for any [`Real`] serves both.
+//! Arithmetic of four numbers in parallel lanes, which the compiler turns into vector instructions. A formula that is
+//! written for any [`Real`] works for one number and for four.
 
 use std::ops::{Add, Div, Mul, Sub};
 
-/// Numbers handled at a time.
+/// Number of lanes.
 pub(crate) const LANES: usize = 4;
 
-/// A number to compute with: one, or four side by side.
+/// Number to compute with: one, or four in parallel lanes.
 pub(crate) trait Real:
     Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self>
 {
-    /// The same number everywhere.
+    /// Returns the same number in every lane.
     fn splat(value: f64) -> Self;
 
-    /// The square root.
+    /// Returns the square root.
     fn sqrt(self) -> Self;
 
-    /// The vector of unit length along one; four at once by one division instead of three.
+    /// Returns the unit vector along `v`; four lanes use one division instead of three.
     fn unit(v: &[Self; 3]) -> [Self; 3];
 
-    /// The sum of three, grouped as suits its kind: one after the other, or the last two first so that they need not wait.
+    /// Returns the sum of three numbers. One number adds them in order; four lanes add the last two first, so that the
+    /// additions need not wait for each other.
     fn plus(self, second: Self, third: Self) -> Self;
 }
 
-/// One number of each of four points.
+/// One number for each of four points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct F64x4(pub(crate) [f64; LANES]);
 
-/// A vector of each of four points: x, y, z.
+/// Vector for each of four points: x, y, z.
 pub(crate) type Vector3x4 = [F64x4; 3];
 
 macro_rules! lanewise {

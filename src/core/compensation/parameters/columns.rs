@@ -1,12 +1,13 @@
-//! What a unit of each parameter, of each motion and of the machine's slides adds to the deviations.
+//! Columns of the fit: effects on the deviations of a unit of each parameter, of each motion and of the machine's
+//! slides.
 
 use super::{Contact, ParameterKind, WheelTerm};
 use crate::geometry::bounds;
 
-/// A column that is left with less than this share of itself is made by those before it.
+/// Minimum share of a column that remains without those before it; a column with less is a combination of them.
 const NOTHING_OWN: f64 = 1e-7;
 
-/// The effect of one unit of something at every point.
+/// Effect of one unit of a parameter, motion or slide at every point.
 pub(super) struct Column<K> {
     pub(super) kind: K,
     pub(super) values: Vec<f64>,
@@ -27,7 +28,7 @@ const SLIDES: [&str; 4] = [
     "a slide that is bent to and fro along y",
 ];
 
-/// Where the part is, in x and y: its middle and half its size.
+/// Extent of the part in x and y: its middle and half its size.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Extent {
     middle_mm: [f64; 2],
@@ -35,25 +36,26 @@ pub struct Extent {
 }
 
 impl Extent {
-    /// The extent of some places.
+    /// Returns the extent of some places.
     pub fn of(places_mm: impl Iterator<Item = [f64; 2]>) -> Self {
         let [low, high] = bounds(places_mm);
         let of = |sign: f64| std::array::from_fn(|k| 0.5 * (high[k] + sign * low[k]));
         Self { middle_mm: of(1.0), half_mm: of(-1.0) }
     }
 
-    /// The larger of its sides, in millimetres.
+    /// Returns the larger of its sides, in millimetres.
     pub(super) fn size_mm(&self) -> f64 {
         2.0 * self.half_mm[0].max(self.half_mm[1])
     }
 
-    /// -1 to 1 along x and along y.
+    /// Returns the position of a contact in the extent, from -1 to 1 along x and along y.
     fn share(&self, contact: &Contact) -> [f64; 2] {
         [0, 1].map(|k| (contact.point[k] - self.middle_mm[k]) / self.half_mm[k].max(f64::MIN_POSITIVE))
     }
 }
 
-/// What a unit of a motion of the part adds: a shift along x, y, z, a turn about x, y, z through the middle of the model frame.
+/// Returns the effect of a unit of a motion of the part: a shift along x, y, z, or a turn about x, y, z through the
+/// origin of the model frame.
 pub(super) fn of_motion(contact: &Contact, motion: usize) -> f64 {
     match motion {
         0..3 => contact.normal[motion],
@@ -66,7 +68,8 @@ pub(super) fn motions(contacts: &[Contact], free: [bool; 6]) -> Vec<Column<&'sta
     (0..6).filter(|&k| free[k]).map(of).collect()
 }
 
-/// What slides that are not straight add: the second and the third Legendre polynomial along either axis, guided in z.
+/// Returns the effects of slides that are not straight, guided in z: the second and the third Legendre polynomial
+/// along either axis.
 pub(super) fn slides(contacts: &[Contact], extent: &Extent) -> Vec<Column<&'static str>> {
     let of = |k: usize| Column { kind: SLIDES[k], values: contacts.iter().map(|c| of_slide(c, extent, k)).collect() };
     (0..SLIDES.len()).map(of).collect()
@@ -78,7 +81,8 @@ pub(super) fn of_slide(contact: &Contact, extent: &Extent, k: usize) -> f64 {
 }
 
 impl ParameterKind {
-    /// What a unit of it adds to the deviation at a contact; wear is no function of the place.
+    /// Returns the effect of a unit of the parameter on the deviation at a contact; 0 for wear, which is no function
+    /// of the place.
     pub(super) fn effect(self, contact: &Contact, term: WheelTerm) -> f64 {
         let n = contact.normal;
         match self {
@@ -125,7 +129,7 @@ pub(super) fn rms(values: &[f64]) -> f64 {
 }
 
 impl Basis {
-    /// Gram-Schmidt, twice over; columns that add nothing are left out.
+    /// Builds the basis by Gram-Schmidt, applied twice; columns that add nothing are left out.
     pub(super) fn of<'a>(columns: impl Iterator<Item = &'a Vec<f64>>) -> Self {
         let mut basis = Self { columns: Vec::new() };
         for column in columns {
@@ -140,7 +144,7 @@ impl Basis {
         basis
     }
 
-    /// Returns what of a column none of these makes.
+    /// Returns the part of a column that is orthogonal to the basis.
     pub(super) fn without(&self, column: &[f64]) -> Vec<f64> {
         let mut own = column.to_vec();
         for _ in 0..2 {

@@ -1,32 +1,34 @@
-//! What of the deviations a parameter of the machine explains: wheel radius, setting of the wheel, tilt of the part, wear along the path.
+//! Parameters of the machine estimated from the deviations: wheel radius, setting of the wheel, tilt of the part,
+//! wear along the path.
 //!
 //! ```text
-//!  contacts --columns--> motions | slides | parameters --Effects--> told +- U --tolerance--> taken --> Set of the next pass
-//!                          (nuisance)        (beside a field)                  \-- beyond it: a person is asked
+//!  contacts --columns--> motions | slides | parameters --GLS--> value +- U --tolerance--> taken --> next Set
+//!                           (nuisance)     (with a field)                     \-- beyond it: a person decides
 //! ```
 //!
-//! A parameter changes the surface in a way that is known beforehand (p and q are the slopes of the nominal surface, n its
-//! unit normal):
+//! A parameter changes the surface in a known way (p and q are the slopes of the nominal surface, n its unit normal):
 //!
 //! ```text
-//!  wheel radius   -dR (1/nz - 1)     dR the true radius less the stated one: a larger wheel cuts deeper on slopes
-//!  setting        ex p nz, ey q nz   the wheel off along x or y;  ez nz  set too high
+//!  wheel radius   -dR (1/nz - 1)     dR the true radius minus the stated one: a larger wheel cuts deeper on slopes
+//!  setting        ex p nz, ey q nz   offset of the wheel along x or y;  ez nz  the wheel is set too high
 //!  tilt           -(r x n) a         the part tilted in the grinder by a, about x or y
 //!  wear           w t                t the progress along the path, 0 to 1: the surface rises as the wheel wears
 //! ```
 //!
-//! Registration has taken out of the deviations whatever a motion of the part can explain, so the motions that are free are fitted along, as
-//! nuisance. That costs what looks like a motion: a spherical wheel that is off along x leaves exactly the surface of a part that is off along
-//! x, and can only be seen where the part is held by a datum, as well as that is known. So do slides that are not straight, whose second and third order along either axis are
-//! fitted along too: on a shallow part a bent slide is what a wheel of another radius looks most like.
+//! Registration has removed from the deviations every part that a motion of the part explains, so the free motions
+//! are fitted too, as nuisance. This loses effects that look like a motion. A spherical wheel that is offset along x
+//! leaves exactly the surface of a part that is offset along x. It is only visible where a datum locks the part, and
+//! only as well as the position of the datum is known. Slides that are not straight are fitted too, with their second
+//! and third order along either axis: on a shallow part a bent slide looks very similar to a wheel of another radius.
 //!
-//! **Uncertainty.** What is left is form, not noise: neighbouring points are off together, and the usual formula would be far too
-//! sure. The values are told by generalised least squares beside the field of the model of the error ([`Effects`]), whose strength and width the points
-//! tell whatever the parameters are.
+//! **Uncertainty.** The residuals are form, not noise: neighbouring points deviate together, and the usual formula
+//! would give far too small uncertainties. Generalised least squares estimates the values together with the field of
+//! the model of the error ([`EffectEstimates`]). The points determine the strength and range of this field, whatever
+//! the parameters are.
 //!
-//! **What is taken back.** What is told beyond its expanded uncertainty is taken back by its expectation, given the tolerance that is stated
-//! of it: told (1 + s^2 / t^2)^-1 for one parameter with the standard uncertainty s and the tolerance 2 t. What is not is left to the map. More than
-//! its tolerance is not taken without a person.
+//! **Compensation.** A value beyond its expanded uncertainty is compensated by its expectation, given its stated
+//! tolerance: value (1 + s^2 / t^2)^-1 for one parameter with the standard uncertainty s and the tolerance 2 t. Any
+//! other value is left to the map. More than the tolerance is not compensated without a person.
 
 mod columns;
 mod set;
@@ -42,32 +44,34 @@ pub use columns::Extent;
 use columns::{Basis, Column, candidates, dot, motions, rms, slides};
 pub use set::{Set, Smooth, smooth_of};
 
-/// Fewer points than this say nothing about a dozen unknowns.
+/// Minimum number of points; fewer carry no information on a dozen unknowns.
 const LEAST_POINTS: usize = 30;
-/// A normal must have so much of z: the wheel comes from above.
+/// Minimum z of a normal: the wheel comes from above.
 const LEAST_NZ: f64 = 0.05;
-/// A column that keeps less than this share of itself beside the others cannot be told apart from them.
+/// Minimum share of a column that is independent of the others; a column with less is not separable from them.
 const LEAST_OWN: f64 = 0.02;
 /// Expanded over standard uncertainty.
 const EXPANDED: f64 = 2.0;
-/// A mean square effect below this is rounding.
+/// Mean square effect below which a column is rounding.
 const NOTHING: f64 = 1e-18;
-/// How strong slides may be, over all that is seen: so many strengths from as much of it down to this.
+/// Number of trial strengths of the prior of values without a tolerance, from the rms of the deviations down to
+/// [`LEAST_STRENGTH`] of it.
 const STRENGTHS: i32 = 25;
+/// Minimum trial strength, as a share of the rms of the deviations.
 const LEAST_STRENGTH: f64 = 1e-3;
 
-/// A point of the surface and how far it is off.
+/// Point of the surface and its deviation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Contact {
-    /// Where, in the model frame, in millimetres.
+    /// Position in the model frame, in millimetres.
     pub point: Point,
-    /// Outward unit normal of the nominal surface there.
+    /// Outward unit normal of the nominal surface at the point.
     pub normal: Vector,
-    /// Positive where material stands proud, in millimetres.
+    /// Deviation, positive where material stands proud, in millimetres.
     pub deviation_mm: f64,
 }
 
-/// How an error of the wheel's radius comes out along the normal.
+/// Effect of an error of the wheel's radius along the normal.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum WheelTerm {
@@ -78,25 +82,26 @@ pub enum WheelTerm {
     AlongNormal,
 }
 
-/// What is asked of the separation.
+/// Options of the parameter estimation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ParameterOptions {
     /// Radius of the wheel as stated to the grinder, in millimetres.
     pub wheel_radius_mm: f64,
-    /// Motions that registration has fitted: shifts along x, y, z, turns about x, y, z. What a datum holds is not free.
+    /// Motions that registration has fitted: shifts along x, y, z, turns about x, y, z. A motion that a datum locks
+    /// is not free.
     pub free_motions: [bool; 6],
-    /// Standard uncertainty of where the datum holds the part, in millimetres, and of how it is turned, in radians; `None` where nobody states
-    /// it, and then a datum tells nothing.
+    /// Standard uncertainty of the position of the part on its datum, in millimetres, and of its rotation, in
+    /// radians; `None` if it is not stated, and then the datum separates no parameter.
     pub datum: Option<[f64; 2]>,
-    /// How the wheel's radius comes out.
+    /// Effect of an error of the wheel's radius.
     pub wheel_term: WheelTerm,
-    /// The tolerance of each parameter that is to be taken back, in its unit, in the order of [`ParameterKind::ALL`]: the expanded
-    /// uncertainty with which it is set; `None` where it is only to be told.
+    /// Tolerance of each parameter to compensate, in its unit, in the order of [`ParameterKind::ALL`]: the expanded
+    /// uncertainty with which it is set. `None` for a parameter that is only reported.
     pub tolerances: [Option<f64>; ParameterKind::COUNT],
 }
 
 impl ParameterOptions {
-    /// All six motions free, nothing to be taken back.
+    /// Returns the options with all six motions free and no parameter to compensate.
     pub fn new(wheel_radius_mm: f64) -> Self {
         Self {
             wheel_radius_mm,
@@ -107,42 +112,45 @@ impl ParameterOptions {
         }
     }
 
-    /// Whether a parameter is told apart by a datum alone of which nobody states how well it holds.
+    /// Returns true if only a datum separates the parameter from a motion, and the uncertainty of this datum is not
+    /// stated.
     fn is_untold(&self, k: usize) -> bool {
         let held = |motion: usize| !self.free_motions[motion];
         ParameterKind::ALL[k].motion().is_some_and(held) && self.datum.is_none()
     }
 }
 
-/// A parameter that is looked for.
+/// Kind of an estimated parameter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum ParameterKind {
-    /// True radius of the wheel less the stated one.
+    /// True radius of the wheel minus the stated one.
     WheelRadius,
-    /// How far the wheel is off along x.
+    /// Offset of the wheel along x.
     SettingX,
-    /// How far the wheel is off along y.
+    /// Offset of the wheel along y.
     SettingY,
-    /// By how much the wheel is set too high.
+    /// Height by which the wheel is set too high.
     SettingZ,
-    /// By how much the part is tilted in the grinder about x.
+    /// Tilt of the part in the grinder about x.
     TiltX,
-    /// The same about y.
+    /// Tilt of the part in the grinder about y.
     TiltY,
-    /// By how much the surface rises over the whole path; never taken back as a parameter, as the next wheel wears anew.
+    /// Rise of the surface over the whole path by wear; never compensated as a parameter, since the wheel wears again
+    /// in the next pass.
     Wear,
 }
 
 impl ParameterKind {
-    /// How many there are.
+    /// Number of kinds.
     pub const COUNT: usize = 7;
-    /// All of them, in order: of two that look alike the first is told.
+    /// All kinds in order: of two with the same effect the first is estimated.
     pub const ALL: [Self; Self::COUNT] =
         [Self::WheelRadius, Self::SettingX, Self::SettingY, Self::SettingZ, Self::TiltX, Self::TiltY, Self::Wear];
 
-    /// The motion of the part that looks exactly like it.
+    /// Returns the index of the motion of the part that has exactly the same effect; `None` if there is no such
+    /// motion.
     fn motion(self) -> Option<usize> {
         match self {
             Self::SettingX => Some(0),
@@ -154,53 +162,55 @@ impl ParameterKind {
         }
     }
 
-    /// Whether it is an angle, in radians; else a length, in millimetres.
+    /// Returns true if the value is an angle, in radians; otherwise it is a length, in millimetres.
     pub fn is_angle(self) -> bool {
         matches!(self, Self::TiltX | Self::TiltY)
     }
 }
 
-/// What was found of one parameter.
+/// Estimate of one parameter.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Parameter {
-    /// Which.
+    /// Kind of the parameter.
     pub kind: ParameterKind,
-    /// Its value in millimetres or radians; 0 where it cannot be told.
+    /// Value in millimetres or radians; 0 if it is not separable.
     pub value: f64,
-    /// Its standard uncertainty in the same unit; 0 where it cannot be told.
+    /// Standard uncertainty of the value in the same unit; 0 if it is not separable.
     pub sigma: f64,
-    /// Share of its effect that nothing else here could make, from 0 to 1.
+    /// Share of its effect that nothing else in the fit explains, from 0 to 1.
     pub own_share: f64,
-    /// What it cannot be told apart from, in words; empty where it can.
+    /// Names of the effects that it is not separable from, for people; empty if it is separable.
     pub alike: Vec<String>,
-    /// Whether it should be corrected as a parameter: it can be told, and it is beyond its expanded uncertainty.
+    /// True if it should be corrected as a parameter: it is separable and beyond its expanded uncertainty.
     pub offered: bool,
-    /// What is to be taken back of it; 0 where it is not offered, or nobody asks for it.
+    /// Value to compensate; 0 if it is not offered, or has no tolerance.
     pub taken: f64,
-    /// Whether that is more than its tolerance, so that a person is to be asked.
+    /// True if `taken` exceeds the tolerance, so that a person must decide.
     pub beyond: bool,
-    /// By how much the root mean square falls when it is corrected beside the others that are offered, in millimetres; 0 where it is not offered.
+    /// Reduction of the root mean square by its correction, together with the others that are offered, in
+    /// millimetres; 0 if it is not offered.
     pub removes_rms_mm: f64,
-    /// What to do, for people.
+    /// Result and advice, for people.
     pub message: String,
 }
 
-/// Parameters and what is left without those that are offered.
+/// Estimated parameters, and the residuals without those that are offered.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Parameters {
-    /// In the order of [`ParameterKind::ALL`].
+    /// Parameters in the order of [`ParameterKind::ALL`].
     pub found: Vec<Parameter>,
-    /// Root mean square of the deviations without what the free motions explain, in millimetres.
+    /// Root mean square of the deviations without the part that the free motions explain, in millimetres.
     pub rms_mm: f64,
-    /// The same without the parameters that are offered.
+    /// Root mean square of `rest_mm`, in millimetres: as `rms_mm`, but also without the offered parameters.
     pub rest_rms_mm: f64,
-    /// What is left at every point once the offered parameters are corrected and the part is registered anew, in millimetres: form and noise.
+    /// Residual at every point after correction of the offered parameters and a new registration, in millimetres:
+    /// form and noise.
     pub rest_mm: Vec<f64>,
-    /// What of the deviations parameters and slides make together, whichever of them it is.
+    /// Part of the deviations that parameters and slides explain together, however it divides between them.
     pub smooth: Smooth,
 }
 
-/// Why parameters cannot be separated.
+/// Error that prevents the separation of parameters.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -221,15 +231,16 @@ pub enum ParameterError {
     Field(#[from] ModelError),
 }
 
-/// Separates what parameters explain of deviations, by generalised least squares beside a field.
+/// Estimates the parameters from deviations, by generalised least squares together with a field.
 ///
-/// Shapes: contacts in any order; `progress` from 0 to 1 along the path at each, or `None` for a raster whose tracks follow each other
-/// along y. Frames: the model frame. Units: millimetres, radians. Equation: deviation = motion + slides + sum of parameters times their columns +
-/// field + scatter.
+/// Shapes: contacts in any order; `progress` from 0 to 1 along the path at each, or `None` for a raster whose tracks
+/// follow each other along y. Frames: the model frame. Units: millimetres, radians. Equation:
+/// deviation = motion + slides + sum of parameters times their columns + field + noise.
 ///
 /// # Errors
-/// Too few points, values that are not finite, normals that do not look up, a radius or a tolerance that is not above 0, points that leave
-/// no field to be told.
+/// Too few points, values that are not finite, a number of `progress` values other than that of the contacts, normals
+/// that do not point up, a radius or a tolerance that is not above 0, a negative uncertainty of the datum, and points
+/// that do not determine a field.
 pub fn parameters(
     contacts: &[Contact],
     progress: Option<&[f64]>,
@@ -301,19 +312,19 @@ fn check(contacts: &[Contact], progress: Option<&[f64]>, options: &ParameterOpti
     }
 }
 
-/// All that is fitted.
+/// All columns of the fit.
 struct Columns {
     motions: Vec<Column<&'static str>>,
     slides: Vec<Column<&'static str>>,
     candidates: Vec<Column<ParameterKind>>,
 }
 
-/// What was fitted, of the columns that are not those of others again.
+/// Fitted values of the columns that are no combinations of others.
 struct Fitted {
-    /// Of each slide and of each candidate behind them: its value; 0 where it was not fitted.
+    /// Value of each slide and, after them, of each candidate; 0 if it was not fitted.
     values: DVector<f64>,
     covariance: DMatrix<f64>,
-    /// Root mean square of a unit of each.
+    /// Root mean square of the effect of a unit of each.
     sizes: Vec<f64>,
     rms_mm: f64,
     slides: usize,
@@ -324,7 +335,8 @@ impl Columns {
         self.motions.iter().chain(&self.slides).map(|c| &c.values)
     }
 
-    /// Returns which candidates can be told from motions, slides and those before them, and how much of each is its own beside all of these.
+    /// Returns which candidates are separable from motions, slides and each other (of two with the same effect, the
+    /// first is), and the share of each that is independent of motions, slides and the other separable candidates.
     fn told(&self) -> (Vec<bool>, Vec<f64>) {
         let mut told: Vec<bool> = Vec::new();
         for k in 0..self.candidates.len() {
@@ -336,11 +348,11 @@ impl Columns {
             own_share(&self.candidates[k].values, &Basis::of(self.nuisance().chain(others)))
         };
         let shares: Vec<f64> = (0..told.len()).map(share).collect();
-        // Who can no longer be told once those behind are there goes to those.
+        // A candidate that is no longer separable once later ones are included is dropped in their favour.
         (told.iter().zip(&shares).map(|(told, share)| *told && *share > LEAST_OWN).collect(), shares)
     }
 
-    /// Fits slides and candidates beside the motions and a field.
+    /// Fits slides and candidates together with the motions and a field.
     fn fitted(
         &self,
         contacts: &[Contact],
@@ -371,7 +383,8 @@ impl Columns {
                 }
             }
         }
-        // What a datum holds badly comes out as the setting that looks like it.
+        // An error of the datum looks like the setting with the same effect, so its variance adds to that of the
+        // setting.
         for (k, kind) in ParameterKind::ALL.into_iter().enumerate().filter(|(k, _)| told[*k]) {
             let held = kind.motion().filter(|&motion| !options.free_motions[motion]);
             if let Some((motion, [shift, turn])) = held.zip(options.datum) {
@@ -382,7 +395,7 @@ impl Columns {
         Ok(Fitted { values, covariance, sizes, rms_mm, slides })
     }
 
-    /// The effects of motions and of chosen columns, in units of these.
+    /// Returns the estimates for motions and for the chosen columns, in units of these.
     fn effects(
         &self,
         contacts: &[Contact],
@@ -390,7 +403,7 @@ impl Columns {
         chosen: &[&Vec<f64>],
     ) -> Result<EffectEstimates, ModelError> {
         let n = contacts.len();
-        // Columns of one size: they have units of their own. What motions make of them changes no value.
+        // Scale the columns to one size, since their units differ. Their overlap with the motions changes no value.
         let sizes: Vec<f64> = chosen.iter().map(|column| rms(column)).collect();
         let of = unseen.columns.len();
         let scale = (n as f64).sqrt();
@@ -411,7 +424,7 @@ impl Columns {
         Ok(found)
     }
 
-    /// Returns in words what a candidate cannot be told apart from.
+    /// Returns the names of the effects that a candidate is not separable from.
     fn alike(&self, k: usize, options: &ParameterOptions) -> Vec<String> {
         let before = self.candidates.iter().enumerate().filter(|(j, _)| *j != k).map(|(_, c)| (c.kind, &c.values));
         let others = self.motions.iter().chain(&self.slides).map(|c| (c.kind.to_owned(), &c.values));
@@ -426,7 +439,7 @@ impl Columns {
 }
 
 impl Fitted {
-    /// Returns what was found of each parameter, without its message and what it removes.
+    /// Returns the estimate of each parameter, without its message and `removes_rms_mm`.
     fn parameters(&self, alike: Vec<Vec<String>>, own_shares: &[f64], options: &ParameterOptions) -> Vec<Parameter> {
         let parameter = |(k, alike): (usize, Vec<String>)| {
             let is_told = alike.is_empty();
@@ -458,7 +471,7 @@ impl Fitted {
         found
     }
 
-    /// Returns what is expected of some of them, given the variance that is stated of each: T (T + S)^-1 b.
+    /// Returns the expectation of the chosen parameters, given the stated variance of each: T (T + S)^-1 b.
     fn expected(&self, chosen: &[(usize, f64)]) -> DVector<f64> {
         let at = |k: usize| self.slides + chosen[k].0;
         let n = chosen.len();
@@ -468,11 +481,11 @@ impl Fitted {
         solved.map_or_else(|| DVector::zeros(n), |solved| DVector::from_fn(n, |k, _| chosen[k].1 * solved[k]))
     }
 
-    /// Returns what is expected of all of them together: of a parameter with a tolerance by that, of what nobody states anything of by how strong all of
-    /// these are, which their values tell.
+    /// Returns the expectation of all slides and parameters together. The prior of a parameter with a tolerance is
+    /// this tolerance. The others share one prior strength, which their values determine.
     ///
-    /// Equation: T (T + S)^-1 b, the mean over strengths from next to nothing up to all that is seen, each as likely as it makes b (empirical Bayes,
-    /// Morris 1983).
+    /// Equation: T (T + S)^-1 b, as the mean over strengths from a small share up to all of the rms, each weighted by
+    /// its likelihood of b (empirical Bayes, Morris 1983).
     fn believed(&self, options: &ParameterOptions) -> DVector<f64> {
         let chosen: Vec<usize> = (0..self.values.len()).filter(|&k| self.covariance[(k, k)] > 0.0).collect();
         let told = DVector::from_fn(chosen.len(), |k, _| self.values[chosen[k]]);
@@ -509,7 +522,7 @@ impl Fitted {
 fn own_share(column: &[f64], others: &Basis) -> f64 {
     let own = others.without(column);
     let size = dot(column, column);
-    // A level surface shows nothing of the wheel's radius but rounding.
+    // On a level surface the effect of the wheel's radius is only rounding.
     if size > NOTHING * column.len() as f64 { (dot(&own, &own) / size).sqrt() } else { 0.0 }
 }
 
@@ -517,7 +530,8 @@ fn own_share(column: &[f64], others: &Basis) -> f64 {
 mod tests {
     use super::*;
 
-    /// A slide of 2 mm rms a unit, a radius of 1 mm and a setting that was not fitted, each known to 1 um.
+    /// Fit with a slide of 2 mm rms per unit and a radius of 1 mm rms per unit, each with a standard uncertainty of
+    /// 1 um, and a setting that was not fitted.
     fn fitted(values_um: [f64; 2]) -> Fitted {
         let [slide, radius] = values_um.map(|value| 1e-3 * value);
         Fitted {
@@ -538,15 +552,17 @@ mod tests {
             assert_eq!(of[2], 0.0, "what was not fitted");
             [1e3 * of[0], 1e3 * of[1]]
         };
-        // A tolerance of 2 um expands a standard uncertainty of 1 um, as large as that of what was told: half of it, however much.
+        // A tolerance of 2 um is a standard uncertainty of 1 um, equal to that of the value: half of any value
+        // remains.
         for radius_um in [0.0, 3.0, -40.0] {
             let [slide, radius] = believed([0.0, radius_um]);
             assert!((radius - 0.5 * radius_um).abs() < 1e-12 && slide == 0.0, "{slide} {radius}");
         }
-        // Of a slide nobody states anything: far above its uncertainty it is believed, within it less than two thirds.
+        // A slide has no tolerance: far above its uncertainty all of it remains, within its uncertainty less than two
+        // thirds.
         assert!((believed([100.0, 0.0])[0] - 100.0).abs() < 0.1, "{:?}", believed([100.0, 0.0]));
         assert!(believed([0.5, 0.0])[0].abs() < 0.33, "{:?}", believed([0.5, 0.0]));
-        // The same by the other sign, and in another unit.
+        // The same with the other sign, and in another unit.
         assert_eq!(believed([-0.5, 1.0])[0], -believed([0.5, -1.0])[0]);
     }
 }

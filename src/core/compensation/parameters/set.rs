@@ -1,4 +1,4 @@
-//! What of the deviations is taken back by parameters, as the next pass is told it, and what of it the map sees.
+//! Parameter corrections of the next pass, and their effect on the map.
 
 use nalgebra::{Matrix6, Vector6};
 use serde::{Deserialize, Serialize};
@@ -8,10 +8,10 @@ use super::{Contact, Fitted, LEAST_NZ, ParameterKind, ParameterOptions, WheelTer
 use crate::compensation::path::{Field, Jet};
 use crate::geometry::{Grid, Point, Vector};
 
-/// A direction of the motions whose size is less than this share of the largest is none.
+/// Minimum eigenvalue of a direction of the motions, as a share of the largest; a direction with less is ignored.
 const NO_DIRECTION: f64 = 1e-9;
 
-/// What parameters and slides make of the deviations together, as a function of the place.
+/// Part of the deviations that parameters and slides explain together, as a function of the place.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Smooth {
     extent: Extent,
@@ -38,16 +38,18 @@ impl Smooth {
         slides.sum::<f64>() + parameters.map(|(kind, value)| value * kind.effect(contact, self.term)).sum::<f64>()
     }
 
-    /// Returns what they make of the deviation at a contact, as far as it is believed, in millimetres; what a motion of the part makes is taken out.
+    /// Returns the part of the deviation at a contact that parameters and slides explain, after shrinkage and without
+    /// the motion of the part that it contains, in millimetres.
     pub fn at(&self, contact: &Contact) -> f64 {
         self.with_motion(contact) - self.motion.at(contact)
     }
 }
 
-/// Tells what of values at the nodes of a correction parameters and slides make: by the places where the part was measured; nothing where that
-/// cannot be told.
+/// Returns the part of values at the nodes of a correction that parameters and slides explain, estimated at the
+/// places where the part was measured; 0 everywhere if it cannot be estimated.
 ///
-/// Shapes: `values_mm` at the nodes of `grid`, `nodes` the places of the surface under them; returned at the same nodes.
+/// Shapes: `values_mm` at the nodes of `grid`; `contacts` where the part was measured; `nodes` the places of the
+/// surface under the nodes. The result is at the same nodes.
 pub fn smooth_of(
     values_mm: &[f64],
     grid: &Grid,
@@ -59,7 +61,7 @@ pub fn smooth_of(
     told.map_or_else(|_| vec![0.0; nodes.len()], |told| nodes.iter().map(|node| told.smooth.at(node)).collect())
 }
 
-/// The motion of the part that registration makes of something.
+/// Motion of the part that registration fits to a change of the surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Motion([f64; 6]);
 
@@ -68,7 +70,7 @@ impl Motion {
         let row = |c: &Contact| Vector6::from_fn(|k, _| if free[k] { of_motion(c, k) } else { 0.0 });
         let gram: Matrix6<f64> = contacts.iter().map(|c| row(c) * row(c).transpose()).sum();
         let towards: Vector6<f64> = contacts.iter().map(|c| row(c) * of(c)).sum();
-        // Turns and shifts have units of their own.
+        // Turns and shifts have different units, so each is scaled to size 1.
         let sizes = gram.diagonal().map(|v| if v > 0.0 { v.sqrt().recip() } else { 0.0 });
         let parts = Matrix6::from_fn(|r, c| gram[(r, c)] * sizes[r] * sizes[c]).symmetric_eigen();
         let towards = towards.component_mul(&sizes);
@@ -87,26 +89,31 @@ impl Motion {
     }
 }
 
-/// Parameters as a pass is told them: absolute, they replace those of the pass before.
+/// Parameter corrections of a pass. They are absolute: they replace those of the pass before.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Set {
-    /// How far each is off what the recipe states, in its unit, in the order of [`ParameterKind::ALL`].
+    /// Difference of each parameter from the value stated in the recipe, in its unit, in the order of
+    /// [`ParameterKind::ALL`].
     pub values: [f64; ParameterKind::COUNT],
-    /// The first pass that is ground with them.
+    /// Number of the first pass that is ground with them.
     pub since_cycle: u16,
-    /// By how much the surface is displaced along its normal at every node of the correction by telling them, in millimetres.
+    /// Displacement of the surface along its normal by these corrections, at every node of the correction, in
+    /// millimetres.
     pub displaced_mm: Vec<f64>,
-    /// What of that setting and tilt make: a grinder has a word for the radius of its wheel, and for these none but its map.
+    /// Part of `displaced_mm` by setting and tilt: a grinder has an input for its wheel radius, but applies these
+    /// only by its map.
     pub setting_mm: Vec<f64>,
-    /// What of all of it is left once the part is registered anew: what a map would have to do in their place.
+    /// Part of `displaced_mm` that remains after registration: a map without these corrections would have to contain
+    /// it.
     pub seen_mm: Vec<f64>,
 }
 
 impl Set {
-    /// The set that takes parameters back by these values, from the next pass on; `None` of nothing.
+    /// Returns the corrections that compensate these values from the pass `since_cycle` on; `None` if all values are
+    /// 0.
     ///
-    /// Shapes: `contacts` where the part was measured, `nodes` the places of the surface under the nodes of the correction. Units: millimetres,
-    /// radians.
+    /// Shapes: `contacts` where the part was measured, `nodes` the places of the surface under the nodes of the
+    /// correction. Units: millimetres, radians.
     pub fn of(
         values: [f64; ParameterKind::COUNT],
         since_cycle: u16,
@@ -127,12 +134,12 @@ impl Set {
         Some(Self { values, since_cycle, displaced_mm, setting_mm, seen_mm })
     }
 
-    /// Returns by how much a parameter is off what the recipe states.
+    /// Returns the difference of a parameter from the value stated in the recipe.
     pub fn value(&self, kind: ParameterKind) -> f64 {
         ParameterKind::ALL.iter().position(|of| *of == kind).map_or(0.0, |k| self.values[k])
     }
 
-    /// Whether every number is one that can be, for so many nodes.
+    /// Returns true if every number is finite and each vector has one value per node.
     pub fn is_sound(&self, nodes: usize) -> bool {
         let each = [&self.displaced_mm, &self.setting_mm, &self.seen_mm];
         self.values.iter().all(|v| v.is_finite())
@@ -141,7 +148,7 @@ impl Set {
 }
 
 impl Contact {
-    /// The places of a surface under the nodes of a grid; beyond where the surface is known, the nearest of those that are.
+    /// Returns the places of a surface under the nodes of a grid; outside the known surface, the nearest known place.
     pub fn under(surface: &Field, grid: &Grid) -> Vec<Self> {
         let at = |k: usize| {
             let [x, y] = grid.place_mm(k);

@@ -1,16 +1,16 @@
-//! What is said of parameters, in the words of a process engineer.
+//! Texts about parameters for process engineers.
 
 use nalgebra::{DMatrix, DVector};
 
 use super::columns::dot;
 use super::{EXPANDED, NOTHING, Parameter, ParameterKind, ParameterOptions};
 
-/// Another column is named where it makes up so much of one that cannot be told apart.
+/// Minimum share, relative to the largest, with which another column is named as a cause of an inseparable one.
 const NAMED: f64 = 0.2;
 pub(super) const NO_DATUM: &str =
     "how well the datum holds the part, which nobody states (registration.hold_uncertainty_um)";
 
-/// What a parameter is called.
+/// Returns the name of a parameter, for people.
 pub fn name(kind: ParameterKind) -> &'static str {
     match kind {
         ParameterKind::WheelRadius => "wheel radius",
@@ -24,22 +24,22 @@ pub fn name(kind: ParameterKind) -> &'static str {
 }
 
 impl ParameterKind {
-    /// What it is called, for people.
+    /// Returns the name of the parameter, for people.
     pub fn name(self) -> &'static str {
         name(self)
     }
 
-    /// The unit that it is told in, for people: a millionth of that of its value, or a thousandth of a millimetre.
+    /// Returns the unit of messages, for people: "urad" for an angle, "um" for a length.
     pub fn unit(self) -> &'static str {
         if self.is_angle() { "urad" } else { "um" }
     }
 
-    /// So many of its units are one of its value.
+    /// Returns the number of these units in one unit of the parameter's value (radian or millimetre).
     pub fn units(self) -> f64 {
         if self.is_angle() { 1e6 } else { 1e3 }
     }
 
-    /// The key of a recipe that takes it back; none where it is never taken.
+    /// Returns the recipe key by which the parameter is compensated; `None` if it never is.
     pub fn key(self) -> Option<&'static str> {
         match self {
             Self::WheelRadius => Some("wheel_radius_um"),
@@ -53,14 +53,15 @@ impl ParameterKind {
     }
 }
 
-/// Returns what makes up most of a column, by name.
+/// Returns the names of the columns that make up most of a column.
 pub(super) fn alike(target: &[f64], others: &[(String, &Vec<f64>)]) -> Vec<String> {
     let size = dot(target, target).sqrt();
     if size * size <= NOTHING * target.len() as f64 {
         return vec!["nothing at all, for it has no effect on a level surface".to_owned()];
     }
     let others: Vec<_> = others.iter().filter(|(_, c)| dot(c, c) > NOTHING * c.len() as f64).collect();
-    // Unit columns; the least-squares solution of least size shares out what several could make alike.
+    // Unit columns; the least-squares solution of minimum norm divides the share between columns with the same
+    // effect.
     let sizes: Vec<f64> = others.iter().map(|(_, c)| dot(c, c).sqrt()).collect();
     let count = others.len();
     let gram = DMatrix::from_fn(count, count, |r, c| dot(others[r].1, others[c].1) / (sizes[r] * sizes[c]));

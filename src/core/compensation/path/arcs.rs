@@ -1,11 +1,13 @@
-//! Arcs in place of straight lines: from each point of a track on, the longest arc that is within a tolerance of the path.
+//! Arcs in place of straight lines. From each point of a track, the longest arc within a tolerance of the path
+//! replaces the lines.
 //!
 //! ```text
 //!  Moves --middle of each step--> window of points --longest--> Arc, or the lines as they were
 //! ```
 //!
-//! An arc runs in a plane of two axes, and the third may move along evenly with its angle. It is judged as it will be written: both ends and the
-//! centre in whole steps of the last digit, between them the path's own points and the middle of every step between those.
+//! An arc lies in a plane of two axes; the third axis may move in proportion to the angle (helix). The deviation is
+//! computed for the arc as written: both ends and the centre are rounded to the last digit. It is evaluated at the
+//! points of the path and at the middle of every step between them.
 
 use std::collections::VecDeque;
 
@@ -14,64 +16,67 @@ use rayon::prelude::*;
 use super::{Move, Moves, ToolPath};
 use crate::geometry::{Point, Vector};
 
-/// Points that one arc is looked for among.
+/// Maximum number of points that one arc can replace.
 const WINDOW: usize = 1024;
-/// Largest half chord as a share of the centre's distance from it: a quarter of a turn, so that no control can take the longer way round.
+/// Maximum ratio of the half chord to the distance of the centre from the chord. At 1 the arc is a quarter of a turn,
+/// so that no control can take the longer way round.
 const WIDEST: f64 = 1.0;
-/// Largest way of the third axis as a share of the chord. Some controls have the feed in the plane, some along the whole way: 0.5 % apart at most.
+/// Maximum travel of the third axis, as a share of the chord. Some controls apply the feed in the plane, others along
+/// the helix. With this limit the two differ by 0.5 % at most.
 const STEEPEST: f64 = 0.1;
 
-/// The plane of arcs: its first and second axis, and the one across; turning from the first to the second is counter-clockwise.
+/// Plane of an arc: indices of its first axis, its second axis, and the axis across. A turn from the first to the
+/// second is counter-clockwise.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Plane(pub [usize; 3]);
 
 impl Plane {
-    /// Of x and y.
+    /// Plane of x and y.
     pub const XY: Self = Self([0, 1, 2]);
-    /// Of z and x.
+    /// Plane of z and x.
     pub const ZX: Self = Self([2, 0, 1]);
-    /// Of y and z.
+    /// Plane of y and z.
     pub const YZ: Self = Self([1, 2, 0]);
 }
 
-/// What arcs must keep to.
+/// Tolerances and limits of arcs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ArcOptions {
-    /// How far they may be from the path of the wheel's centre, in millimetres.
+    /// Maximum deviation of an arc from the path of the wheel's centre, in millimetres.
     pub within_mm: f64,
-    /// Steps of the last digit that is written in a millimetre.
+    /// Number of steps of the last written digit in a millimetre.
     pub per_mm: f64,
-    /// How much the radius at the end may differ from that at the beginning, in millimetres.
+    /// Maximum difference between the radius at the end and at the start, in millimetres.
     pub radius_error_mm: f64,
-    /// Largest coordinate of a centre, and its largest distance from the beginning, in millimetres.
+    /// Maximum coordinate of a centre, and maximum offset of a centre from the start along an axis, in millimetres.
     pub largest_mm: f64,
-    /// Whether the third axis may move along.
+    /// True if the third axis may move during an arc.
     pub helix: bool,
-    /// An arc stands for so many lines at least.
+    /// Minimum number of lines that an arc must replace.
     pub least_lines: usize,
 }
 
-/// An arc at a feed, from where the move before it ended.
+/// Arc at a feed, from the end of the previous move.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Arc {
-    /// The plane that it turns in.
+    /// Plane of the arc.
     pub plane: Plane,
-    /// Whether it turns from the second axis of the plane to the first.
+    /// True if the arc turns from the second axis of the plane to the first.
     pub clockwise: bool,
-    /// Where to, in millimetres, in the model frame.
+    /// End point, in millimetres, in the model frame.
     pub to: Point,
-    /// The centre along the two axes of the plane, in whole steps.
+    /// Centre along the two axes of the plane, in millimetres, rounded to whole steps of the last digit.
     pub centre_mm: [f64; 2],
-    /// How fast.
+    /// Feed of the wheel's centre.
     pub feed_mm_min: f64,
-    /// How far it is from the path of the wheel's centre at most.
+    /// Upper bound of the deviation from the path of the wheel's centre, in millimetres.
     pub deviation_mm: f64,
 }
 
-/// What a program says in one block, or in two that belong together.
+/// Content of one program block, or of two blocks that belong together.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Block {
-    /// A move along a line.
+    /// Straight move.
     Straight(Move),
     /// An arc.
     Arc(Arc),
@@ -83,30 +88,33 @@ impl From<Move> for Block {
     }
 }
 
-/// A path in arcs, beside the same path in lines.
+/// Comparison of a path in arcs with the same path in lines.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ArcSummary {
-    /// Moves, arcs and rapid ones included.
+    /// Number of moves, including arcs and rapid moves.
     pub moves: u64,
-    /// Arcs.
+    /// Number of arcs.
     pub arcs: u64,
-    /// Lines at feed that are left.
+    /// Number of remaining lines at feed.
     pub lines: u64,
-    /// How far an arc is from the path of the wheel's centre at most, in millimetres.
+    /// Largest deviation of an arc from the path of the wheel's centre, in millimetres.
     pub deviation_mm: f64,
-    /// Largest angle between the end of one move at feed and the beginning of the next: in arcs, and in lines.
+    /// Largest angle between the end direction of one move at feed and the start direction of the next, in rad: for
+    /// the path in arcs, then for the path in lines.
     pub corner_rad: [f64; 2],
 }
 
 impl ToolPath {
-    /// Returns the moves of the wheel's centre track by track, in arcs where points can be put together.
+    /// Returns the moves of the wheel's centre track by track. Arcs replace lines where a fit within the tolerance
+    /// exists.
     ///
     /// Frame: model. Units: mm, mm/min.
     pub fn arcs_by_track(&self, options: &ArcOptions) -> Vec<Arcs<Sampled<'_>>> {
         self.moves_by_track().into_iter().map(|moves| Arcs::new(Sampled(moves), options)).collect()
     }
 
-    /// Puts the whole path into arcs once, all tracks at the same time, and counts what comes of it.
+    /// Converts the whole path into arcs, with all tracks in parallel, and returns the counts, the largest deviation
+    /// and the largest corners.
     pub fn arc_summary(&self, options: &ArcOptions) -> ArcSummary {
         let one = |k: usize| {
             let mut one = ArcSummary::default();
@@ -144,7 +152,7 @@ impl ArcSummary {
     }
 }
 
-/// The moves of a path, each with the middle of its step; one that has none stays a line.
+/// Iterator over the moves of a path, each with the middle of its step. A move without a middle stays a line.
 #[derive(Clone, Debug)]
 pub struct Sampled<'a>(Moves<'a>);
 
@@ -157,7 +165,7 @@ impl Iterator for Sampled<'_> {
     }
 }
 
-/// A point of the path, the middle of the step that led to it, and the feed.
+/// Point of the path, middle of the step to it, and feed.
 #[derive(Clone, Copy, Debug)]
 struct Sample {
     middle: Point,
@@ -165,17 +173,17 @@ struct Sample {
     feed_mm_min: f64,
 }
 
-/// The moves of a path, in arcs where points can be put together.
+/// Iterator over the blocks of a path: arcs where a fit within the tolerance exists, straight moves otherwise.
 #[derive(Clone, Debug)]
 pub struct Arcs<S> {
     source: S,
     options: ArcOptions,
-    /// Where the last block ended.
+    /// End point of the last block.
     from: Point,
     window: VecDeque<Sample>,
-    /// So many points of the window stay lines.
+    /// Number of points at the front of the window that stay lines.
     lines: usize,
-    /// What comes after the window.
+    /// Move after the window that cannot be part of an arc.
     after: Option<Move>,
 }
 
@@ -197,7 +205,8 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> Arcs<S> {
         }
     }
 
-    /// The longest arc from here on with how many points it takes; none, with how many points stay lines.
+    /// Returns the longest arc from the current point and the number of points that it replaces, or `None` and the
+    /// number of points that stay lines. The search doubles the number of points, then bisects.
     fn longest(&mut self) -> (usize, Option<Arc>) {
         let least = self.options.least_lines.max(2);
         let from = self.from;
@@ -262,17 +271,17 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> Iterator for Arcs<S> {
     }
 }
 
-/// What some points in a row are.
+/// Result of a fit to successive points.
 enum Fit {
     /// An arc.
     Arc(Arc),
-    /// As good as straight.
+    /// A straight line within the tolerance.
     Straight,
-    /// Neither.
+    /// Neither an arc nor a line within the tolerance.
     Not,
 }
 
-/// Lays an arc from a point through some others, of which the last is its end.
+/// Fits an arc from a point through the samples. The last sample is its end.
 fn fit(from: Point, samples: &[Sample], options: &ArcOptions) -> Fit {
     let Some(frame) = Chord::of(from, samples, options) else { return Fit::Not };
     let Some([low, high]) = frame.bends(samples, options.within_mm) else { return Fit::Not };
@@ -285,11 +294,11 @@ fn fit(from: Point, samples: &[Sample], options: &ArcOptions) -> Fit {
     }
 }
 
-/// The chord of an arc, both ends as they are written.
+/// Chord of an arc, with both ends rounded as they are written.
 struct Chord {
     plane: Plane,
     ends: [Point; 2],
-    /// In the plane: the middle, the direction from the first end to the second, half of the length.
+    /// Middle of the chord, unit direction from the first end to the second, and half of its length, all in the plane.
     middle: [f64; 2],
     along: [f64; 2],
     half: f64,
@@ -299,7 +308,7 @@ impl Chord {
     fn of(from: Point, samples: &[Sample], options: &ArcOptions) -> Option<Self> {
         let last = samples.last()?.at;
         let ends = [from, last].map(|p| p.map(|v| written(v, options)));
-        // The plane is the one that the points turn in most: half-way they are farthest from their chord.
+        // Choose the plane in which the points turn most: half-way they are farthest from their chord.
         let turn: Vector = (samples[(samples.len() - 1) / 2].at - ends[0]).cross(&(ends[1] - ends[0]));
         let plane = [Plane::XY, Plane::ZX, Plane::YZ].into_iter().max_by(|p, q| {
             let share = |plane: &Plane| turn[plane.0[2]].abs();
@@ -316,7 +325,8 @@ impl Chord {
         Some(Self { plane, ends, middle, along: [by[a] / length, by[b] / length], half: 0.5 * length })
     }
 
-    /// A point along the chord and to the left of it, from its middle.
+    /// Returns the coordinates of a point relative to the middle of the chord: along the chord, then to its left, in
+    /// mm.
     fn beside(&self, p: &Point) -> [f64; 2] {
         let [a, b, _] = self.plane.0;
         let [x, y] = [p[a] - self.middle[0], p[b] - self.middle[1]];
@@ -324,10 +334,13 @@ impl Chord {
         [x * s + y * t, y * s - x * t]
     }
 
-    /// The bends of arcs over the chord that are near enough to all points: 1 / t for a centre t to the left of the chord.
+    /// Returns the interval of the values 1 / t for which an arc over the chord is close enough to all points, or
+    /// `None` if it is empty. The centre of the arc is at a distance t to the left of the chord.
     ///
-    /// A point (u, v) is off the circle about (0, t) through (+-h, 0) by d where u^2 + v^2 - h^2 - 2 v t = 2 d (t^2 + h^2)^(1/2) + d^2;
-    /// multiplied by 1 / t that is linear in it, but for a factor (1 + h^2 / t^2)^(1/2) of d, which only allows more.
+    /// A point (u, v) is at a signed distance d from the circle about (0, t) through (+-h, 0) if
+    /// u^2 + v^2 - h^2 - 2 v t = 2 d (t^2 + h^2)^(1/2) + d^2.
+    /// Multiplied by 1 / t, this is linear in 1 / t except for d^2 and the factor (1 + h^2 / t^2)^(1/2) of d.
+    /// The bounds omit both. The factor is at least 1 and would only make the interval wider.
     fn bends(&self, samples: &[Sample], within_mm: f64) -> Option<[f64; 2]> {
         let widest = WIDEST / self.half;
         let [mut low, mut high] = [-widest, widest];
@@ -338,7 +351,7 @@ impl Chord {
                 continue;
             }
             let [p, q] = [(2.0 * (v - within_mm)) / w, (2.0 * (v + within_mm)) / w];
-            // Points near the ends tell little: all of these hold where w is small enough.
+            // Points near the ends constrain little: if w is small, the interval is wide.
             (low, high) = (low.max(p.min(q)), high.min(p.max(q)));
             if low > high {
                 return None;
@@ -347,7 +360,7 @@ impl Chord {
         Some([low, high])
     }
 
-    /// Whether the third axis moves evenly along the chord.
+    /// Returns true if the third axis moves in proportion to the position along the chord, within the tolerance.
     fn is_level(&self, samples: &[Sample], within_mm: f64) -> bool {
         let c = self.plane.0[2];
         let [first, last] = [self.ends[0][c], self.ends[1][c]];
@@ -357,7 +370,9 @@ impl Chord {
         })
     }
 
-    /// The arc of a curvature as it is written, and how far it is from the points and what is between them.
+    /// Returns the arc with the given value of 1 / t, rounded as it is written, with an upper bound of its deviation
+    /// from the path. Returns `None` if the centre is too far away, the radius error is too large, or a point is not
+    /// between the ends.
     fn arc(&self, from: Point, samples: &[Sample], bend: f64, options: &ArcOptions) -> Option<Arc> {
         let [s, t] = self.along;
         let centre_mm = [self.middle[0] - t / bend, self.middle[1] + s / bend].map(|v| written(v, options));
@@ -373,23 +388,23 @@ impl Chord {
         for sample in samples {
             let (half_way, now) = (circle.off(&sample.middle)?, circle.off(&sample.at)?);
             most = most.max(size(half_way)).max(size(now));
-            // Between a point and the middle the difference bends a quarter as much as between two points.
+            // The deviation curves a quarter as much between a point and the middle as between two points.
             let bend = [0, 1].map(|k| half_way[k] - 0.5 * (last[k] + now[k]));
             between = between.max(0.25 * size(bend));
             last = now;
         }
-        // Controls differ in where they leave a difference of the radii.
+        // Controls differ in where along the arc they put the difference between the radii.
         let deviation_mm = most + between + circle.radius_error().abs();
         let Sample { at: to, feed_mm_min, .. } = *samples.last()?;
         Some(Arc { plane: self.plane, clockwise: bend < 0.0, to, centre_mm, feed_mm_min, deviation_mm })
     }
 }
 
-/// The circle of an arc as a control goes along it: radius and third axis change evenly with the angle.
+/// Circle of an arc as a control executes it: radius and third axis change in proportion to the angle.
 struct Circle {
     plane: Plane,
     centre_mm: [f64; 2],
-    /// From the centre to the beginning, the radii at both ends, the sweep, and the third axis at both ends.
+    /// Vector from the centre to the start, radii at both ends, sweep in rad, and third axis at both ends.
     arm: [f64; 2],
     radii: [f64; 2],
     sweep: f64,
@@ -411,12 +426,13 @@ impl Circle {
         self.radii[1] - self.radii[0]
     }
 
-    /// How far a point is off, along the radius and across the plane; none where it is not between the ends.
+    /// Returns the deviation of a point along the radius and across the plane, in mm, or `None` if the point is not
+    /// between the ends.
     fn off(&self, p: &Point) -> Option<[f64; 2]> {
         let [a, b, c] = self.plane.0;
         let arm = [p[a] - self.centre_mm[0], p[b] - self.centre_mm[1]];
         let share = angle(self.arm, arm) / self.sweep;
-        // Rounding moves an end by a step.
+        // Rounding can move an end by one step.
         let beyond = 0.01;
         if !(-beyond..=1.0 + beyond).contains(&share) {
             return None;
@@ -427,7 +443,7 @@ impl Circle {
     }
 }
 
-/// The angle from one arm to another, counter-clockwise.
+/// Returns the signed angle from one arm to another, in rad, positive counter-clockwise.
 fn angle([x, y]: [f64; 2], [u, v]: [f64; 2]) -> f64 {
     (x * v - y * u).atan2(x * u + y * v)
 }
@@ -436,12 +452,13 @@ fn size([x, y]: [f64; 2]) -> f64 {
     x.hypot(y)
 }
 
-/// A coordinate as it will be written.
+/// Returns a coordinate rounded as it is written.
 fn written(value_mm: f64, options: &ArcOptions) -> f64 {
     (value_mm * options.per_mm).round() / options.per_mm
 }
 
-/// Tells every block with the angle between its beginning and the end of the one before; 0 where the wheel comes down or travels.
+/// Calls `tell` for every block with the angle between its start direction and the end direction of the previous
+/// block, in rad. The angle is 0 for rapid moves and for the first moves at feed of a track.
 fn corners(blocks: impl Iterator<Item = Block>, mut tell: impl FnMut(&Block, f64)) {
     let (mut from, mut heading): (Option<Point>, Option<Vector>) = (None, None);
     for block in blocks {
@@ -457,7 +474,7 @@ fn corners(blocks: impl Iterator<Item = Block>, mut tell: impl FnMut(&Block, f64
 }
 
 impl Arc {
-    /// The directions in which it begins and ends, of any length.
+    /// Returns the tangent directions at the start and at the end, not normalized.
     fn directions(&self, from: Point) -> [Vector; 2] {
         let [a, b, c] = self.plane.0;
         let turn = if self.clockwise { -1.0 } else { 1.0 };
@@ -488,7 +505,7 @@ mod tests {
         least_lines: 2,
     };
 
-    /// A track along a curve over a parameter from 0 to 1, in equal steps.
+    /// Returns a track along a curve over a parameter from 0 to 1, in equal steps.
     fn track(curve: impl Fn(f64) -> Point, steps: usize) -> impl Iterator<Item = (Move, Option<Point>)> {
         fed(curve, steps, |_| 600.0)
     }
@@ -511,7 +528,7 @@ mod tests {
         blocks.iter().filter_map(|block| if let Block::Arc(arc) = block { Some(*arc) } else { None }).collect()
     }
 
-    /// A quarter of a circle of 40 mm about (3, 7, -5) from +z towards +x, while y rises.
+    /// Returns an arc of 0.4 rad with a radius of 40 mm about (3, 7, -5), from +z towards +x, while y rises by `y_mm`.
     fn quarter(y_mm: f64) -> impl Fn(f64) -> Point + Copy {
         move |t: f64| {
             let (s, c) = (0.4 * t).sin_cos();
@@ -526,9 +543,9 @@ mod tests {
             assert!(matches!(blocks[..2], [Block::Straight(Move::RapidZ(9.0)), Block::Straight(Move::Feed { .. })]));
             assert!(matches!(blocks[3..], [Block::Straight(Move::RapidZ(10.0))]), "{blocks:?}");
             let Block::Arc(arc) = blocks[2] else { panic!("{blocks:?}") };
-            // From z towards x is counter-clockwise in the plane of z and x.
+            // A turn from z towards x is counter-clockwise in the plane of z and x.
             assert!(arc.plane == Plane::ZX && !arc.clockwise && arc.to == quarter(y_mm)(1.0));
-            // A sagitta of 0.8 mm tells the radius 25 times less well than its own middle.
+            // With a sagitta of 0.8 mm the radius is 25 times less certain than the middle of the arc.
             assert!((arc.centre_mm[0] + 5.0).abs() < 0.01 && (arc.centre_mm[1] - 3.0).abs() < 0.01, "{arc:?}");
             assert!(arc.deviation_mm < 1e-4);
             let flat = ArcOptions { helix: false, ..OPTIONS };
@@ -552,7 +569,7 @@ mod tests {
     fn straight_runs_short_runs_and_points_that_stand_still_stay_lines() {
         let straight = |t: f64| Point::new(80.0 * t, 1.0, 0.2 - 3.0 * t);
         let still = |_: f64| Point::new(1.0, 1.0, 0.0);
-        // One step, and a jump to and fro.
+        // A track of one step, and jumps to and fro.
         let jump = |t: f64| Point::new((40.0 * t).fract(), 0.0, (97.0 * t).fract());
         let all: [(Vec<_>, usize); 4] = [
             (track(straight, 500).collect(), 500),
@@ -573,7 +590,7 @@ mod tests {
         let arcs = arcs_of(&Arcs::new(fed(quarter(0.0), 300, slower), &OPTIONS).collect::<Vec<_>>());
         assert_eq!(arcs.iter().map(|a| a.feed_mm_min).collect::<Vec<_>>(), [600.0, 300.0]);
         assert_eq!(arcs[0].to, quarter(0.0)(0.4));
-        // A line that goes on into a circle: the line stays one but for its last points.
+        // A line that continues into a circle: the line stays a line except for its last points.
         let joined = |t: f64| {
             let (s, c) = (t.max(0.0)).sin_cos();
             if t < 0.0 { Point::new(20.0 * t, 0.0, 20.0) } else { Point::new(20.0 * s, 0.0, 20.0 * c) }
@@ -583,7 +600,7 @@ mod tests {
         assert!(arcs.len() <= 2 && blocks.len() > 95 && blocks.len() < 110, "{} {}", arcs.len(), blocks.len());
     }
 
-    /// Where a control is along an arc at a share of its angle.
+    /// Returns the position of a control on an arc after a share of its angle.
     fn along(arc: &Arc, from: Point, share: f64) -> Point {
         let [a, b, c] = arc.plane.0;
         let [i, j] = arc.centre_mm;
@@ -620,7 +637,7 @@ mod tests {
                         assert!(arc.deviation_mm <= 2e-4);
                         for share in 0..=40 {
                             let at = along(&arc, from, f64::from(share) / 40.0);
-                            // The nearest place of the path, which is a little further than the last one.
+                            // The nearest place of the path, a little after the last one.
                             let speed = span.speed_mm(t) * (last - first).signum();
                             for _ in 0..60 {
                                 let [p, q] = [centre(t), centre(t + 1e-4 / speed)];
@@ -628,7 +645,7 @@ mod tests {
                                 t += (at - p).dot(&along) / along.norm_squared() / speed;
                             }
                             let off = (at - centre(t)).norm();
-                            // By rounding of its ends, which the path has none of.
+                            // The tolerance covers the rounding of the ends; the path itself is not rounded.
                             assert!(
                                 off <= arc.deviation_mm + 1.0 / per_mm + 1e-9,
                                 "{off} {arc:?} {t} {span:?} {share}"
@@ -646,7 +663,7 @@ mod tests {
     #[test]
     fn a_path_in_arcs_is_much_shorter_and_its_summary_counts_it() {
         for pattern in [Pattern::Raster, Pattern::Spiral] {
-            // A spiral rises evenly on what is round about its middle.
+            // On a surface that is rotationally symmetric about its middle a spiral rises evenly.
             let path = path(quadric(0.01, 0.01), PathOptions { pattern, ..ball(8.0) }).unwrap();
             let plain = path.summary().unwrap();
             let summary = path.arc_summary(&OPTIONS);

@@ -1,8 +1,9 @@
-//! A correction as controllers take it that compensate by a table: an offset of Z over the places of X and Y.
+//! Correction for controllers that compensate by a table: an offset of Z over the axis positions X and Y.
 //!
-//! Such tables (sag or straightness compensation over two axes, a levelling mesh) know where the axes are, not where the wheel touches. So
-//! the table holds, for the wheel's centre at X and Y, how much higher it must be for the corrected surface than for the one without a
-//! correction; the slope of the surface and the radius of the wheel are in it. It is exact at the nodes.
+//! A table of this kind (sag or straightness compensation over two axes, a levelling mesh) depends on the axis
+//! positions, not on the contact point of the wheel. Each entry is therefore the height of the wheel's centre over the
+//! corrected surface minus its height over the uncorrected surface, at the same X and Y of the centre. This includes
+//! the slope of the surface and the radius of the wheel. The table is exact at its nodes.
 
 use rayon::prelude::*;
 
@@ -14,10 +15,11 @@ const STEPS: usize = 40;
 
 /// Returns the offset of Z at every node of a grid over the axes X and Y, in millimetres; positive leaves material.
 ///
-/// A node where the wheel would touch far from the part, whose continued surface it need not fit, has the offset of the nearest other one.
+/// At some nodes the wheel would touch the extrapolated surface far from the part, and it need not fit there. If the
+/// wheel cannot touch at a node, the node takes the offset of the nearest node with a solution.
 ///
 /// # Errors
-/// A place that the wheel cannot touch, where that is so at every node.
+/// Returns [`PathError::CannotTouch`] if the wheel cannot touch the surface at any node.
 pub fn axis_offsets(before: &Wanted, after: &Wanted, wheel: &Wheel, grid: &Grid) -> Result<Vec<f64>, PathError> {
     let one = |node: usize| {
         let axes = grid.place_mm(node);
@@ -32,13 +34,14 @@ pub fn axis_offsets(before: &Wanted, after: &Wanted, wheel: &Wheel, grid: &Grid)
     Ok(nearest_known(grid, &known).into_iter().map(|node| values[node]).collect())
 }
 
-/// The height of the wheel's centre over X and Y: the place that it touches then is searched by Newton's method.
+/// Computes the height z of the wheel's centre at the axis positions X and Y, in mm. Newton's method finds the contact
+/// point.
 fn height_mm(wanted: &Wanted, wheel: &Wheel, axes: [f64; 2]) -> Result<f64, PathError> {
     let refused = |[x_mm, y_mm]: [f64; 2]| PathError::CannotTouch { x_mm, y_mm };
     let centre = |place: [f64; 2]| wheel.centre(&wanted.at(place)).ok_or_else(|| refused(place));
     let off = |at: &Point| [at.x - axes[0], at.y - axes[1]];
     let size = |[x, y]: [f64; 2]| f64::hypot(x, y);
-    // A rim touches far from below its centre.
+    // The contact point of a rim is far from the point below its centre.
     let first = centre(axes)?;
     let mut place = [2.0 * axes[0] - first.x, 2.0 * axes[1] - first.y];
     let mut at = centre(place)?;
@@ -51,7 +54,8 @@ fn height_mm(wanted: &Wanted, wheel: &Wheel, axes: [f64; 2]) -> Result<f64, Path
         let [a, b, c, d] = [east.x - at.x, north.x - at.x, east.y - at.y, north.y - at.y].map(|v| v / H);
         let ([x, y], determinant) = (off(&at), a * d - b * c);
         let step = [(d * x - b * y) / determinant, (a * y - c * x) / determinant];
-        // A step no longer than the wheel, and shorter until it leads nearer: beyond the edge the surface bends otherwise than before it.
+        // Limit the step to the reach of the wheel and halve it until the residual decreases: the curvature of the
+        // surface changes at the edge of the part.
         let mut share = (wheel.reach_mm() / size(step)).min(1.0);
         (place, at) = loop {
             let next = [place[0] - share * step[0], place[1] - share * step[1]];
@@ -86,7 +90,7 @@ mod tests {
             [Wheel::Sphere { radius_mm: 5.0 }, Wheel::Torus { ring_mm: 8.0, tube_mm: 2.0, spindle: Vector::y() }]
         {
             let offsets = axis_offsets(&before, &after, &wheel, &grid).unwrap();
-            // Moved by e along the normal, a plane is higher by e / nz.
+            // A plane that is shifted by e along its normal is higher by e / nz.
             let expected = 0.004 * 1.25f64.sqrt();
             assert!(offsets.iter().all(|dz| (dz - expected).abs() < 1e-9), "{offsets:?}");
         }
@@ -94,7 +98,8 @@ mod tests {
 
     #[test]
     fn where_the_wheel_cannot_touch_the_nearest_offset_holds() {
-        // Flat ground that becomes a slope whose normal is the spindle of a cup: its rim touches the one and not the other.
+        // A flat plane joins a slope whose normal is parallel to the spindle of a cup. The rim can touch the plane,
+        // not the slope.
         let spindle = Vector::new(-0.5, 0.0, 0.75f64.sqrt());
         let wheel = Wheel::Cup { ring_mm: 6.0, tube_mm: 1.0, spindle };
         let facing = 0.5 / 0.75f64.sqrt();

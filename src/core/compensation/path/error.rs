@@ -1,8 +1,9 @@
-//! Why there is no path, or why it must not be sent.
+//! Errors of a tool path.
 
 use thiserror::Error;
 
-/// Why there is no path, or why it must not be sent: what, where, the limit, and what to do.
+/// Reason why no path can be laid, or why a path must not be sent to the machine. Each message gives the value, the
+/// place, the limit and the remedy.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -97,7 +98,8 @@ pub enum PathError {
 }
 
 impl PathError {
-    /// Returns whether only we cannot lay the path: a controller that makes its own from the map may well grind the part.
+    /// Returns true if only our own path planning fails. A controller that makes its own path from the correction map
+    /// may still be able to grind the part.
     pub fn is_ours(&self) -> bool {
         matches!(self, Self::NotAHeight { .. })
     }

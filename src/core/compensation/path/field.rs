@@ -1,17 +1,18 @@
-//! A smooth height over a regular grid: bicubic between the nodes, with the slopes and curvatures of the very same function.
+//! Smooth height over a regular grid: bicubic between the nodes, with the slopes and second derivatives of the same
+//! function.
 //!
-//! Made from values alone it is the tensor product of cubic splines, twice continuously differentiable; made from values and
-//! slopes it is Hermite's bicubic, once continuously differentiable and exact in both at every node. Beyond the border it goes
-//! on along its tangents.
+//! From values alone the field is the tensor product of cubic splines, twice continuously differentiable. From values
+//! and slopes it is Hermite's bicubic, once continuously differentiable and exact in value and slope at every node.
+//! Beyond the border the field continues along its tangents.
 
 use rayon::prelude::*;
 
 use crate::geometry::Grid;
 
-/// A value and its derivatives at a place; lengths in millimetres.
+/// Value and derivatives of a field at a place; lengths in millimetres.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Jet {
-    /// The value.
+    /// Value of the field.
     pub value: f64,
     /// Slopes along x and y.
     pub slope: [f64; 2],
@@ -19,17 +20,18 @@ pub struct Jet {
     pub bend: [f64; 3],
 }
 
-/// A smooth height over a regular grid.
+/// Smooth height over a regular grid.
 #[derive(Clone, Debug)]
 pub struct Field {
     on: Grid,
     per_mm: [f64; 2],
-    /// Value, slopes along the columns and the rows, and twist at every node, lengths along x and y counted in cells.
+    /// Value, slope along x, slope along y, and twist (mixed derivative) at every node. The unit of length along x and
+    /// y is one cell.
     nodes: Vec<[f64; 4]>,
 }
 
 impl Field {
-    /// Lays a spline through values, level across the border.
+    /// Fits a spline through values at the nodes. Its slope across the border is zero.
     pub fn spline(on: Grid, values: &[f64]) -> Self {
         let Grid { columns, rows, .. } = on;
         let mut nodes: Vec<[f64; 4]> = values.iter().map(|v| [*v, 0.0, 0.0, 0.0]).collect();
@@ -47,7 +49,8 @@ impl Field {
         Self::of(on, nodes)
     }
 
-    /// Lays Hermite's bicubic through values and slopes; nodes without a value, which are NaN, continue their neighbours.
+    /// Fits Hermite's bicubic through values and slopes at the nodes. Nodes without a value (NaN) are extrapolated
+    /// from their neighbours.
     pub fn hermite(on: Grid, values: &[f64], slopes: &[[f64; 2]]) -> Self {
         let h = on.spacing_mm;
         let mut nodes: Vec<[f64; 4]> =
@@ -61,21 +64,21 @@ impl Field {
         Self { on, per_mm: on.spacing_mm.map(|h| 1.0 / h), nodes }
     }
 
-    /// The same, lower everywhere.
+    /// Returns the field with `by` subtracted from every height.
     #[must_use]
     pub fn lowered(mut self, by: f64) -> Self {
         self.nodes.iter_mut().for_each(|node| node[0] -= by);
         self
     }
 
-    /// Returns the field of the same heights downwards.
+    /// Returns the field with the sign of every height changed.
     #[must_use]
     pub fn mirrored(mut self) -> Self {
         self.nodes.par_iter_mut().for_each(|node| *node = node.map(|value| -value));
         self
     }
 
-    /// Returns the distance of the nodes along x and y, in millimetres.
+    /// Returns the node spacing along x and y, in millimetres.
     pub fn spacing_mm(&self) -> [f64; 2] {
         self.per_mm.map(|p| 1.0 / p)
     }
@@ -95,14 +98,14 @@ impl Field {
         jet
     }
 
-    /// The bicubic of a cell, with lengths counted in cells.
+    /// Evaluates the bicubic of a cell at (u, v) in [0, 1]. The unit of length is one cell.
     #[inline]
     fn within(&self, i: usize, j: usize, u: f64, v: f64) -> Jet {
         let below = j * self.on.columns + i;
         let above = below + self.on.columns;
         let (low, high) = (&self.nodes[below..below + 2], &self.nodes[above..above + 2]);
         let across = Basis::at(u);
-        // Along u on both rows: the height, and its slope across the rows.
+        // Along u on both rows: the height (a), and its slope across the rows (b).
         let (a0, b0) = (
             across.curve(low[0][0], low[0][1], low[1][0], low[1][1]),
             across.curve(low[0][2], low[0][3], low[1][2], low[1][3]),
@@ -119,7 +122,8 @@ impl Field {
     }
 }
 
-/// Returns the cell of a coordinate, the place in it, and how far beyond the border the coordinate is.
+/// Returns the cell of a coordinate, the position in the cell (0 to 1), and the signed distance of the coordinate
+/// beyond the border (0 inside). All are in cells.
 #[inline]
 fn cell(at: f64, nodes: usize) -> (usize, f64, f64) {
     let kept = at.clamp(0.0, (nodes - 1) as f64);
@@ -127,7 +131,7 @@ fn cell(at: f64, nodes: usize) -> (usize, f64, f64) {
     (i, kept - i as f64, at - kept)
 }
 
-/// Goes on along the tangents from a place at the border.
+/// Continues a jet at the border along its tangents, by (du, dv) cells beyond the border.
 #[cold]
 fn continued(jet: &mut Jet, [du, dv]: [f64; 2]) {
     let ([su, sv], twist) = (jet.slope, jet.bend[1]);
@@ -141,7 +145,8 @@ fn continued(jet: &mut Jet, [du, dv]: [f64; 2]) {
     }
 }
 
-/// The four cubics of Hermite, for value and slope at 0 and at 1, with their first and second derivatives.
+/// Four Hermite basis functions, in the order value at 0, slope at 0, value at 1, slope at 1, with their first and
+/// second derivatives.
 struct Basis {
     value: [f64; 4],
     slope: [f64; 4],
@@ -161,7 +166,7 @@ impl Basis {
         }
     }
 
-    /// Value, slope and second derivative of the cubic with these values and slopes at its ends.
+    /// Returns value, slope and second derivative of the cubic with these values and slopes at its ends.
     #[inline]
     fn curve(&self, z0: f64, m0: f64, z1: f64, m1: f64) -> [f64; 3] {
         let sum = |w: &[f64; 4]| w[0] * z0 + w[1] * m0 + w[2] * z1 + w[3] * m1;
@@ -169,7 +174,8 @@ impl Basis {
     }
 }
 
-/// Slopes of the cubic spline through equally spaced values that is level at both ends, by Thomas's algorithm.
+/// Computes the slopes of the cubic spline through equally spaced values, with zero slope at both ends, by Thomas's
+/// algorithm.
 fn level_spline(count: usize, value: impl Fn(usize) -> f64) -> Vec<f64> {
     // m[i-1] + 4 m[i] + m[i+1] = 3 (f[i+1] - f[i-1]), m[0] = m[n-1] = 0.
     let (mut slope, mut factor) = (vec![0.0; count], vec![0.0; count]);
@@ -184,7 +190,8 @@ fn level_spline(count: usize, value: impl Fn(usize) -> f64) -> Vec<f64> {
     slope
 }
 
-/// Gives nodes without a value one, ring by ring outwards, on the mean of the tangents of the neighbours that have one.
+/// Fills nodes without a value, ring by ring outwards. Each new value is the weighted mean of the tangent
+/// extrapolations from the neighbours that have a value.
 fn fill(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     let near = |k: usize| {
         let (i, j) = (k % columns, k / columns);
@@ -212,12 +219,12 @@ fn fill(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
             weight == 0.0
         });
         if ring.is_empty() {
-            // Not one node has a value.
+            // No node has a value.
             return;
         }
         ring.into_iter().for_each(|(k, node)| nodes[k] = node);
     }
-    // The slopes of what was filled in are those of its heights.
+    // The slopes of the filled nodes are the differences of their heights.
     let heights: Vec<f64> = nodes.iter().map(|node| node[0]).collect();
     for k in filled {
         nodes[k][1] = difference(k % columns, columns, |i| heights[k - k % columns + i]);
@@ -225,7 +232,7 @@ fn fill(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     }
 }
 
-/// Sets the twist of every node to the mean of the differences of both slopes.
+/// Sets the twist of every node to the mean of two differences: of the x slope along y, and of the y slope along x.
 fn twist(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     let twists: Vec<f64> = (0..nodes.len())
         .into_par_iter()
@@ -240,7 +247,8 @@ fn twist(nodes: &mut [[f64; 4]], columns: usize, rows: usize) {
     nodes.iter_mut().zip(twists).for_each(|(node, twist)| node[3] = twist);
 }
 
-/// The derivative at one of equally spaced values: central, of second order at the ends too.
+/// Returns the derivative at one of equally spaced values: central difference inside, one-sided at the ends, both of
+/// second order. With two values it is their difference; with one it is 0.
 fn difference(at: usize, count: usize, value: impl Fn(usize) -> f64) -> f64 {
     match at {
         _ if count < 2 => 0.0,
@@ -279,7 +287,8 @@ mod tests {
 
     #[test]
     fn a_bicubic_with_exact_slopes_is_kept_to_rounding() {
-        // Slopes up to quadratic along each other's direction: the twist by differences is exact.
+        // The x slope is at most quadratic in y, and the y slope at most quadratic in x: the twist by differences is
+        // exact.
         let z = |x: f64, y: f64| {
             0.3 + 0.1 * x - 0.2 * y + 0.05 * x * y + 0.01 * x * x * y - 0.02 * x.powi(3) + 0.004 * y.powi(3)
         };
@@ -312,7 +321,8 @@ mod tests {
             let (left, right) = (field.at([x - e, y - e]).bend[k], field.at([x + e, y + e]).bend[k]);
             assert!((left - right).abs() < 1e-9, "{left} {right}");
         }
-        // Away from the border, where it is not level, the error is of the fourth order of the spacing.
+        // Away from the border the error is of fourth order in the spacing. At the border the wave has a slope and the
+        // spline has none.
         assert!((field.at([0.11, 6.66]).value - wave([0.11, 6.66])).abs() < 1e-7);
         derivatives_agree(&field, [1.03, 4.44]);
         assert_eq!(field.at([-5.0, 4.44]).slope[0], 0.0);
@@ -327,7 +337,7 @@ mod tests {
         let slopes: Vec<[f64; 2]> = places(ON).into_iter().map(slope).collect();
         let field = Field::hermite(ON, &values, &slopes);
         assert!((field.at([1.1, 7.0]).value - z([1.1, 7.0])).abs() < 1e-9);
-        // Beyond, within the error of a tangent: half the curvature times the square of the distance.
+        // Beyond the hole's edge the error is that of a tangent: half the curvature times the square of the distance.
         assert!((field.at([4.5, 6.5]).value - z([4.5, 6.5])).abs() < 0.02 * 1.3 * 1.3);
         assert!(places(ON).into_iter().all(|p| field.at(p).slope[0].is_finite()));
         let none = Field::hermite(ON, &vec![f64::NAN; 41 * 31], &slopes);

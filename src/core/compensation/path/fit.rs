@@ -1,4 +1,5 @@
-//! What must hold before a path is laid: the wheel fits the surface, and touches the part nowhere else.
+//! Checks before a path is laid: the wheel fits the surface at the contact, and its body does not touch the part
+//! elsewhere.
 
 use rayon::prelude::*;
 
@@ -8,18 +9,21 @@ use super::wanted::Bend;
 use super::{PathError, Wanted, Wheel};
 use crate::geometry::{Aperture, Point};
 
-/// Places along each axis at which the wheel is held against the surface.
+/// Number of places along each axis at which the fit of the wheel to the surface is checked.
 pub(super) const PLACES: usize = 101;
-/// Places of the wheel, and places of the surface along each axis, at which its body is held against the part.
+/// Number of contacts along each axis (`BODIES`), and of surface points along each axis (`GROUND`), at which the body
+/// of the wheel is checked against the part.
 const BODIES: usize = 24;
 const GROUND: usize = 48;
-/// How much a wheel must be more curved than a hollow: in a nearer fit a little error of either touches along a line.
+/// Minimum ratio of the wheel's curvature to the curvature of a hollow. With a closer fit a small error of either
+/// makes the contact a line.
 const MARGIN: f64 = 1.05;
-/// Depth at which the body of a wheel cuts where it should not: what the surface's own smoothness leaves.
+/// Maximum depth to which the body of a wheel may cut the part away from the contact, in millimetres. It allows for
+/// the limited smoothness of the surface.
 const DEEPEST_MM: f64 = 1e-4;
-/// Steepest slope that a wheel grinds: beyond, the machine's spindle is in the way.
+/// Maximum slope that a wheel can grind. On steeper slopes the machine's spindle is in the way.
 const STEEPEST_RAD: f64 = 1.2;
-/// Holds the wheel against the surface at places all over the part, and returns the distance of the tracks over x and y.
+/// Checks the fit of the wheel at places all over the part and returns the distance between tracks over x and y, in mm.
 pub(super) fn track_mm(wanted: &Wanted, outline: &Aperture, options: &PathOptions) -> Result<f64, PathError> {
     let places = places(outline, PLACES);
     let one = |place: &[f64; 2]| fit_at(&wanted.bend(*place), *place, outline, options);
@@ -31,14 +35,15 @@ pub(super) fn track_mm(wanted: &Wanted, outline: &Aperture, options: &PathOption
     }
 }
 
-/// Whether the wheel reaches a few places: most of what does not fit fails there.
+/// Returns true if the wheel fits at a few places. This quick test finds most wheels that do not fit.
 pub(super) fn may_fit(wanted: &Wanted, outline: &Aperture, options: &PathOptions) -> bool {
     const FEW: usize = 21;
     places(outline, FEW).iter().all(|place| fit_at(&wanted.bend(*place), *place, outline, options).is_ok())
 }
 
-/// The lesser distance or, where the wheel is refused, the refusal that says most: the narrowest hollow, which tells the wheel that fits
-/// everywhere, and else the first, so that the same path is refused with the same words each time.
+/// Returns the smaller distance or, if the wheel is rejected, the more useful error. The narrowest hollow comes first,
+/// because it gives the wheel that fits everywhere. Otherwise it is the first error, so that the same path always
+/// gives the same message.
 fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64, PathError> {
     let room = |e: &PathError| match e {
         PathError::Hollow { limit_mm, wheel_mm, .. } => Some(limit_mm / wheel_mm),
@@ -51,14 +56,14 @@ fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64,
     }
 }
 
-/// Places of a grid over the part, its border included.
+/// Returns the points of a grid over the part and points on its border, x and y in mm.
 fn places(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
     let mut places = on_grid(outline, count);
     places.extend(outline.outline_mm(4 * count));
     places
 }
 
-/// Places of a grid over the part.
+/// Returns the points of a `count` x `count` grid that lie on the part, x and y in mm.
 pub(super) fn on_grid(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
     let [low, high] = outline.bounds();
     let at = |k: usize, i: usize| low[k] + (high[k] - low[k]) * i as f64 / (count - 1) as f64;
@@ -66,7 +71,8 @@ pub(super) fn on_grid(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
     grid.filter(|[x, y]| outline.contains(*x, *y)).collect()
 }
 
-/// Checks slope and hollows at a place; returns the distance over x and y of tracks that leave the scallop wanted.
+/// Checks slope, contact and hollows at a place. Returns the distance between tracks over x and y that leaves the
+/// requested scallop height, in mm, or infinity if no scallop height is given.
 fn fit_at(bend: &Bend, place: [f64; 2], outline: &Aperture, options: &PathOptions) -> Result<f64, PathError> {
     let [x_mm, y_mm] = place;
     let normal = &bend.contact.normal;
@@ -85,7 +91,7 @@ fn fit_at(bend: &Bend, place: [f64; 2], outline: &Aperture, options: &PathOption
     }
     let curved = wheel_in(bend, &wheel);
     let [a, b, c] = std::array::from_fn(|k| curved[k] - MARGIN * bend.curvature[k]);
-    // The gap opens in every direction where both the trace and the determinant of this are positive.
+    // The gap opens in every direction if trace and determinant of this form are both positive.
     if !(a + c > 0.0 && a * c - b * b > 0.0) {
         return Err(hollow(bend, &curved, place));
     }
@@ -94,14 +100,14 @@ fn fit_at(bend: &Bend, place: [f64; 2], outline: &Aperture, options: &PathOption
     Ok((8.0 * height / groove.bend).sqrt() / groove.stretch)
 }
 
-/// The wheel's curvature in the directions of a bend: along, mixed, across.
+/// Returns the wheel's curvature in the directions of a bend, in 1/mm: along, mixed, across.
 pub(super) fn wheel_in(bend: &Bend, wheel: &Wheel) -> [f64; 3] {
     let ([around, across], direction) = wheel.curvatures(&bend.contact.normal);
     let [c, s] = [0, 1].map(|k| direction.dot(&bend.along[k]));
     [around * c * c + across * s * s, (around - across) * s * c, around * s * s + across * c * c]
 }
 
-/// The direction in which the wheel fits least.
+/// Returns the error for the direction in which the wheel fits least.
 fn hollow(bend: &Bend, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> PathError {
     let in_direction = |q: &[f64; 3], angle: f64| {
         let (s, c) = angle.sin_cos();
@@ -121,10 +127,11 @@ fn hollow(bend: &Bend, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> PathError {
     }
 }
 
-/// Holds the whole body of the wheel, at places all over the part, against the whole part within its reach.
+/// Checks the body of the wheel, in contacts all over the part, against every surface point within its reach.
 ///
-/// Curvature tells that a wheel fits where it touches; this tells that it does not touch elsewhere: the far side of a cup, the flank of a
-/// disc, the opposite wall of a valley.
+/// The curvatures show that a wheel fits at the contact. This check shows that it does not touch elsewhere: the far
+/// side of a cup, the flank of a disc, the opposite wall of a valley. The error is a place that the wheel cannot touch,
+/// if there is one, and otherwise the deepest cut.
 pub(super) fn check_body(wanted: &Wanted, outline: &Aperture, options: &PathOptions) -> Result<(), PathError> {
     let ground: Vec<([f64; 2], Point)> =
         places(outline, GROUND).into_par_iter().map(|at| (at, wanted.at(at).point)).collect();
@@ -165,12 +172,12 @@ pub(super) mod tests {
     pub(in super::super) const PART: Aperture =
         Aperture::Rectangle { centre_mm: [0.0, 0.0], width_mm: 16.0, height_mm: 12.0 };
 
-    /// A surface z = a x^2 + b y^2 without a correction.
+    /// Returns the surface z = a x^2 + b y^2 without a correction.
     pub(in super::super) fn quadric(a: f64, b: f64) -> Wanted {
         surface(|[x, y]| (a * x * x + b * y * y, [2.0 * a * x, 2.0 * b * y]))
     }
 
-    /// A surface by its height and slopes over x and y, without a correction.
+    /// Returns a surface with a given height and slopes over x and y, without a correction.
     pub(in super::super) fn surface(height: impl Fn([f64; 2]) -> (f64, [f64; 2])) -> Wanted {
         let on = Grid { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
         let places = (0..on.len()).map(|k| on.place_mm(k));
@@ -190,17 +197,17 @@ pub(super) mod tests {
 
     #[test]
     fn a_wheel_must_be_smaller_than_every_hollow_in_every_direction() {
-        // Hollow across the tracks with a radius of 20 mm, and on a dome along them.
+        // Hollow across the tracks with a radius of 20 mm; a dome along them.
         let hollow = || quadric(-0.01, 0.025);
         assert!(path(hollow(), ball(18.0)).is_ok());
         let refused = path(hollow(), ball(20.5)).unwrap_err();
         let PathError::Hollow { direction_deg, hollow_mm, wheel_mm, .. } = refused else { panic!("{refused}") };
         assert!((direction_deg - 90.0).abs() < 5.0 && (hollow_mm - 20.0).abs() < 0.01 && wheel_mm == 20.5, "{refused}");
-        // The narrowest place of all is told, whichever thread came first.
+        // The error names the narrowest place, in any order of the threads.
         for _ in 0..20 {
             assert_eq!(path(hollow(), ball(20.5)).unwrap_err().to_string(), refused.to_string());
         }
-        // A disc that rolls along the track is narrow across it, and would not fit the other way.
+        // A disc that rolls along the track is narrow across it. Turned by 90° it does not fit.
         let disc = |spindle| PathOptions { wheel: Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle }, ..ball(1.0) };
         assert!(path(hollow(), disc(Vector::y())).is_ok());
         assert!(matches!(path(hollow(), disc(Vector::x())), Err(PathError::Hollow { .. })));
@@ -210,13 +217,13 @@ pub(super) mod tests {
     #[test]
     fn slopes_rims_and_bodies_are_held_against_the_part() {
         assert!(matches!(path(quadric(0.2, 0.0), ball(1.0)), Err(PathError::Steep { .. })));
-        // Along x the part faces the spindle more and more.
+        // Along x the normal approaches the direction of the spindle.
         let along = Wheel::Torus { ring_mm: 3.0, tube_mm: 0.5, spindle: Vector::new(0.6, 0.0, 0.8) };
         assert!(matches!(
             path(quadric(-0.05, 0.0), PathOptions { wheel: along, ..ball(1.0) }),
             Err(PathError::CannotTouch { .. })
         ));
-        // A cup that is tilted less than the dome slopes would have to touch with the other side of its ring.
+        // A cup that is tilted less than the slope of the dome would have to touch with the other side of its ring.
         let cup = PathOptions { wheel: Wheel::tilted_cup(6.0, 1.0, 0.15), ..ball(1.0) };
         assert!(matches!(path(quadric(-0.0125, -0.001), cup), Err(PathError::CannotTouch { .. })));
         assert!(path(quadric(-0.002, -0.001), cup).is_ok());
@@ -224,7 +231,8 @@ pub(super) mod tests {
 
     #[test]
     fn the_far_side_of_a_wheel_must_not_reach_the_part() {
-        // A disc that leans by 37 degrees reaches up over the part towards -x, below a wall of 50 degrees at whose foot its rim still fits.
+        // A disc tilted by 37° reaches up over the part towards -x. There it meets a wall of 50°, although its rim
+        // still fits at the bottom of the wall.
         let wall = |steepest: f64| {
             surface(move |[x, _]| {
                 let (into, width) = ((-2.0 - x).max(0.0), 0.8 * steepest / 1.2);
@@ -237,7 +245,8 @@ pub(super) mod tests {
         assert!(path(wall(0.4), options).is_ok());
         let refused = path(wall(1.2), options).unwrap_err();
         let PathError::Body { x_mm, at_x_mm, depth_mm, limit_mm, .. } = refused else { panic!("{refused}") };
-        // On the wall it touches with the side that is high on the flat; the deepest of all is told, and a rim is no deeper than its tube.
+        // On the wall the wheel touches with the side that is high over the flat. The error gives the deepest cut; a
+        // rim cuts no deeper than its tube radius.
         assert!(x_mm < -2.0 && (at_x_mm - x_mm).abs() > 1.0 && limit_mm == DEEPEST_MM, "{refused}");
         assert!(depth_mm > 0.1 && depth_mm <= 0.4, "{refused}");
     }
@@ -258,10 +267,10 @@ pub(super) mod tests {
     fn the_scallop_height_sets_the_distance_of_tracks() {
         let spacing = TrackSpacing::Scallop { height_mm: 1e-4, widest_mm: 5.0 };
         let flat = path(quadric(0.0, 0.0), PathOptions { spacing, ..ball(10.0) }).unwrap();
-        // h = s^2 / (8 R); the tracks are laid evenly, so a little closer.
+        // h = s^2 / (8 R). Tracks are equally spaced between the borders, so they are a little closer.
         let most = (8.0f64 * 10.0 * 1e-4).sqrt();
         assert!(flat.track_mm() <= most && flat.track_mm() > 0.98 * most, "{}", flat.track_mm());
-        // In a hollow of 20 mm the ridges are half as high.
+        // In a hollow with a radius of 20 mm the ridges are half as high.
         let hollow = path(quadric(0.0, 0.025), PathOptions { spacing, ..ball(10.0) }).unwrap();
         assert!(hollow.track_mm() > 1.2 * most);
     }

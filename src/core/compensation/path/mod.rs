@@ -1,14 +1,15 @@
-//! From the surface wanted to the way of the wheel: tracks over the part, the wheel's centre along them, and what must hold
-//! before a program is made of it.
+//! Tool path of the wheel over the target surface: tracks over the part, positions of the wheel's centre along the
+//! tracks, and the checks that a path must pass before a program is written from it.
 //!
 //! ```text
 //!  Nominal --height_of--> Field --+
-//!                                 +-- Wanted (points, normals of the corrected surface) --ToolPath--> Moves --> a program
-//!  Correction --spline--> Field --+                 Wheel (where its centre must be)  --/      \--> Summary, checked against limits
+//!                                 +-- Wanted (points, normals of target) --ToolPath--> Moves --> program
+//!  Correction --spline--> Field --+      Wheel (position of its centre) --/      \--> Summary, checked against limits
 //! ```
 //!
-//! Pure. Frame: everything is in the model frame {M}, z away from the part. Units: mm, s, rad; feeds are mm/min. A path is never
-//! held in memory: it is a list of tracks and an iterator over their points.
+//! The module is pure: no I/O and no clock. Frame: everything is in the model frame {M}, with z away from the part.
+//! Units: mm, s, rad; feeds are in mm/min. The points of a path are not stored: a path is a list of tracks and an
+//! iterator over their points.
 
 mod arcs;
 mod axis_table;

@@ -1,4 +1,4 @@
-//! From a nominal surface to a smooth height over x and y.
+//! Conversion of a nominal surface into a smooth height over x and y.
 
 use rayon::prelude::*;
 
@@ -8,19 +8,22 @@ use crate::surface::{Nominal, NominalKind, OffsetSurface, Place, Side};
 use super::PathError;
 use super::field::Field;
 
-/// Most nodes of a field that is laid over points that are no grid.
+/// Maximum number of nodes of a field over points that do not form a grid.
 const MOST_NODES: f64 = 2e6;
-/// Steps of Newton's method down to a surface; each squares the error.
+/// Maximum number of steps of Newton's method to a surface. Each step squares the error.
 const STEPS: usize = 8;
-/// Normals flatter than this are no height over the plane: 84 degrees of slope.
+/// Minimum z component of a normal: 84° of slope. A steeper surface is not a height over x and y.
 const LEAST_UPRIGHT: f64 = 0.1;
 
-/// Returns the nominal surface as a height, and the outline of the part: the one stated, or the box around its points.
+/// Returns the nominal surface as a height field, and the outline of the part: the given outline, or the bounding box
+/// of the points.
 ///
-/// A grid that is regular in x and y is taken as it is, with its normals; any other surface is sampled as finely as its points lie.
+/// A grid that is regular in x and y becomes the field directly, with slopes from its normals. Any other surface is
+/// sampled with the density of its points.
 ///
 /// # Errors
-/// A surface that is steeper than 84 degrees somewhere, or turned away from +z.
+/// Returns [`PathError::NotAHeight`] if the surface is steeper than 84° at some point or faces away from +z, and
+/// [`PathError::Empty`] if the points cover no area or give no surface.
 pub fn height_of(nominal: &Nominal) -> Result<(Field, Aperture), PathError> {
     let [low, high] = bounds(nominal.points().map(|p| [p.x, p.y]));
     let outline = nominal.outline().cloned().unwrap_or(Aperture::between([low, high]));
@@ -31,11 +34,11 @@ pub fn height_of(nominal: &Nominal) -> Result<(Field, Aperture), PathError> {
     Ok((field, outline))
 }
 
-/// The field of a surface whose nodes are a regular grid already.
+/// Returns the field of a surface whose nodes already form a regular grid, or `None` if they do not.
 fn regular(nominal: &Nominal) -> Result<Option<Field>, PathError> {
     let (NominalKind::Grid { columns, rows }, [patch]) = (nominal.kind(), nominal.patches()) else { return Ok(None) };
     let nodes = patch.nodes();
-    // Two nodes that are there tell where all are.
+    // Two valid nodes along each axis fix the origin and the spacing of the grid.
     let of = |k: usize| (k % columns, k / columns);
     let mut there = (0..nodes.len()).filter(|&k| nodes[k].point.x.is_finite());
     let Some(first) = there.next() else { return Ok(None) };
@@ -70,7 +73,7 @@ fn regular(nominal: &Nominal) -> Result<Option<Field>, PathError> {
             return Err(PathError::NotAHeight { x_mm: p.x, y_mm: p.y });
         }
         let slope = [-n.x / n.z, -n.y / n.z];
-        // A node that is off its place by rounding is brought there along its tangent.
+        // A node can be off its grid position by rounding: move it there along its tangent.
         let (i, j) = of(k);
         let off = [x0 + i as f64 * dx - p.x, y0 + j as f64 * dy - p.y];
         slopes.push(slope);
@@ -79,10 +82,10 @@ fn regular(nominal: &Nominal) -> Result<Option<Field>, PathError> {
     Ok(Some(Field::hermite(on, &heights, &slopes)))
 }
 
-/// A height and its slopes.
+/// Height and slopes at a node.
 type Node = (f64, [f64; 2]);
 
-/// The field of any other surface: its height is searched for at every node.
+/// Returns the field of a surface that is not a regular grid. The height at each node is found by Newton's method.
 fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<Field, PathError> {
     let surface = OffsetSurface::new(nominal, 0.0, Side::Normal).map_err(|_| PathError::Empty)?;
     let size = [high[0] - low[0], high[1] - low[1]];
@@ -111,13 +114,15 @@ fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<Field, PathE
                 .collect()
         })
         .collect();
-    // The first that fails in their order, not in time, so that the same surface is refused with the same words.
+    // Take the first error in the order of the lines, not in time, so that the same surface always gives the same
+    // message.
     let lines: Vec<Vec<Node>> = lines.into_iter().collect::<Result<_, PathError>>()?;
     let (heights, slopes): (Vec<f64>, Vec<[f64; 2]>) = lines.into_iter().flatten().unzip();
     Ok(Field::hermite(on, &heights, &slopes))
 }
 
-/// Searches the height and the slopes at a place; NaN off the part.
+/// Finds the height and the slopes at a place by Newton's method along z. The height is NaN off the part or without
+/// convergence.
 fn height_at(surface: &OffsetSurface, [x, y]: [f64; 2], start_mm: f64, place: &mut Place) -> Result<Node, PathError> {
     let mut z = start_mm;
     for _ in 0..STEPS {

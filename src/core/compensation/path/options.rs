@@ -1,4 +1,4 @@
-//! How a path is laid.
+//! Options of a tool path and their validation.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,17 +17,18 @@ pub enum Pattern {
     Spiral,
 }
 
-/// How far apart tracks are.
+/// Distance between neighbouring tracks.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum TrackSpacing {
-    /// So far over x and y, in millimetres, at most.
+    /// Maximum distance, measured over x and y, in millimetres.
     Distance(f64),
-    /// As far as leaves ridges of a height at most, in millimetres: h = s^2 / (8 r_eff), with 1 / r_eff the curvature of the wheel less
-    /// that of the hollow surface across the track.
+    /// Largest distance at which the ridges (scallops) between tracks stay within a maximum height:
+    /// h = s^2 / (8 r_eff), with 1 / r_eff the curvature of the wheel minus the curvature of the hollow surface, both
+    /// across the track.
     Scallop {
-        /// The height.
+        /// Maximum height of the scallops, in millimetres.
         height_mm: f64,
-        /// Never farther apart than this, in millimetres.
+        /// Upper limit of the distance, in millimetres.
         widest_mm: f64,
     },
 }
@@ -46,44 +47,46 @@ pub enum PathMode {
     ExactStop,
 }
 
-/// How a path is laid.
+/// Options from which a [`super::ToolPath`] is laid.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PathOptions {
-    /// The wheel.
+    /// Shape and size of the wheel, with the spindle upright.
     pub wheel: Wheel,
-    /// The rotary axis of the machine's head, if it has one.
+    /// Rotary axis of the machine's head, if it has one.
     pub rotary: Option<Rotary>,
-    /// How the wheel leans by it; `None` leaves the axis alone, and programs do not name it.
+    /// Tilt of the wheel about this axis. With `None` the axis does not move, and programs do not contain it.
     pub lean: Option<Lean>,
-    /// Whether the wheel comes from -z. The surface is then given as it is seen from there, with z turned round, and so is the wheel: its
-    /// spindle, its heights. The moves of the path are in the model frame.
+    /// True if the wheel comes from -z. The surface and the wheel (spindle, heights) are then given as seen from
+    /// there, mirrored in z. The moves of the path are in the model frame.
     pub from_below: bool,
-    /// How the tracks run.
+    /// Pattern of the tracks.
     pub pattern: Pattern,
-    /// Whether every track of a raster runs towards +x; else they alternate.
+    /// True if every track of a raster runs towards +x. Otherwise the direction alternates.
     pub one_way: bool,
-    /// How far apart they are.
+    /// Distance between neighbouring tracks.
     pub spacing: TrackSpacing,
-    /// How far the straight lines between points may be from the path of the wheel's centre, in millimetres.
+    /// Maximum distance between the straight lines that join the points and the path of the wheel's centre, in
+    /// millimetres.
     pub chord_error_mm: f64,
-    /// Longest distance of two points, over x and y, in millimetres.
+    /// Maximum distance between two successive points, over x and y, in millimetres.
     pub longest_step_mm: f64,
-    /// How far tracks go on beyond the edge of the part, on the tangent of the surface, in millimetres.
+    /// Length by which tracks continue beyond the edge of the part, on the tangent of the surface, in millimetres.
     pub overrun_mm: f64,
-    /// How long the wheel takes, beyond that, to come down and to lift off, over x and y, in millimetres.
+    /// Length of the lead-in and of the lead-out beyond the overrun, over x and y, in millimetres. In the leads the
+    /// wheel comes down and lifts off.
     pub lead_mm: f64,
-    /// Radius of the curve on which it comes down and lifts off, in millimetres.
+    /// Radius of the curve of the lead-in and of the lead-out, in millimetres.
     pub lead_radius_mm: f64,
-    /// How far above the highest point of the path the wheel travels, in millimetres.
+    /// Height above the highest point of the path at which the wheel travels, in millimetres.
     pub safe_height_mm: f64,
     /// Feed of the wheel's centre along the path.
     pub feed_mm_min: f64,
-    /// On a spiral the feed is lowered towards the middle so that this acceleration is kept, in mm/s2.
+    /// Acceleration limit on a spiral, in mm/s². The feed is lowered towards the middle to stay within it.
     pub spiral_acceleration_mm_s2: Option<f64>,
 }
 
 impl PathOptions {
-    /// Options with a chord error of 0.1 um and room for an ordinary machine.
+    /// Returns options with a chord error of 0.1 µm and with overrun, leads and safe height for an ordinary machine.
     pub fn new(wheel: Wheel, track_mm: f64, feed_mm_min: f64) -> Self {
         Self {
             wheel,
@@ -104,7 +107,7 @@ impl PathOptions {
         }
     }
 
-    /// Refuses what makes no sense whatever the surface.
+    /// Rejects options that are invalid for every surface.
     pub(super) fn check(&self) -> Result<(), PathError> {
         let (spacing, height) = match self.spacing {
             TrackSpacing::Distance(mm) => (mm, 1.0),
@@ -140,7 +143,8 @@ impl PathOptions {
         self.check_lean()
     }
 
-    /// Refuses a wheel that leans by what the machine has not.
+    /// Rejects a tilt that is not possible: no rotary axis, a wheel from below, an angle that is not finite, or a
+    /// following tilt that keeps the pole of a ball on the surface.
     fn check_lean(&self) -> Result<(), PathError> {
         let Some(lean) = self.lean else { return Ok(()) };
         if self.rotary.is_none() {

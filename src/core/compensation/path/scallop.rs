@@ -1,15 +1,16 @@
-//! Scallops: what stands between the tracks of a pass because the wheel is round across them.
+//! Scallops: ridges that remain between the tracks of a pass because the wheel is curved across the tracks.
 //!
-//! The wheel touches the wanted surface along its tracks and leaves a groove around each. With s for the distance of two tracks along the
-//! surface and g for the curvature of the groove against the surface,
+//! The wheel touches the target surface along its tracks and leaves a groove around each track. Let s be the distance
+//! between two tracks along the surface and g the curvature of the groove relative to the surface. Then
 //!
 //! ```text
 //!  h = s^2 g / 8        mean over the groove: h / 3        rms about that mean: h 2 / (3 sqrt 5) = 0.298 h
 //! ```
 //!
-//! The gap between wheel and surface is a quadratic form Q, the wheel's curvatures less those of the hollow surface. A wheel that moves along
-//! the track sweeps the least of it over that direction: g = Q_22 - Q_12^2 / Q_11, which for a ball is nearly 1 / r - k. The heights are those
-//! of parabolas: tracks as far apart as the wheel's radius make them 7 % higher.
+//! The gap between wheel and surface is a quadratic form Q: the wheel's curvatures minus those of the surface
+//! (positive in a hollow). A wheel that moves along the track (index 1) leaves the minimum of Q over that direction:
+//! g = Q_22 - Q_12^2 / Q_11, which for a ball is nearly 1 / r - k. The heights are those of parabolas. If the tracks
+//! are as far apart as the wheel's radius, the true heights are 7 % larger.
 
 use rayon::prelude::*;
 
@@ -18,26 +19,27 @@ use super::wanted::{Bend, Contact};
 use super::{Pattern, ToolPath, Wanted, Wheel};
 use crate::geometry::{Aperture, Vector};
 
-/// The rms of a parabola about its mean, over its height.
+/// Ratio of the rms of a parabola about its mean to its height: 2 / (3 sqrt 5).
 const RMS_OF_HEIGHT: f64 = 0.298_142_396_999_972;
 
-/// What the tracks of a pass leave between them.
+/// Size of the scallops that the tracks of a pass leave.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Scallops {
-    /// Distance of the tracks over x and y, in millimetres.
+    /// Distance between tracks over x and y, in millimetres.
     pub track_mm: f64,
-    /// Height of the highest one over the grooves beside it, in millimetres: what it adds to a peak to valley.
+    /// Height of the highest scallop above its neighbouring grooves, in millimetres. This is its contribution to a
+    /// peak-to-valley value.
     pub height_mm: f64,
-    /// Root mean square over the part, about their mean height nearby, in millimetres. The mean changes slowly over the part, and what changes slowly
-    /// is form, which a correction takes back.
+    /// Root mean square over the part about the local mean height, in millimetres. The local mean changes slowly over
+    /// the part. It counts as form error, which a correction compensates.
     pub rms_mm: f64,
-    /// Mean height over the surface that the wheel touches, in millimetres.
+    /// Mean height above the surface that the wheel touches, in millimetres.
     pub mean_mm: f64,
 }
 
 impl Scallops {
-    /// Returns what tracks leave on a wanted surface, by the wheel as it stands where it touches. Where the wheel does not fit the surface there are
-    /// none, and no path either.
+    /// Computes the scallops on a target surface. `wheel_at` returns the wheel in its orientation at a contact. Places
+    /// where the wheel does not fit the surface count as zero height; no path is laid for them.
     pub fn between(
         wanted: &Wanted,
         outline: &Aperture,
@@ -63,13 +65,15 @@ impl Scallops {
         }
     }
 
-    /// Returns the distance of tracks that leave at most this height and this rms, in millimetres; infinite where no distance leaves any.
+    /// Returns the largest distance between tracks, in millimetres, that keeps the scallops within this height and
+    /// this rms. It is infinite if no distance leaves scallops.
     pub fn track_for_mm(&self, height_mm: f64, rms_mm: f64) -> f64 {
         let by = |most: f64, found: f64| if found > 0.0 { (most / found).sqrt() } else { f64::INFINITY };
         self.track_mm * by(height_mm, self.height_mm).min(by(rms_mm, self.rms_mm))
     }
 
-    /// Returns what tracks of another distance leave: the height goes by its square.
+    /// Returns the scallops for another distance between tracks. Heights are proportional to the square of the
+    /// distance.
     #[must_use]
     pub fn at_mm(&self, track_mm: f64) -> Self {
         let times = (track_mm / self.track_mm).powi(2);
@@ -79,7 +83,7 @@ impl Scallops {
 }
 
 impl ToolPath {
-    /// Returns what this path leaves between its tracks.
+    /// Returns the scallops that this path leaves between its tracks.
     pub fn scallops(&self) -> Scallops {
         let options = self.options();
         let wheel_at = |contact: &Contact| options.wheel_at(contact);
@@ -87,23 +91,23 @@ impl ToolPath {
     }
 }
 
-/// The groove that the wheel leaves at a place.
+/// Groove that the wheel leaves at a place.
 pub(super) struct Groove {
-    /// Its curvature against the surface, across the track, 1/mm; 0 where there is none.
+    /// Curvature of the groove relative to the surface, across the track, in 1/mm; 0 if there is no groove.
     pub(super) bend: f64,
-    /// How far two tracks are apart along the surface, across the track, over their distance over x and y.
+    /// Ratio of the distance between two tracks along the surface, across the track, to their distance over x and y.
     pub(super) stretch: f64,
 }
 
-/// Returns the middle that a spiral winds about, less a place.
+/// Returns a place relative to the middle of the part, about which a spiral winds, in mm.
 pub(super) fn from_middle(outline: &Aperture, place: [f64; 2]) -> [f64; 2] {
     let [low, high] = outline.bounds();
     std::array::from_fn(|k| place[k] - 0.5 * (low[k] + high[k]))
 }
 
-/// Returns the groove at a place, given from the middle of the part.
+/// Returns the groove at a place. `[x, y]` is the place relative to the middle of the part.
 pub(super) fn groove(bend: &Bend, [x, y]: [f64; 2], wheel: &Wheel, pattern: Pattern) -> Groove {
-    // The track over x and y; the next one lies at a right angle to it there.
+    // Direction of the track over x and y; the next track is at a right angle to it.
     let radius = x.hypot(y);
     let [east, north] = match pattern {
         Pattern::Spiral if radius > 0.0 => [-y / radius, x / radius],
@@ -139,19 +143,19 @@ mod tests {
     #[test]
     fn by_hand() {
         let of = |b: f64| between(&quadric(0.0, b), Wheel::Sphere { radius_mm: 12.5 }, 0.5);
-        // 0.25 / (8 * 12.5) on a plane; where the surface is hollow or stands up with a radius of 50 mm, a quarter less or more.
+        // 0.25 / (8 * 12.5) on a plane. On a hollow or a dome with a radius of 50 mm it is a quarter less or more.
         let flat = of(0.0);
         assert!((flat.height_mm - 2.5e-3).abs() < 1e-12, "{flat:?}");
         assert!((flat.rms_mm / flat.height_mm - 2.0 / (3.0 * 5f64.sqrt())).abs() < 1e-12);
         assert!((flat.mean_mm - 2.5e-3 / 3.0).abs() < 1e-12);
         let nearly = |found: Scallops, height_mm: f64| {
-            // Towards the edges it bends less, and the tracks are farther apart along the slope.
+            // Towards the edges the curvature is smaller, and the tracks are farther apart along the slope.
             assert!((found.height_mm / height_mm - 1.0).abs() < 0.03, "{found:?}");
             assert!(found.rms_mm <= 0.2982 * found.height_mm && found.rms_mm > 0.28 * found.height_mm, "{found:?}");
         };
         nearly(of(0.01), 2.5e-3 * 0.75);
         nearly(of(-0.01), 2.5e-3 * 1.25);
-        // Four times as near, a sixteenth as high.
+        // A quarter of the distance gives a sixteenth of the height.
         let near = between(&quadric(0.0, 0.0), Wheel::Sphere { radius_mm: 12.5 }, 0.125);
         assert!(
             (near.height_mm - flat.at_mm(0.125).height_mm).abs() < 1e-15 && near.rms_mm == flat.at_mm(0.125).rms_mm
@@ -173,14 +177,15 @@ mod tests {
         for (wanted, wheel) in [
             (quadric(0.0, 0.0), Wheel::Sphere { radius_mm: f64::INFINITY }),
             (quadric(-0.001, 0.0), straight),
-            // A hollow of 20 mm for a wheel of 30 mm, which no path is laid for.
+            // A hollow of radius 20 mm and a wheel of radius 30 mm: no path is laid for this pair.
             (quadric(0.0, 0.025), Wheel::Sphere { radius_mm: 30.0 }),
         ] {
             let none = between(&wanted, wheel, 0.5);
             assert_eq!([none.height_mm.max(1e-18), none.rms_mm.max(1e-18)], [1e-18; 2], "{wheel:?}");
             assert!(none.track_for_mm(1e-3, 1e-3) > 1e3);
         }
-        // A cup that stands on one place of its ring is blunt across the tracks, and a disc as sharp as its rim.
+        // Across the tracks a disc is as sharp as its rim. A cup that touches with one point of its ring is blunt
+        // there.
         let disc = Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle: Vector::y() };
         assert!((between(&quadric(0.0, 0.0), disc, 0.5).height_mm - 0.25 / 40.0).abs() < 1e-12);
         let cup = between(&quadric(0.0, 0.0), Wheel::tilted_cup(20.0, 1.0, 0.5), 0.5);
@@ -190,7 +195,7 @@ mod tests {
 
     #[test]
     fn on_a_slope_tracks_are_farther_apart_than_over_x_and_y() {
-        // A plane that rises along x and y: tracks lie (1, 0, p), the next (0, t, q t) beside.
+        // A plane that rises along x and y: tracks run along (1, 0, p), and the offset to the next one is (0, t, q t).
         let [p, q] = [0.4, 0.3];
         let slope = super::super::fit::tests::surface(|[x, y]| (p * x + q * y, [p, q]));
         let expected = 0.25 * (1.0 + p * p + q * q) / (1.0 + p * p) / (8.0 * 12.5);

@@ -1,29 +1,30 @@
-//! A path as a whole, and whether a machine can follow it.
+//! Summary of a whole path, and the check against the limits of a machine.
 
 use rayon::prelude::*;
 
 use super::{Move, Moves, PathError, Rotary, ToolPath};
 use crate::geometry::{Point, Vector};
 
-/// Most points of a path.
+/// Maximum number of points of a path.
 const MOST_POINTS: u64 = 200_000_000;
 
-/// What a machine can do; `None` where it was not told.
+/// Limits of a machine; `None` if a limit is unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Limits {
-    /// Least and largest x, y, z of the point that a program moves, in the frame of the program.
+    /// Minimum and maximum x, y, z of the programmed point, in the frame of the program.
     pub travel_mm: Option<[[f64; 3]; 2]>,
-    /// Largest speed of an axis.
+    /// Maximum speed of an axis.
     pub speed_mm_s: Option<f64>,
-    /// Largest acceleration.
+    /// Maximum acceleration.
     pub acceleration_mm_s2: Option<f64>,
-    /// Largest change of the acceleration in time.
+    /// Maximum jerk: rate of change of the acceleration.
     pub jerk_mm_s3: Option<f64>,
 }
 
 impl Limits {
-    /// Returns the way from standstill to a feed with an acceleration that rises and falls within the jerk, in millimetres: v / 2 (v / a + a / j), and
-    /// v (v / j)^(1/2) where a is not reached; v^2 / (2 a) where no jerk is known.
+    /// Returns the distance from standstill to a feed, in millimetres. The acceleration rises and falls within the
+    /// jerk limit: the distance is v / 2 (v / a + a / j), or v (v / j)^(1/2) if the acceleration a is not reached.
+    /// Without a jerk limit it is v^2 / (2 a). Without either limit it is 0.
     pub fn run_up_mm(&self, feed_mm_min: f64) -> f64 {
         let speed = feed_mm_min / 60.0;
         match (self.acceleration_mm_s2, self.jerk_mm_s3) {
@@ -34,7 +35,7 @@ impl Limits {
         }
     }
 
-    /// Returns the feed whose run-up takes this way, in mm/min.
+    /// Returns the feed whose run-up takes this distance, in mm/min.
     fn feed_of_run_up(&self, way_mm: f64) -> f64 {
         let (mut low, mut high) = (0.0, 1.0);
         while self.run_up_mm(high) < way_mm && high < 1e9 {
@@ -48,67 +49,68 @@ impl Limits {
     }
 }
 
-/// A largest value and where it is.
+/// Extreme value along a path, and its place.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Peak {
-    /// The value.
+    /// Extreme value.
     pub value: f64,
-    /// Where, over x and y.
+    /// Place in x and y.
     pub at_mm: [f64; 2],
-    /// The feed there.
+    /// Feed at this place.
     pub feed_mm_min: f64,
 }
 
-/// How the head turns along a path; angles right-handed, in rad.
+/// Rotation of the head along a path. Angles are right-handed, in rad.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Turned {
-    /// By which axis.
+    /// Rotary axis of the head.
     pub rotary: Rotary,
-    /// Least tilt.
+    /// Smallest tilt.
     pub least_rad: Peak,
     /// Largest tilt.
     pub most_rad: Peak,
-    /// Largest rate at feed.
+    /// Largest angular speed at feed.
     pub rate_rad_s: Peak,
 }
 
-/// A path as a whole.
+/// Summary of a whole path.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Summary {
-    /// Moves, rapid ones included.
+    /// Number of moves, including rapid moves.
     pub moves: u64,
-    /// Points at feed.
+    /// Number of points at feed.
     pub points: u64,
-    /// Least x, y, z.
+    /// Smallest x, y, z.
     pub least_mm: [f64; 3],
     /// Largest x, y, z.
     pub most_mm: [f64; 3],
-    /// Length of the wheel's way at feed.
+    /// Length of the path of the wheel's centre at feed.
     pub length_mm: f64,
-    /// Length of the rapid moves.
+    /// Length of the rapid moves along z. Rapid moves in x and y do not count.
     pub rapid_mm: f64,
-    /// Time of the moves at feed, without acceleration.
+    /// Time of the moves at feed, in s, without time for acceleration.
     pub seconds: f64,
     /// Largest speed of each axis, in mm/s.
     pub speed_mm_s: [Peak; 3],
-    /// Largest acceleration across the wheel's path, v^2 times its curvature, in mm/s2.
+    /// Largest acceleration across the path, in mm/s²: v^2 times the curvature.
     pub acceleration_mm_s2: Peak,
-    /// Largest change of that acceleration in time while the wheel is on the part or its overrun, in mm/s3: v^3 (k'^2 + k^4)^(1/2) for a curvature k
-    /// that changes by k' along the path. Where it comes down or lifts off a controller may go slower and no harm is done.
+    /// Largest jerk while the wheel is on the part or its overrun, in mm/s³: v^3 (k'^2 + k^4)^(1/2) for a curvature k
+    /// with the derivative k' along the path. Leads do not count: there a controller can move more slowly without
+    /// harm.
     pub jerk_mm_s3: Peak,
-    /// Feed with which tracks begin.
+    /// Feed at the start of the tracks.
     pub feed_mm_min: f64,
-    /// Length from standstill to the part.
+    /// Distance from standstill to the part: overrun plus lead.
     pub run_up_mm: f64,
-    /// How the head turns, where the wheel leans.
+    /// Rotation of the head; `None` if the wheel is not tilted.
     pub turned: Option<Turned>,
 }
 
 impl ToolPath {
-    /// Walks the whole path once, all tracks at the same time, and returns what is largest and least on it.
+    /// Walks the whole path once, with all tracks in parallel, and returns its extents, lengths, time and peaks.
     ///
     /// # Errors
-    /// More than 2e8 points.
+    /// Returns [`PathError::TooManyPoints`] for more than 2e8 points.
     pub fn summary(&self) -> Result<Summary, PathError> {
         let options = self.options();
         let empty = Summary {
@@ -134,7 +136,7 @@ impl ToolPath {
                 one
             })
             .collect();
-        // Added up in their order, so that a path has one length whichever thread was first.
+        // Add up in the order of the tracks, so that the length does not depend on the order of the threads.
         let whole = tracks.into_iter().fold(empty, Summary::and);
         if whole.points > MOST_POINTS {
             return Err(PathError::TooManyPoints { points: whole.points, limit: MOST_POINTS });
@@ -144,7 +146,7 @@ impl ToolPath {
 }
 
 impl Summary {
-    /// Takes in the moves of one track.
+    /// Adds the moves of one track.
     fn take(&mut self, mut moves: Moves, safe_z_mm: f64) {
         let mut last: Option<Point> = None;
         let mut before: Option<Bend> = None;
@@ -174,7 +176,8 @@ impl Summary {
         }
     }
 
-    /// Takes in a move at feed; the wheel's centre goes as far as the slides do, unless it is told how far.
+    /// Adds a move at feed. `centre_mm` is the distance that the wheel's centre moves; with `None` it is the distance
+    /// of the slides.
     #[inline]
     fn feed(
         &mut self,
@@ -216,7 +219,7 @@ impl Summary {
         }
     }
 
-    /// From one chord to the next, at the place between them.
+    /// Updates the largest jerk from two successive chords, at the place between them.
     #[inline]
     fn bends_anew(&mut self, before: Bend, now: Bend, at: Point, feed_mm_min: f64) {
         let speed = feed_mm_min / 60.0;
@@ -245,10 +248,12 @@ impl Summary {
         }
     }
 
-    /// Compares a path with what a machine can do.
+    /// Checks a path against the limits of a machine.
     ///
     /// # Errors
-    /// Travel and range of the head, speed of an axis and rate of the head, acceleration across the path, its change in time on the part, and a run-up longer than the way to the part.
+    /// Returns an error if the path exceeds, in this order: the travel of an axis, the speed of an axis, the range or
+    /// the angular speed of the head, the acceleration across the path, the jerk on the part, or if the run-up is
+    /// longer than the distance to the part.
     pub fn check(&self, limits: &Limits) -> Result<(), PathError> {
         if let Some([least, most]) = limits.travel_mm {
             for (k, axis) in ['X', 'Y', 'Z'].into_iter().enumerate() {
@@ -261,7 +266,7 @@ impl Summary {
         }
         if let Some(limit_mm_s) = limits.speed_mm_s {
             for (axis, peak) in ['X', 'Y', 'Z'].into_iter().zip(self.speed_mm_s) {
-                // Rounding is no excess.
+                // Tolerate rounding errors.
                 if peak.value > limit_mm_s * (1.0 + 1e-9) {
                     let ([x_mm, y_mm], found_mm_s) = (peak.at_mm, peak.value);
                     let feed_mm_min = (peak.feed_mm_min * limit_mm_s / found_mm_s).floor();
@@ -330,7 +335,7 @@ impl Turned {
         let [least_deg, most_deg] = range_rad.map(f64::to_degrees);
         for Peak { value, at_mm: [x_mm, y_mm], .. } in [self.least_rad, self.most_rad] {
             let found_deg = self.rotary.on_scale_rad(value).to_degrees();
-            // Rounding is no excess.
+            // Tolerate rounding errors.
             let by_deg = (least_deg - found_deg).max(found_deg - most_deg);
             if by_deg > 1e-9 {
                 return Err(PathError::Tilt { letter, found_deg, x_mm, y_mm, least_deg, most_deg, by_deg });
@@ -347,7 +352,7 @@ impl Turned {
     }
 }
 
-/// How a path bends along a chord.
+/// Curvature of a path along a chord, in 1/mm, and length of the chord.
 #[derive(Clone, Copy)]
 struct Bend {
     bend: f64,
@@ -366,7 +371,7 @@ mod tests {
         let summary = path.summary().unwrap();
         // 10 mm/s.
         let Peak { value, .. } = summary.acceleration_mm_s2;
-        // It comes down on a radius of 5 mm over x and y, which is a little more along the slope.
+        // The lead-in has a radius of 5 mm over x and y, which is a little more along the slope.
         assert!((value - 100.0 / 5.0).abs() < 1.5, "{value}");
         assert!(summary.check(&Limits::default()).is_ok());
         let travel_mm = Some([[-9.0, -50.0, 0.0], [50.0, 50.0, 50.0]]);
@@ -390,7 +395,8 @@ mod tests {
 
     #[test]
     fn jerk_is_that_of_the_curve() {
-        // z = h sin(k x) along the tracks, where a ball of little more than nothing has the surface itself for its path: the third derivative is h k^3.
+        // z = h sin(k x) along the tracks. The path of a very small ball is nearly the surface itself: its third
+        // derivative is h k^3.
         let (h, k) = (0.02, 0.4);
         let wave = surface(move |[x, _]| (h * (k * x).sin(), [h * k * (k * x).cos(), 0.0]));
         let options = PathOptions { chord_error_mm: 1e-6, ..ball(0.05) };
@@ -412,12 +418,13 @@ mod tests {
     fn a_run_up_takes_what_acceleration_and_jerk_leave() {
         let limits =
             |a: Option<f64>, j: Option<f64>| Limits { acceleration_mm_s2: a, jerk_mm_s3: j, ..Limits::default() };
-        // 10 mm/s with 100 mm/s2: 0.1 s, 0.5 mm; with 1000 mm/s3 0.1 s up and 0.1 s down again, and the acceleration is just reached.
+        // 10 mm/s with 100 mm/s²: 0.1 s, 0.5 mm. With 1000 mm/s³ the acceleration rises for 0.1 s and falls for 0.1 s;
+        // its limit is just reached.
         assert!((limits(Some(100.0), None).run_up_mm(600.0) - 0.5).abs() < 1e-12);
         assert!((limits(Some(100.0), Some(1000.0)).run_up_mm(600.0) - 1.0).abs() < 1e-12);
         assert!((limits(Some(1e9), Some(1000.0)).run_up_mm(600.0) - 1.0).abs() < 1e-12);
         assert!((limits(None, Some(1000.0)).run_up_mm(600.0) - 1.0).abs() < 1e-12);
-        // 20 mm/s: 0.1 s up, 0.1 s at 100 mm/s2, 0.1 s down; half of 20 mm/s on average.
+        // 20 mm/s: 0.1 s rise, 0.1 s at 100 mm/s², 0.1 s fall. The mean speed is half of 20 mm/s.
         assert!((limits(Some(100.0), Some(1000.0)).run_up_mm(1200.0) - 3.0).abs() < 1e-12);
         for feed in [1.0, 600.0, 1e5] {
             for limits in [limits(Some(100.0), None), limits(Some(100.0), Some(1000.0)), limits(None, Some(50.0))] {
@@ -436,7 +443,7 @@ mod tests {
         for one in path.moves() {
             if let (Move::Feed { at, .. }, Some(from)) = (one, last) {
                 let middle = nalgebra::center(&from, &at);
-                // The centre of a ball that touches is 10 mm from the surface; in a lead it is more.
+                // The centre of a ball in contact is 10 mm from the surface; in a lead it is further away.
                 let nearest = |p: &Point| {
                     let mut place = [p.x, p.y];
                     for _ in 0..50 {

@@ -1,14 +1,16 @@
-//! A head that tilts its wheel about one axis: how far at a place, and where the slides must be then.
+//! Tilt of the wheel by a head with one rotary axis: tilt angle at a contact, and position of the slides for it.
 //!
 //! ```text
 //!  constant    t = a
-//!  following   t = f(n) + a      f: the turn that lays z along the normal n, seen along the axis
-//!  spindle     R(t) s            s: the spindle upright
-//!  slides      c + (R(t) - 1) v  v: from the wheel's centre to the pivot, upright; 0 where the control keeps the centre by itself
+//!  following   t = f(n) + a      f: rotation that brings z onto the normal n, seen along the axis
+//!  spindle     R(t) s            s: direction of the spindle with the head upright
+//!  slides      c + (R(t) - 1) v  v: from the wheel's centre c to the pivot, head upright;
+//!                                   0 if the control itself keeps the centre in position
 //! ```
 //!
-//! With the normal turned into the wheel's frame nothing else changes: the wheel touches where it would touch that normal upright, turned
-//! back. While it turns along the track it still touches the surface all along, since at every place of the track it does.
+//! To place a tilted wheel, rotate the normal into the wheel's frame, place the upright wheel for that normal, and
+//! rotate the result back. The wheel stays in contact while it rotates along the track, because it touches at every
+//! place of the track.
 
 use crate::geometry::{Point, Vector};
 
@@ -16,73 +18,74 @@ use super::options::PathOptions;
 use super::wanted::Contact;
 use super::{PathError, Wheel};
 
-/// The axis of the model frame that a head turns about.
+/// Axis of the model frame about which a head rotates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TurnAxis {
-    /// x, which an A turns about.
+    /// x, the axis of an A rotation.
     X,
-    /// y, which a B turns about.
+    /// y, the axis of a B rotation.
     Y,
 }
 
-/// The rotary axis of a head.
+/// Rotary axis of a head.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rotary {
-    /// What programs call it.
+    /// Letter of the axis in programs.
     pub letter: char,
-    /// What it turns about, right-handed.
+    /// Axis of rotation, right-handed.
     pub about: TurnAxis,
-    /// Whether its scale counts the other way.
+    /// True if the scale of the axis counts in the opposite direction.
     pub reversed: bool,
-    /// Least and largest angle on its scale.
+    /// Minimum and maximum angle on the scale of the axis.
     pub range_rad: [f64; 2],
-    /// Largest rate.
+    /// Maximum angular speed.
     pub rate_rad_s: f64,
-    /// What its scale is written in multiples of; 0 where every angle can be written.
+    /// Increment of the written angles; 0 if every angle can be written.
     pub step_rad: f64,
-    /// From the wheel's centre to the pivot with the head upright; `None` where the control keeps the centre where programs say.
+    /// Vector from the wheel's centre to the pivot with the head upright. `None` if the control itself keeps the
+    /// wheel's centre at the programmed position.
     pub pivot_mm: Option<Vector>,
 }
 
-/// How a wheel leans, right-handed about the axis of its head.
+/// Tilt of a wheel, right-handed about the axis of its head.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Lean {
-    /// By the same angle everywhere.
+    /// The same angle everywhere.
     Constant {
-        /// The angle.
+        /// Tilt angle.
         angle_rad: f64,
     },
-    /// After the normal of the surface, seen along the axis.
+    /// An angle that follows the normal of the surface, seen along the axis.
     Following {
-        /// From the normal to the upright direction of the head.
+        /// Angle from the normal to the axis of the head.
         lead_rad: f64,
     },
 }
 
-/// Where the wheel stands at a place of a track, and what a program says of it.
+/// Position and tilt of the wheel at a place of a track: exact, and as a program writes them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stand {
-    /// The centre of the wheel and its tilt, to rounding.
+    /// Centre of the wheel and tilt, not rounded to the increment of the axis.
     pub(super) centre: Point,
     pub(super) tilt_rad: f64,
-    /// The point that a program moves, and the tilt as it can be written.
+    /// Programmed point, and tilt rounded to the increment of the axis.
     pub(super) at: Point,
     pub(super) written_rad: f64,
 }
 
-/// How a step leaves the path, in millimetres.
+/// Deviation of a straight step from the path, in millimetres.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Sag {
-    /// How far its middle is from where the control leads the wheel.
+    /// Distance between the middle of the path's step and the position to which the control moves the wheel.
     pub(super) sag: f64,
-    /// How far the wheel's centre goes.
+    /// Distance that the wheel's centre moves.
     pub(super) chord: f64,
-    /// How far the slides are from the straight way between its ends.
+    /// Distance of the slides from the straight line between the ends of the step, at its middle.
     pub(super) bent: f64,
 }
 
 impl Rotary {
-    /// Returns a direction of the upright head after a turn.
+    /// Returns a vector of the upright head after a rotation of the head.
     #[inline]
     pub fn turned(&self, v: &Vector, angle_rad: f64) -> Vector {
         let (s, c) = angle_rad.sin_cos();
@@ -92,18 +95,18 @@ impl Rotary {
         }
     }
 
-    /// Returns what the scale shows after a turn, in rad.
+    /// Converts a right-handed angle into the reading of the axis' scale, in rad.
     pub fn on_scale_rad(&self, angle_rad: f64) -> f64 {
         if self.reversed { 0.0 - angle_rad } else { angle_rad }
     }
 
-    /// Returns how far the slides are from where they would hold the wheel's centre upright, in millimetres: (R - 1) v.
+    /// Returns the offset of the slides that keeps the wheel's centre in place when the head tilts: (R - 1) v, in mm.
     #[inline]
     pub fn shift_mm(&self, angle_rad: f64) -> Vector {
         self.pivot_mm.map_or_else(Vector::zeros, |pivot| self.turned(&pivot, angle_rad) - pivot)
     }
 
-    /// The turn that lays z along a normal, seen along the axis.
+    /// Returns the rotation that brings z onto a normal, seen along the axis, in rad.
     #[inline]
     fn along(&self, normal: &Vector) -> f64 {
         match self.about {
@@ -117,10 +120,11 @@ impl Rotary {
         if self.step_rad > 0.0 { (angle_rad / self.step_rad).round() * self.step_rad } else { angle_rad }
     }
 
-    /// How far the slides are lifted at most by a turn within the range.
+    /// Returns the largest rise of the slides over all angles in the range, in mm.
     fn most_lift_mm(&self) -> f64 {
         let [a, b] = self.range_rad.map(|angle| self.on_scale_rad(angle));
-        // The height is a sine of the angle: so many looks find its top to a millionth of the way to the pivot.
+        // The height is a sine of the angle: this number of samples finds its maximum to a millionth of the distance
+        // to the pivot.
         const LOOKS: u32 = 2000;
         let at = |k: u32| a + (b - a) * f64::from(k) / f64::from(LOOKS);
         (0..=LOOKS).map(|k| self.shift_mm(at(k)).z).fold(f64::NEG_INFINITY, f64::max)
@@ -128,7 +132,7 @@ impl Rotary {
 }
 
 impl PathOptions {
-    /// Returns how far the head is turned where the wheel touches a place; 0 for a wheel that does not lean.
+    /// Returns the tilt of the head at a contact, in rad, right-handed; 0 for a wheel without tilt.
     #[inline]
     pub fn tilt_rad(&self, contact: &Contact) -> f64 {
         match (self.lean, &self.rotary) {
@@ -138,13 +142,13 @@ impl PathOptions {
         }
     }
 
-    /// Returns the wheel as it stands where it touches a place.
+    /// Returns the wheel in its orientation at a contact.
     #[inline]
     pub fn wheel_at(&self, contact: &Contact) -> Wheel {
         if self.lean.is_none() { self.wheel } else { self.wheel_turned(self.tilt_rad(contact)) }
     }
 
-    /// Returns the upright direction of the head where the wheel touches a place.
+    /// Returns the direction of the head's axis at a contact: z rotated by the tilt.
     #[inline]
     pub fn head_at(&self, contact: &Contact) -> Vector {
         let turned = |rotary: &Rotary| rotary.turned(&Vector::z(), self.tilt_rad(contact));
@@ -160,13 +164,14 @@ impl PathOptions {
         wheel
     }
 
-    /// Returns the axis by which the wheel leans, if it does.
+    /// Returns the rotary axis if the wheel is tilted by it.
     #[inline]
     pub fn leaning(&self) -> Option<&Rotary> {
         self.lean.and(self.rotary.as_ref())
     }
 
-    /// Where the wheel stands when it touches a place, lifted off by so much along the normal; `None` where a rim cannot touch it.
+    /// Returns position and tilt of the wheel at a contact, lifted off by `lifted_mm` along the normal, or `None` if a
+    /// rim cannot touch there.
     #[inline]
     pub(super) fn stand(&self, contact: &Contact, lifted_mm: f64) -> Option<Stand> {
         let centre = |wheel: Wheel| {
@@ -178,14 +183,14 @@ impl PathOptions {
             return Some(Stand { centre, tilt_rad: 0.0, at: centre, written_rad: 0.0 });
         };
         let tilt_rad = self.tilt_rad(contact);
-        // The centre is that of the angle that is written, and so nothing of the surface is lost by the digits of the angle.
+        // `at` belongs to the rounded angle, so the rounding of the angle causes no error of the surface.
         let written_rad = rotary.rounded(tilt_rad);
         let at = centre(self.wheel_turned(written_rad))? + rotary.shift_mm(written_rad);
         Some(Stand { centre: centre(self.wheel_turned(tilt_rad))?, tilt_rad, at, written_rad })
     }
 
-    /// Looks at a step by its middle. The control moves slides and head in proportion; a ring that is turned otherwise than it should be counts as
-    /// far as its own places move.
+    /// Computes the deviation of a step at its middle. The control moves slides and head in proportion. An error of
+    /// the tilt counts as the distance that it moves the points of the ring.
     #[inline]
     pub(super) fn sag_mm(&self, from: &Stand, middle: &Stand, to: &Stand) -> Sag {
         let (chord, half) = (to.centre - from.centre, middle.centre - from.centre);
@@ -209,13 +214,14 @@ impl PathOptions {
         Sag { sag, chord: length2.sqrt(), bent }
     }
 
-    /// How much higher the slides must be than the highest place of the wheel's centre, whatever the head is turned to.
+    /// Returns how far the slides must be above the highest place of the wheel's centre, for any angle of the head, in
+    /// mm.
     pub(super) fn lift_mm(&self) -> f64 {
         self.leaning().map_or(0.0, Rotary::most_lift_mm)
     }
 
-    /// The height that has to be travelled over: of the wheel's centre, and where the wheel is turned in the air, as high as any place of it may
-    /// come to lie.
+    /// Returns the height that rapid moves must clear at a contact, in mm. It is the height of the wheel's centre. If
+    /// the wheel rotates in the air, it is at least the height of the contact plus the reach of the wheel.
     #[inline]
     pub(super) fn height_mm(&self, contact: &Contact, lifted_mm: f64, stand: &Stand) -> f64 {
         match self.lean {
@@ -228,7 +234,10 @@ impl PathOptions {
     }
 }
 
-/// Says of a wheel that cannot reach a place upright by how much it must be tilted, where the machine can and that does.
+/// Adds the necessary tilt to the error of an upright wheel that cannot reach a place.
+///
+/// Tries constant tilts in steps of 5° up to 90° to either side, within the range of the axis. Returns
+/// [`PathError::Upright`] with the first tilt for which `would_do` is true; otherwise returns the error unchanged.
 pub(super) fn or_tilted(
     refused: PathError,
     options: &PathOptions,
@@ -280,7 +289,7 @@ mod tests {
         PathOptions { wheel, rotary: Some(rotary), lean: Some(lean), ..ball(1.0) }
     }
 
-    /// Where slides and head are at feed, and how far the centre goes there.
+    /// Returns for every move at feed: position of the slides, tilt of the head, and distance that the centre moves.
     fn feeds(path: &ToolPath) -> Vec<(Point, f64, f64)> {
         let of = |one| match one {
             Move::FeedTilted { at, tilt_rad, centre_mm, .. } => Some((at, tilt_rad, centre_mm)),
@@ -300,7 +309,7 @@ mod tests {
             .moves()
             .filter_map(|one| if let Move::Feed { at, .. } = one { Some(at) } else { None })
             .collect();
-        // The pivot swings to +x by 200 sin 30 when B turns, to -y when A does, and comes down by 200 (1 - cos 30).
+        // The pivot moves by 200 sin 30° to +x when B rotates, or to -y when A rotates, and down by 200 (1 - cos 30°).
         for (about, by) in [
             (TurnAxis::Y, Vector::new(100.0, 0.0, -26.794_919_243_112_27)),
             (TurnAxis::X, Vector::new(0.0, -100.0, -26.794_919_243_112_27)),
@@ -338,7 +347,7 @@ mod tests {
 
     #[test]
     fn a_wheel_that_follows_keeps_its_lead() {
-        // Along x the normal turns by -atan(2 a x), which B takes up; seen along y it is no more than that.
+        // Along x the normal rotates by -atan(2 a x), and B follows it. Seen along y there is no other rotation.
         let (a, lead) = (0.02f64, 0.5);
         let follows = leaning(head(TurnAxis::Y), Lean::Following { lead_rad: lead }, Wheel::Sphere { radius_mm: 8.0 });
         let laid = path(quadric(a, 0.0), follows).unwrap();
@@ -377,7 +386,8 @@ mod tests {
                 let near = |p: &&Point| (**p - centre).norm() < wheel.reach_mm() + 0.1;
                 let nearest = ground.iter().filter(near).map(|p| stands.distance_mm(&(p - centre)));
                 let nearest = nearest.fold(f64::INFINITY, f64::min);
-                // The wheel comes down, or is over the edge; else within the chord error and the gap between places that are looked at.
+                // Larger distances occur in leads and over the edge. Otherwise the distance is within the chord error
+                // plus the effect of the spacing of the ground points.
                 if nearest < 2e-3 {
                     assert!(nearest > -1.3e-4, "{about:?} {wheel:?}: {nearest} at {at}");
                     looked += 1;
@@ -399,7 +409,7 @@ mod tests {
             panic!()
         };
         assert!(x_mm > -20.0 && found_deg > 40.2 && (found_deg - 0.7f64.to_degrees() - by_deg).abs() < 1e-9);
-        // Its scale counts the other way.
+        // The scale of the axis counts in the opposite direction.
         let reversed = Rotary { reversed: true, range_rad: [-1.0, -0.1], ..head(TurnAxis::Y) };
         assert_eq!(of(reversed).check(&limits), Ok(()));
         let lazy = Rotary { rate_rad_s: 0.05, ..head(TurnAxis::Y) };
@@ -418,20 +428,20 @@ mod tests {
 
     #[test]
     fn a_wheel_that_cannot_reach_upright_is_told_by_how_much_to_tilt() {
-        // A flank of 74 degrees, on which the spindle of an upright wheel is in the way.
+        // A flank of 74°: the spindle of an upright wheel is in the way.
         let flank = || surface(|[x, y]| (3.5 * y + 0.01 * x * x, [0.02 * x, 3.5]));
         let upright = PathOptions { rotary: Some(head(TurnAxis::X)), ..ball(5.0) };
         let Err(PathError::Upright { refused, letter: 'A', angle_deg }) = path(flank(), upright) else { panic!() };
         assert!(matches!(*refused, PathError::Steep { .. }), "{refused}");
-        // 74.05 - 68.75 degrees and more, towards the normal, which leans to -y.
+        // At least 74.05° - 68.75°, towards the normal, which points to -y.
         assert_eq!(angle_deg, 10.0);
         let tilted = PathOptions { lean: Some(Lean::Constant { angle_rad: angle_deg.to_radians() }), ..upright };
         assert!(path(flank(), tilted).is_ok());
-        // About y it would not do, and a machine without the axis is told what it was told before.
+        // A rotation about y does not help. A machine without a rotary axis gets the original error.
         let about_y = PathOptions { rotary: Some(head(TurnAxis::Y)), ..upright };
         assert!(matches!(path(flank(), about_y), Err(PathError::Steep { .. })));
         assert!(matches!(path(flank(), ball(5.0)), Err(PathError::Steep { .. })));
-        // A cup that is tilted less than the dome slopes.
+        // A cup that is tilted less than the slope of the dome.
         let cup = PathOptions { wheel: Wheel::tilted_cup(6.0, 1.0, 0.15), ..about_y };
         let refused = path(quadric(-0.0125, -0.001), cup).unwrap_err();
         let PathError::Upright { angle_deg, .. } = refused else { panic!("{refused}") };
@@ -441,7 +451,8 @@ mod tests {
 
     #[test]
     fn scallops_are_those_of_the_wheel_as_it_stands() {
-        // A disc that rolls along the track, tilted across it by 0.5: its ring is seen under that angle, its rim as it was.
+        // A disc that rolls along the track, tilted across it by 0.5 rad: the curvature of its ring changes, that of
+        // its rim does not.
         let disc = Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle: Vector::y() };
         let lean = Lean::Constant { angle_rad: 0.5 };
         let laid = path(quadric(0.0, 0.0), leaning(head(TurnAxis::X), lean, disc)).unwrap();
@@ -456,7 +467,7 @@ mod tests {
         let across =
             leaning(head(TurnAxis::X), lean, Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle: Vector::x() });
         let laid = path(quadric(0.0, 0.0), across).unwrap();
-        // Across the tracks the disc with its spindle along them is as round as its rim's outer circle.
+        // With its spindle along the tracks, the disc has the curvature of its outer circle across the tracks.
         assert!((laid.scallops().height_mm - laid.track_mm().powi(2) / 8.0 / 45.0).abs() < 1e-12);
     }
 }

@@ -1,4 +1,4 @@
-//! The way of a wheel over a part.
+//! Tool path: the path of a wheel over a part, with its checks.
 
 use rayon::prelude::*;
 
@@ -8,10 +8,10 @@ use super::tracks::{Span, Tracks};
 use super::{PathError, Wanted, fit};
 use crate::geometry::{Aperture, Point};
 
-/// Tracks on which the highest place is looked for.
+/// Approximate number of tracks that are searched for the highest place.
 const SOME_TRACKS: usize = 200;
 
-/// The way of a wheel over a part, point by point when it is asked for.
+/// Path of a wheel over a part. Its points are computed on demand by [`ToolPath::moves`].
 #[derive(Clone, Debug)]
 pub struct ToolPath {
     wanted: Wanted,
@@ -25,11 +25,14 @@ pub struct ToolPath {
 impl ToolPath {
     /// Lays tracks over a part.
     ///
-    /// Checked are the options, and whether the wheel fits the surface: its slope, its hollows in every direction, and whether the body
-    /// of the wheel touches the part elsewhere. Travel, speed and acceleration are checked by [`super::Summary::check`].
+    /// Checks the options and the fit of the wheel: slope of the surface, hollows in every direction, and contact of
+    /// the wheel's body with the part away from the contact point. [`super::Summary::check`] checks travel, speed and
+    /// acceleration.
     ///
     /// # Errors
-    /// Options that make no path, and a wheel that does not fit, each with place, value, limit and remedy.
+    /// Returns an error for invalid options and for a wheel that does not fit. Each error gives place, value, limit
+    /// and remedy. If a constant tilt of the head solves the problem, the error is [`PathError::Upright`] with that
+    /// angle.
     pub fn new(wanted: Wanted, outline: Aperture, options: PathOptions) -> Result<Self, PathError> {
         options.check()?;
         let grain_mm = wanted.grain_mm();
@@ -51,8 +54,8 @@ impl ToolPath {
         fit::check_body(&self.wanted, &self.outline, &self.options)
     }
 
-    /// Returns the least angle between the upright direction of the head and a normal of the part, in rad: at 0 the pole of a ball touches, which
-    /// stands still.
+    /// Returns the smallest angle between the axis of the head and a normal of the part, in rad. At 0 a ball touches
+    /// with its pole, which has no cutting speed.
     pub fn least_lean_rad(&self) -> f64 {
         let lean = |place: [f64; 2]| {
             let contact = self.wanted.at(place);
@@ -61,43 +64,44 @@ impl ToolPath {
         fit::on_grid(&self.outline, fit::PLACES).into_iter().map(lean).fold(f64::INFINITY, f64::min)
     }
 
-    /// Returns the distance of the tracks over x and y, in millimetres.
+    /// Returns the distance between tracks over x and y, in millimetres.
     pub fn track_mm(&self) -> f64 {
         self.tracks.track_mm
     }
 
-    /// Returns the number of tracks, or of pieces of them where they leave the part.
+    /// Returns the number of tracks. A track that leaves the part and comes back counts once for each piece.
     pub fn tracks(&self) -> usize {
         self.tracks.spans.len()
     }
 
-    /// Returns the height at which the wheel travels, in millimetres, in the model frame.
+    /// Returns the height z of the rapid moves in x and y, in millimetres, in the model frame.
     pub fn safe_z_mm(&self) -> f64 {
         self.upright(self.safe_z_mm)
     }
 
-    /// Returns that height as it is seen from where the wheel comes from.
+    /// Returns the height of the rapid moves as seen from the side from which the wheel comes, in millimetres.
     pub(super) fn travel_mm(&self) -> f64 {
         self.safe_z_mm
     }
 
-    /// A height in the model frame that is seen from where the wheel comes from, or the other way round.
+    /// Converts a height as seen from the wheel's side into the model frame, or back. The sign changes for a wheel
+    /// from below.
     #[inline]
     pub(super) fn upright(&self, z_mm: f64) -> f64 {
         if self.options.from_below { -z_mm } else { z_mm }
     }
 
-    /// Nothing of the surface is finer than this, in millimetres.
+    /// Returns the smallest node spacing of the surface, in millimetres.
     pub(super) fn grain_mm(&self) -> f64 {
         self.grain_mm
     }
 
-    /// Returns how the path was laid.
+    /// Returns the options of the path.
     pub fn options(&self) -> &PathOptions {
         &self.options
     }
 
-    /// Returns the surface that it leaves.
+    /// Returns the target surface of the path.
     pub fn wanted(&self) -> &Wanted {
         &self.wanted
     }
@@ -107,7 +111,8 @@ impl ToolPath {
         &self.outline
     }
 
-    /// Returns where the wheel stands at a place of a track; NaN where a rim cannot touch, which [`ToolPath::new`] has refused.
+    /// Returns the position and tilt of the wheel at parameter `t` of a track. They are NaN if a rim cannot touch
+    /// there; [`ToolPath::new`] rejects these paths.
     #[inline]
     pub(super) fn stand(&self, span: &Span, t: f64) -> Stand {
         let contact = self.wanted.at(span.place(t));
@@ -117,14 +122,16 @@ impl ToolPath {
         self.options.stand(&contact, lifted).unwrap_or(none)
     }
 
-    /// The height that has to be travelled over at a place of a track.
+    /// Returns the height that rapid moves must clear at parameter `t` of a track, in mm; NaN if the wheel cannot
+    /// touch there.
     fn height_mm(&self, span: &Span, t: f64) -> f64 {
         let contact = self.wanted.at(span.place(t));
         let lifted = self.tracks.lift_mm(span, t, &self.options);
         self.options.stand(&contact, lifted).map_or(f64::NAN, |stand| self.options.height_mm(&contact, lifted, &stand))
     }
 
-    /// The highest place of the centre, looked for a millimetre apart on some of the tracks: the height of travel has room above it.
+    /// Returns the largest height that rapid moves must clear, in mm. The search uses steps of about 1 mm on some of
+    /// the tracks; the safe height above it leaves enough room.
     fn highest_mm(&self) -> Result<f64, PathError> {
         let highest = |span: &Span| {
             let (from, to) = span.with_leads(&self.options);
@@ -154,7 +161,7 @@ mod tests {
     use super::super::{Move, Pattern, Wheel};
     use super::*;
 
-    /// A surface without any symmetry, seen from +z (1) or from -z (-1).
+    /// Returns a surface without symmetry, seen from +z (1) or from -z (-1).
     fn seen(from: f64) -> Wanted {
         surface(move |[x, y]| {
             let z = 0.01 * x * x - 0.004 * y * y + 0.05 * x + 0.03 * (0.3 * y).sin();
@@ -172,7 +179,7 @@ mod tests {
         ] {
             let options = PathOptions { pattern, ..PathOptions::new(wheel, 1.5, 600.0) };
             let above = ToolPath::new(seen(1.0), PART, options).unwrap();
-            // A part that hangs, whose lower side is the mirror image of the upper side of the other.
+            // A hanging part: its lower side is the mirror image of the upper side of the other part.
             let below = ToolPath::new(seen(1.0), PART, PathOptions { from_below: true, ..options }).unwrap();
             assert_eq!(above.tracks(), below.tracks());
             for (up, down) in above.moves().zip(below.moves()) {
@@ -192,7 +199,7 @@ mod tests {
 
     #[test]
     fn from_below_a_ball_stands_under_the_surface_itself() {
-        // The surface of the model, its wheel under it.
+        // The surface is in the model frame; the wheel is under it.
         let options =
             PathOptions { from_below: true, ..PathOptions::new(Wheel::Sphere { radius_mm: 10.0 }, 1.5, 600.0) };
         let below = ToolPath::new(seen(-1.0), PART, options).unwrap();

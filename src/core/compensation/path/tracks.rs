@@ -1,4 +1,4 @@
-//! Tracks over x and y: a raster along x or a spiral from the rim inwards, cut where they are off the part.
+//! Tracks over x and y: a raster along x, or a spiral from the rim inwards. Tracks are cut where they leave the part.
 
 use std::f64::consts::TAU;
 
@@ -7,29 +7,30 @@ use crate::geometry::Aperture;
 use super::PathError;
 use super::options::{PathOptions, Pattern};
 
-/// Most tracks of a path.
+/// Maximum number of tracks of a path.
 const MOST_TRACKS: f64 = 1e6;
-/// Places at which a track is looked at for whether it is on the part; parts of it that are shorter may be missed.
+/// Number of intervals at whose ends a track is tested for being on the part. Shorter pieces of the track can be
+/// missed.
 const LOOKS: usize = 720;
 
-/// A track, or a piece of one.
+/// Track, or a piece of one, on a curve.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Span {
     curve: Curve,
-    /// Where it meets and leaves the part and its overrun, in the curve's own parameter.
+    /// Parameters of the curve at which the track enters and leaves the part with its overrun.
     pub(super) from: f64,
     pub(super) to: f64,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Curve {
-    /// The parameter is x.
+    /// Line along x. The parameter is x, in mm.
     Line { y_mm: f64 },
-    /// r = b |angle|; the parameter is the angle, which falls to 0 in the middle.
+    /// Spiral r = b |angle|. The parameter is the angle, in rad, which falls to 0 in the middle.
     Spiral { centre_mm: [f64; 2], rise_mm: f64 },
 }
 
-/// The tracks of a path.
+/// Tracks of a path, in the order of grinding.
 #[derive(Clone, Debug)]
 pub(super) struct Tracks {
     pub(super) spans: Vec<Span>,
@@ -37,7 +38,7 @@ pub(super) struct Tracks {
 }
 
 impl Span {
-    /// Returns x and y at a parameter.
+    /// Returns x and y at a parameter, in mm.
     #[inline]
     pub(super) fn place(&self, t: f64) -> [f64; 2] {
         match self.curve {
@@ -49,7 +50,7 @@ impl Span {
         }
     }
 
-    /// Returns the length over x and y from the origin of the parameter.
+    /// Returns the arc length over x and y from parameter 0, in mm.
     #[inline]
     fn arc_mm(&self, t: f64) -> f64 {
         match self.curve {
@@ -58,7 +59,7 @@ impl Span {
         }
     }
 
-    /// Returns the length over x and y per unit of the parameter.
+    /// Returns the length over x and y per unit of the parameter, in mm.
     #[inline]
     pub(super) fn speed_mm(&self, t: f64) -> f64 {
         match self.curve {
@@ -67,12 +68,13 @@ impl Span {
         }
     }
 
-    /// Returns the length between two parameters over x and y.
+    /// Returns the length over x and y between two parameters, in mm.
     pub(super) fn length_mm(&self, from: f64, to: f64) -> f64 {
         (self.arc_mm(to) - self.arc_mm(from)).abs()
     }
 
-    /// Returns the parameter this far beyond another one.
+    /// Returns the parameter at a signed arc length `by_mm` from parameter `t`. On a spiral Newton's method solves for
+    /// it.
     fn beyond(&self, t: f64, by_mm: f64) -> f64 {
         match self.curve {
             Curve::Line { .. } => t + by_mm,
@@ -91,7 +93,7 @@ impl Span {
         }
     }
 
-    /// Returns the parameters where the wheel begins to come down and has lifted off.
+    /// Returns the parameters at the start of the lead-in and at the end of the lead-out.
     pub(super) fn with_leads(&self, options: &PathOptions) -> (f64, f64) {
         let ahead = (self.to - self.from).signum() * options.lead_mm;
         (self.beyond(self.from, -ahead), self.beyond(self.to, ahead))
@@ -100,6 +102,10 @@ impl Span {
 
 impl Tracks {
     /// Lays tracks that cover the outline.
+    ///
+    /// # Errors
+    /// Returns [`PathError::TooManyTracks`] for 1e6 tracks or more, and [`PathError::Empty`] if no track is on the
+    /// part.
     pub(super) fn lay(outline: &Aperture, options: &PathOptions, track_mm: f64) -> Result<Self, PathError> {
         let [low, high] = outline.bounds();
         let size = [high[0] - low[0], high[1] - low[1]];
@@ -114,7 +120,8 @@ impl Tracks {
         if tracks.spans.is_empty() { Err(PathError::Empty) } else { Ok(tracks) }
     }
 
-    /// Returns how far the wheel is lifted off the surface at a parameter, in millimetres: s^2 / (2 rho) at s beyond a span's end.
+    /// Returns the lift of the wheel off the surface at a parameter, in millimetres: s^2 / (2 rho) at a distance s
+    /// beyond a span's end, with the lead radius rho.
     #[inline]
     pub(super) fn lift_mm(&self, span: &Span, t: f64, options: &PathOptions) -> f64 {
         let ahead = (span.to - span.from).signum();
@@ -131,7 +138,8 @@ impl Tracks {
 
 fn raster(outline: &Aperture, overrun_mm: f64, track_mm: f64, one_way: bool) -> Tracks {
     let [[x0, y0], [x1, y1]] = outline.bounds();
-    // From border to border in equal steps, so that the edges have their tracks; rounding makes no step more.
+    // Equal steps from border to border, so that a track runs along each edge. The factor keeps rounding from adding a
+    // step.
     let steps = ((y1 - y0) / track_mm * (1.0 - 1e-9)).ceil().max(1.0);
     let step_mm = (y1 - y0) / steps;
     let mut spans = Vec::new();
@@ -156,7 +164,7 @@ fn spiral(outline: &Aperture, overrun_mm: f64, track_mm: f64) -> Tracks {
     let rim_mm = rim.fold(0.0, f64::max);
     let rise_mm = track_mm / TAU;
     let curve = Curve::Spiral { centre_mm, rise_mm };
-    // A full turn at or beyond the rim, and what of it is within the overrun.
+    // Start one full turn beyond the rim; `on_part` keeps the pieces within the overrun.
     let outermost = rim_mm / rise_mm + TAU;
     let turns = (outermost / TAU).ceil() as usize;
     let mut spans: Vec<Span> = Vec::new();
@@ -173,7 +181,7 @@ fn spiral(outline: &Aperture, overrun_mm: f64, track_mm: f64) -> Tracks {
     Tracks { spans, track_mm }
 }
 
-/// Returns the pieces of a curve between two parameters that are within the overrun of the outline, in rising order.
+/// Returns the pieces of a curve between two parameters that are within the overrun of the outline, in ascending order.
 fn on_part(curve: &Span, outline: &Aperture, overrun_mm: f64, least: f64, most: f64) -> Vec<Span> {
     let inside = |t: f64| {
         let [x, y] = curve.place(t);

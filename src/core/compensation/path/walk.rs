@@ -1,68 +1,71 @@
-//! Along the tracks, point by point: as far from each to the next as the chord error allows.
+//! Moves along the tracks, point by point. Each step is as long as the chord error allows.
 
 use super::tilt::{Sag, Stand};
 use super::tracks::Span;
 use super::{Pattern, ToolPath};
 use crate::geometry::Point;
 
-/// Share of the chord error that a step aims at: the deviation is looked at in the middle of a step, and the largest is near it.
+/// Target of a step's deviation, as a share of the chord error. The deviation is evaluated in the middle of a step;
+/// its maximum is near the middle and can be a little larger.
 const AIM: f64 = 0.8;
-/// A step is never shorter than this share of the longest one.
+/// Limit below which a step is not shortened further, as a share of the longest step.
 const SHORTEST: f64 = 1e-5;
-/// Height above the beginning of a track down to which the wheel comes down rapidly, in millimetres.
+/// Height above the start of a track at which the rapid move down ends, in millimetres.
 const APPROACH_MM: f64 = 1.0;
-/// Share of the acceleration that a spiral takes up.
+/// Share of the acceleration limit that a spiral uses.
 const ACCELERATION_SHARE: f64 = 0.8;
 
-/// A move of the point that a program moves; in the model frame.
+/// Move of the programmed point, in the model frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Move {
-    /// Rapidly along z alone, in the air.
+    /// Rapid move along z alone, in the air, to this height in millimetres.
     RapidZ(f64),
-    /// Rapidly in x and y, at the safe height.
+    /// Rapid move in x and y, at the safe height, to this place in millimetres.
     RapidXy([f64; 2]),
-    /// Straight at a feed.
+    /// Straight move at a feed.
     Feed {
-        /// Where to, in millimetres.
+        /// End point, in millimetres.
         at: Point,
-        /// How fast.
+        /// Feed of the wheel's centre.
         feed_mm_min: f64,
     },
-    /// Rapidly in x and y, at the safe height, while the head turns.
+    /// Rapid move in x and y, at the safe height, while the head rotates.
     RapidTilted {
-        /// Where to.
+        /// End place in x and y.
         to_mm: [f64; 2],
         /// How far the head is turned there, right-handed.
         tilt_rad: f64,
     },
-    /// Straight at a feed while the head turns in proportion.
+    /// Straight move at a feed while the head rotates in proportion.
     FeedTilted {
-        /// Where to, in millimetres; the slides', where the control does not keep the wheel's centre.
+        /// End point, in millimetres: of the wheel's centre if the control compensates the pivot, otherwise of the
+        /// slides.
         at: Point,
         /// How far the head is turned there, right-handed.
         tilt_rad: f64,
-        /// How fast the wheel's centre moves.
+        /// Feed of the wheel's centre.
         feed_mm_min: f64,
-        /// How far it goes, which is not how far the slides go.
+        /// Distance that the wheel's centre moves. The slides move a different distance.
         centre_mm: f64,
     },
 }
 
-/// The moves of a path. Each point costs two places of the surface; nothing is stored.
+/// Iterator over the moves of a path. Each point needs at least two evaluations of the surface. No moves are stored.
 #[derive(Clone, Debug)]
 pub struct Moves<'a> {
     path: &'a ToolPath,
-    /// The next span, and where to stop.
+    /// Index of the next span, and index at which to stop.
     next: usize,
     end: usize,
     state: State,
-    /// How the path bends and where its x and y are, at the last point given.
+    /// Curvature of the path at the last point returned, in 1/mm.
     pub(super) bend: f64,
-    /// Whether the last point given is on the part or its overrun, and so not where the wheel comes down or lifts off.
+    /// True if the step to the last point returned is on the part or its overrun. False in a lead-in or lead-out.
     pub(super) on_span: bool,
-    /// The middle of the step that led to the last point, on the path; none where that began a track, and over the place where a lead begins or ends.
+    /// Point of the path in the middle of the step to the last point. `None` for the first point of a track, and for a
+    /// step across the place where a lead and the span meet.
     pub(super) middle: Option<Point>,
-    /// How far the wheel's centre has gone to the last point given.
+    /// Distance that the wheel's centre moved to the last point returned, in mm.
     centre_mm: f64,
 }
 
@@ -76,7 +79,7 @@ enum State {
     Ended,
 }
 
-/// The way along one span.
+/// State of the walk along one span.
 #[derive(Clone, Copy, Debug)]
 struct Walk {
     span: Span,
@@ -87,19 +90,19 @@ struct Walk {
 }
 
 impl ToolPath {
-    /// Returns the moves of the wheel's centre, from the first rapid one to the last.
+    /// Returns the moves of the wheel's centre, from the first rapid move to the last.
     pub fn moves(&self) -> Moves<'_> {
         Moves::of(self, 0, self.tracks())
     }
 
-    /// Returns the same moves track by track; each ends at the safe height.
+    /// Returns the same moves track by track. Each track ends at the safe height.
     pub fn moves_by_track(&self) -> Vec<Moves<'_>> {
         (0..self.tracks()).map(|k| Moves::of(self, k, k + 1)).collect()
     }
 }
 
 impl<'a> Moves<'a> {
-    /// The moves of some of the spans, which begin and end at the safe height.
+    /// Returns the moves of the spans `from..to`. They begin and end at the safe height.
     pub(super) fn of(path: &'a ToolPath, from: usize, to: usize) -> Self {
         let (state, bend, on_span, middle, centre_mm) = (State::Above, 0.0, false, None, 0.0);
         Self { path, next: from, end: to, state, bend, on_span, middle, centre_mm }
@@ -112,7 +115,7 @@ impl<'a> Moves<'a> {
         Walk { span, to, t: from, step, at: self.path.stand(&span, from) }
     }
 
-    /// A move in the model frame.
+    /// Converts a move as seen from the wheel's side into the model frame.
     #[inline]
     fn upright(&self, given: Move) -> Move {
         let upright = |z| self.path.upright(z);
@@ -123,7 +126,7 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// Goes on by as much as the chord error allows.
+    /// Advances by the longest step that the chord error allows, and proposes the length of the next step.
     #[inline]
     fn along(&mut self, mut walk: Walk) -> Walk {
         let path = self.path;
@@ -132,7 +135,7 @@ impl<'a> Moves<'a> {
         let longest = options.longest_step_mm.min(path.grain_mm()) / span.speed_mm(walk.t);
         let mut step = walk.step.min(longest);
         loop {
-            // A rest shorter than half a step joins the last one; two even ones are better than a long and a tiny one.
+            // If less than two steps remain, divide the rest into two equal steps: a long and a tiny step are worse.
             let whole = step >= left.abs();
             let t = if whole {
                 walk.to
@@ -155,7 +158,7 @@ impl<'a> Moves<'a> {
             let next = taken * (0.95 / share.max(1e-6).sqrt()).clamp(0.5, 2.0);
             let (low, high) = (span.from.min(span.to), span.from.max(span.to));
             self.on_span = low <= walk.t.min(t) && walk.t.max(t) <= high;
-            // Where the lead meets the span the path bends anew, and its middle says little of such a step.
+            // The curvature jumps where a lead meets the span. The middle does not represent a step across that place.
             let over_an_end = [low, high].iter().any(|end| walk.t.min(t) < *end && *end < walk.t.max(t));
             self.middle = (!over_an_end).then(|| Point::new(middle.at.x, middle.at.y, path.upright(middle.at.z)));
             walk = Walk { t, at, step: next, ..walk };
@@ -163,7 +166,7 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// The move to a point.
+    /// Returns the move at feed to a point.
     #[inline]
     fn feed(&self, stand: &Stand) -> Move {
         let (at, feed_mm_min) = (stand.at, self.feed_mm_min());
@@ -173,7 +176,7 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// The rapid move over the first point of a track.
+    /// Returns the rapid move to the place above the first point of a track.
     fn over(&self, walk: &Walk) -> Move {
         let to_mm = [walk.at.at.x, walk.at.at.y];
         match self.path.options().lean {
@@ -182,7 +185,8 @@ impl<'a> Moves<'a> {
         }
     }
 
-    /// The feed at the last point: on a spiral as low as the acceleration asks for, to two digits so that it seldom changes.
+    /// Returns the feed at the last point, in mm/min. On a spiral the acceleration limit lowers it to
+    /// (share * limit / curvature)^(1/2), rounded down to two digits so that it seldom changes.
     fn feed_mm_min(&self) -> f64 {
         let options = self.path.options();
         let (Pattern::Spiral, Some(limit)) = (options.pattern, options.spiral_acceleration_mm_s2) else {
@@ -200,7 +204,8 @@ impl<'a> Moves<'a> {
 impl Iterator for Moves<'_> {
     type Item = Move;
 
-    // Not inlined: a call is nothing beside a step along the path, and who writes the moves would compile all of this.
+    // Not inlined: the cost of a call is small compared with a step, and every user of the moves would otherwise
+    // compile all of this.
     fn next(&mut self) -> Option<Move> {
         let safe = self.path.travel_mm();
         let (state, given) = match self.state {
@@ -213,7 +218,7 @@ impl Iterator for Moves<'_> {
                 let walk = self.walk(self.path.tracks.spans[self.next]);
                 let first = self.next == 0;
                 self.next += 1;
-                // The wheel may be anywhere before the first move of all.
+                // Before the first move of the path the wheel can be anywhere.
                 if first { (State::Over(walk), Move::RapidZ(safe)) } else { (State::Down(walk), self.over(&walk)) }
             }
             State::Above => (State::Ended, Move::RapidZ(safe)),
@@ -228,7 +233,7 @@ impl Iterator for Moves<'_> {
         };
         let ended = matches!(state, State::Ended);
         self.state = state;
-        // The last retreat has been given with the last track.
+        // The last track already returned the last retreat.
         if ended { None } else { Some(self.upright(given)) }
     }
 }

@@ -1,8 +1,10 @@
-//! The surface that a pass is to leave: the nominal one, moved along its own normals by the level and the correction.
+//! Target surface of a pass: the nominal surface, shifted along its normals by the level (the remaining allowance)
+//! plus the correction.
 //!
-//! P(x, y) = S(x, y) + d(x, y) N(x, y) with d = level + correction. The normals are those of P itself, from the derivatives of
-//! the same interpolation that defines where P is: n ~ P_x x P_y, P_x = S_x + d_x N + d N_x. The slope of the correction is in
-//! them; with the nominal normals a wheel of radius R would be off by R |grad d|^2 / 2 along the normal and R |grad d| along the surface.
+//! P(x, y) = S(x, y) + d(x, y) N(x, y) with d = level + correction. The normals are those of P itself. They come from
+//! the derivatives of the same interpolation that defines P: n ~ P_x x P_y, P_x = S_x + d_x N + d N_x. They therefore
+//! include the slope of the correction. With the nominal normals a wheel of radius R would be off by R |grad d|^2 / 2
+//! along the normal and by R |grad d| along the surface.
 
 use crate::compensation::Correction;
 use crate::geometry::{Grid, Point, Vector};
@@ -10,10 +12,10 @@ use crate::geometry::{Grid, Point, Vector};
 use super::PathError;
 use super::field::{Field, Jet};
 
-/// Rings of nodes that are added around a correction at most.
+/// Maximum number of rings of nodes added around a correction.
 const MOST_RINGS: f64 = 200.0;
 
-/// The surface that a pass is to leave.
+/// Target surface of a pass.
 #[derive(Clone, Debug)]
 pub struct Wanted {
     nominal: Field,
@@ -21,31 +23,33 @@ pub struct Wanted {
     level_mm: f64,
 }
 
-/// A place of the wanted surface.
+/// Point of the target surface with its normal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Contact {
-    /// The point, in the model frame.
+    /// Position, in the model frame, in millimetres.
     pub point: Point,
-    /// Unit normal of the wanted surface, on the side of +z.
+    /// Unit normal of the target surface, towards +z.
     pub normal: Vector,
 }
 
-/// How the wanted surface bends at a place.
+/// Normal curvatures of the target surface at a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Bend {
-    /// The place and its normal.
+    /// Point and normal.
     pub contact: Contact,
-    /// Two unit vectors along the surface, at right angles: along x, and across.
+    /// Two orthogonal unit tangents: along x, and across.
     pub along: [Vector; 2],
-    /// Normal curvature in these directions, 1/mm, positive where the surface is hollow: along the first, mixed, along the second.
+    /// Second fundamental form in these directions, in 1/mm, positive in a hollow: normal curvature along the first,
+    /// mixed term, normal curvature along the second.
     pub curvature: [f64; 3],
 }
 
 impl Wanted {
-    /// Joins a nominal surface and a correction, which is levelled off within `level_off_mm` beyond its grid.
+    /// Creates the target surface from a nominal surface and a correction. Beyond its grid the correction levels off
+    /// within `level_off_mm`.
     ///
     /// # Errors
-    /// Values that are not finite.
+    /// Returns [`PathError::Correction`] if a value of the correction is not finite.
     pub fn new(nominal: Field, correction: &Correction, level_off_mm: f64) -> Result<Self, PathError> {
         if let Some(node) = correction.values_mm.iter().position(|v| !v.is_finite()) {
             let [x_mm, y_mm] = correction.grid.place_mm(node);
@@ -54,21 +58,21 @@ impl Wanted {
         Ok(Self { nominal, correction: spline_of(correction, level_off_mm), level_mm: correction.level_mm })
     }
 
-    /// Returns the point and the normal at a place of the nominal surface.
+    /// Returns the point and the normal of the target surface that belong to x and y of the nominal surface.
     #[inline]
     pub fn at(&self, place_mm: [f64; 2]) -> Contact {
         let (point, tangents) = self.tangents(place_mm);
         Contact { point, normal: tangents[0].cross(&tangents[1]).normalize() }
     }
 
-    /// The point, and its derivatives by x and y.
+    /// Returns the point and its derivatives by x and y.
     #[inline]
     fn tangents(&self, place_mm: [f64; 2]) -> (Point, [Vector; 2]) {
         let e = self.correction.at(place_mm);
         self.moved(place_mm, &Jet { value: self.level_mm + e.value, ..e })
     }
 
-    /// The nominal point moved along its normal, and the derivatives by x and y.
+    /// Returns the nominal point shifted along its normal by `e`, and its derivatives by x and y.
     #[inline]
     fn moved(&self, place_mm: [f64; 2], e: &Jet) -> (Point, [Vector; 2]) {
         let s = self.nominal.at(place_mm);
@@ -76,7 +80,7 @@ impl Wanted {
         let [p, q] = s.slope;
         let w = 1.0 / (1.0 + p * p + q * q).sqrt();
         let normal = Vector::new(-p * w, -q * w, w);
-        // N_x = (-r, -s, 0) w - N (p r + q s) w^2, and the like for y.
+        // N_x = (-r, -s, 0) w - N (p r + q s) w^2, and N_y likewise.
         let turned = |a: f64, b: f64| Vector::new(-a * w, -b * w, 0.0) - normal * ((p * a + q * b) * w * w);
         let [r, mixed, t] = s.bend;
         let by_x = Vector::new(1.0, 0.0, p) + normal * e.slope[0] + turned(r, mixed) * d;
@@ -84,14 +88,15 @@ impl Wanted {
         (Point::new(place_mm[0], place_mm[1], s.value) + normal * d, [by_x, by_y])
     }
 
-    /// Returns how the surface bends at a place, from differences of its normals over a thousandth of a cell.
+    /// Returns the curvatures of the surface at x and y, from central differences of its normals with a step of a
+    /// thousandth of a cell.
     pub(super) fn bend(&self, place_mm: [f64; 2]) -> Bend {
         let (point, [by_x, by_y]) = self.tangents(place_mm);
         let normal = by_x.cross(&by_y).normalize();
         let first = by_x.normalize();
         let along = [first, normal.cross(&first)];
         let steps = self.nominal.spacing_mm().map(|h| 1e-3 * h);
-        // The shape operator: how the normal turns for a step along x and along y.
+        // The shape operator: change of the normal per unit step along x and along y.
         let turn = |k: usize| {
             let mut sides = [place_mm; 2];
             sides[0][k] += steps[k];
@@ -100,46 +105,50 @@ impl Wanted {
             (ahead - behind) / (2.0 * steps[k])
         };
         let (n_x, n_y) = (turn(0), turn(1));
-        // Directions of the frame in terms of the derivatives: along[0] = by_x / |by_x|, along[1] = a by_x + b by_y.
+        // Tangents in terms of the derivatives: along[0] = by_x / |by_x|, along[1] = a by_x + b by_y.
         let (length, slant) = (by_x.norm(), by_y.dot(&along[1]));
         let b = 1.0 / slant;
         let a = -by_y.dot(&along[0]) / (slant * length);
         let turned = [n_x / length, n_x * a + n_y * b];
         let of = |i: usize, j: usize| -turned[i].dot(&along[j]);
-        // A hollow bends its normal against the step.
+        // In a hollow the normal turns against the step, hence the minus sign in `of`.
         Bend { contact: Contact { point, normal }, along, curvature: [of(0, 0), 0.5 * (of(0, 1) + of(1, 0)), of(1, 1)] }
     }
 
-    /// The share of a tangential step that leads to the foot of a point at a height over a surface that bends: 1 / (1 - h k), with the
-    /// mean curvature k, positive in a hollow.
+    /// Returns the factor for a tangent-plane step towards the projection of a point at height h above the surface:
+    /// 1 / (1 - h k), with the mean curvature k, positive in a hollow. The factor is limited to 1.9.
     fn bend_factor(&self, place_mm: [f64; 2], height_mm: f64) -> f64 {
         let [a, _, c] = self.bend(place_mm).curvature;
         (1.0 / (1.0 - 0.5 * height_mm * (a + c)).max(0.05)).min(1.9)
     }
 
-    /// Returns the shorter distance of the nodes of both fields, in millimetres: nothing of the surface is finer.
+    /// Returns the smallest node spacing of the nominal field and the correction field, in millimetres. The surface
+    /// has no finer detail.
     pub(super) fn grain_mm(&self) -> f64 {
         let [a, b] = [self.nominal.spacing_mm(), self.correction.spacing_mm()].map(|[x, y]| x.min(y));
         a.min(b)
     }
 }
 
-/// Returns by how much the centre of a ball that touches a nominal surface moves when the surface is moved along its normals.
+/// Returns the displacement of the centre of a ball that touches the nominal surface, when the surface is shifted
+/// along its normals.
 ///
-/// The ball's radius is the distance of its centre from the surface. With the foot P and the normal n of the nominal surface, the shift e
-/// and the normal n' of the moved surface: P + e n + R n' less the centre. `None` where no place of the surface is under the centre.
+/// The ball's radius R is the distance of its centre from the surface. Let P be the projection of the centre onto the
+/// nominal surface, n the normal there, e the shift, and n' the normal of the shifted surface. The result is
+/// P + e n + R n' minus the centre, in mm. Returns `None` if the projection does not converge.
 pub fn displaced(nominal: &Wanted, shift: &Field, centre: &Point) -> Option<Vector> {
     let mut place = [centre.x, centre.y];
     for _ in 0..STEPS {
         let (point, [by_x, by_y]) = nominal.tangents(place);
         let arm = centre - point;
         let normal = by_x.cross(&by_y).normalize();
-        // Where the tangent plane at this place has the centre above it; then on from there.
+        // Project the centre onto the tangent plane at this place; the next step starts there.
         let (a, b, c) = (by_x.norm_squared(), by_x.dot(&by_y), by_y.norm_squared());
         let (u, v) = (arm.dot(&by_x), arm.dot(&by_y));
         let determinant = a * c - b * b;
         let step = [(c * u - b * v) / determinant, (a * v - b * u) / determinant];
-        // A plane takes the ball's height into no account; half-way steps over a dome, shorter ones in a hollow, settle all the same.
+        // The tangent plane ignores the height of the centre above a curved surface. The factor corrects the step:
+        // shorter over a dome, longer in a hollow.
         let bend = nominal.bend_factor(place, arm.dot(&normal));
         place = [place[0] + step[0] * bend, place[1] + step[1] * bend];
         if !(place[0] + place[1]).is_finite() {
@@ -155,18 +164,21 @@ pub fn displaced(nominal: &Wanted, shift: &Field, centre: &Point) -> Option<Vect
     None
 }
 
-/// Steps down to a foot; each leaves a small share of the error, since how the surface bends is taken into account.
+/// Maximum number of steps to a projection. Each step leaves only a small share of the error, because the steps allow
+/// for the curvature.
 const STEPS: usize = 100;
 
-/// Lays a spline through a correction that goes on beyond its grid with a slope that fades away.
+/// Fits a spline through a correction and continues it beyond its grid with a slope that falls to zero within
+/// `length_mm`.
 ///
-/// With the slope g across the border and the length L the correction rises by g L (t - t^3 + t^4 / 2) at t = s / L <= 1: as
-/// steep as it was at the border, level at L, and never further.
+/// With the slope g across the border and the length L the correction rises by g L (t - t^3 + t^4 / 2) at a distance s
+/// beyond the border, for t = s / L from 0 to 1. The slope is continuous at the border and zero at L, and the
+/// correction is constant beyond L.
 pub fn spline_of(correction: &Correction, length_mm: f64) -> Field {
     let grid = correction.grid;
     let spacing_mm = [0, 1].map(|k| {
         let nodes = grid.counts()[k];
-        // A single row or column is level across.
+        // A single row or column is constant across.
         if nodes < 2 || grid.spacing_mm[k] <= 0.0 { length_mm } else { grid.spacing_mm[k] }
     });
     let rings = spacing_mm.map(|h| (length_mm / h).ceil().clamp(1.0, MOST_RINGS) as usize);
@@ -203,7 +215,7 @@ mod tests {
     use super::*;
     use crate::geometry::Grid;
 
-    /// A hollow sphere as a field.
+    /// Returns the height field of a hollow sphere.
     fn bowl(radius_mm: f64) -> Field {
         let on = Grid { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
         let places = (0..81 * 81).map(|k| [-10.0 + (k % 81) as f64 * 0.25, -10.0 + (k / 81) as f64 * 0.25]);

@@ -1,50 +1,56 @@
-//! The wheel: where its centre must be for it to touch a place, how it bends there, and what space it fills.
+//! Geometry of the wheel: position of its centre for a given contact, its curvatures at the contact, and the volume of
+//! its body.
 //!
-//! **Axes.** The spindle's direction is a unit vector in the model frame, fixed during the program unless a head tilts it. The point
-//! that a program moves is the centre of the ball, or the middle of the circle that the rim's own curve is swept around.
+//! **Axes.** The spindle's direction is a unit vector in the model frame, fixed during the program unless a head tilts
+//! it. The programmed point is the centre of the ball, or the centre of the circle along which the rim's profile is
+//! swept.
 //!
 //! ```text
 //!  sphere   c = p + R n
 //!  torus    c = p + r n + Rt m     a disc with a round rim, outer radius R = Rt + r
 //!  cup      c = p + r n + Rc m     a ring of mean radius Rc whose face has the radius r, spindle tilted by a
-//!           m = unit of (n less its component along the spindle)
+//!           m = unit vector along n minus the component of n along the spindle
 //! ```
 //!
-//! A disc's spindle lies along y, across tracks that run along x, unless said otherwise: it rolls along the track. A cup's spindle is
-//! tilted from z towards -x: the lowest place of its ring is on the side of -x, touches with the outer side of the face, and the rest of
-//! the ring stands clear. On a hollow sphere of radius rho the whole ring touches where the normal leans from the spindle by a with
-//! sin a = D / (2 (rho - r)); on a dome it would be the inner side of the face, with sin a = D / (2 (rho + r)). A free form has no one
-//! rho, so the spindle is tilted further than any slope of the part, and one place of the ring touches at a time: the outer one.
+//! By default a disc's spindle is along y, across tracks that run along x: the disc rolls along the track. A cup's
+//! spindle is tilted from z towards -x. The lowest point of its ring is then on the -x side and touches with the outer
+//! side of the face; the rest of the ring is clear of the part. On a hollow sphere of radius rho the whole ring
+//! touches if the angle a between the normal and the spindle satisfies sin a = D / (2 (rho - r)), with D = 2 Rc the
+//! mean diameter of the ring. On a dome the inner side of the face touches, with sin a = D / (2 (rho + r)). A free
+//! form has no single rho. The spindle is therefore tilted further than any slope of the part, and only one point of
+//! the ring touches at a time, on the outer side of the face.
 
 use crate::geometry::{Point, Vector};
 
 use super::wanted::Contact;
 
-/// The least angle between the normal and the spindle of a rim or a ring, sine: nearer, the place of contact runs around the wheel.
+/// Sine of the minimum angle between the normal and the spindle of a rim or a ring. At smaller angles the contact
+/// point runs around the wheel.
 pub(super) const LEAST_LEAN: f64 = 0.035;
 
-/// A wheel.
+/// Shape and size of a wheel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Wheel {
     /// A ball.
     Sphere {
-        /// Its radius, in millimetres.
+        /// Radius of the ball, in millimetres.
         radius_mm: f64,
     },
     /// A disc with a round rim.
     Torus {
-        /// Radius of the circle on which the rim's curve has its centres, in millimetres: the outer radius less the rim's.
+        /// Radius of the circle along which the rim's profile is swept, in millimetres: the outer radius minus the rim
+        /// radius.
         ring_mm: f64,
-        /// Radius of the rim's own curve, in millimetres.
+        /// Radius of the rim's profile, in millimetres.
         tube_mm: f64,
         /// Direction of the spindle, of unit length.
         spindle: Vector,
     },
     /// A ring that cuts with its face.
     Cup {
-        /// Radius to the middle of the face, in millimetres.
+        /// Mean radius of the ring: from the spindle to the middle of the face, in millimetres.
         ring_mm: f64,
-        /// Radius of the face's own curve, in millimetres.
+        /// Radius of the face's profile, in millimetres.
         tube_mm: f64,
         /// Direction of the spindle, from the face into the machine, of unit length.
         spindle: Vector,
@@ -52,12 +58,12 @@ pub enum Wheel {
 }
 
 impl Wheel {
-    /// A cup whose spindle is tilted by an angle from z towards -x.
+    /// Returns a cup whose spindle is tilted by an angle from z towards -x.
     pub fn tilted_cup(ring_mm: f64, tube_mm: f64, tilt_rad: f64) -> Self {
         Self::Cup { ring_mm, tube_mm, spindle: Vector::new(-tilt_rad.sin(), 0.0, tilt_rad.cos()) }
     }
 
-    /// Returns the point that the program moves when the wheel touches a place; `None` where a rim cannot touch it.
+    /// Returns the programmed point (the wheel's centre) for a contact, or `None` if the rim cannot touch there.
     #[inline]
     pub fn centre(&self, contact: &Contact) -> Option<Point> {
         let Contact { point, normal } = contact;
@@ -71,7 +77,8 @@ impl Wheel {
         }
     }
 
-    /// Returns the curvatures of the wheel where it touches, 1/mm, and the direction of the first: around the spindle, and across.
+    /// Returns the principal curvatures of the wheel at the contact, in 1/mm: around the spindle, then across. Also
+    /// returns the unit direction of the first.
     pub(super) fn curvatures(&self, normal: &Vector) -> ([f64; 2], Vector) {
         match self {
             Self::Sphere { radius_mm } => ([1.0 / radius_mm; 2], normal.cross(&Vector::y()).normalize()),
@@ -83,7 +90,8 @@ impl Wheel {
         }
     }
 
-    /// Returns the distance of a point from the wheel, given from its centre; negative inside.
+    /// Returns the signed distance of a point from the wheel's surface, in mm, negative inside. The point is relative
+    /// to the wheel's centre.
     pub fn distance_mm(&self, from_centre: &Vector) -> f64 {
         match self {
             Self::Sphere { radius_mm } => from_centre.norm() - radius_mm,
@@ -96,13 +104,13 @@ impl Wheel {
             Self::Cup { ring_mm, tube_mm, spindle } => {
                 let axial = from_centre.dot(spindle);
                 let radial = (from_centre - spindle * axial).norm();
-                // The wall of the cup stands on its face.
+                // The wall of the cup rises from its face along the spindle.
                 (radial - ring_mm).hypot(axial.min(0.0)) - tube_mm
             }
         }
     }
 
-    /// The same wheel with a larger radius; of a ball.
+    /// Returns a ball with its radius increased by `mm`; returns any other wheel unchanged.
     #[must_use]
     pub fn larger_by(self, mm: f64) -> Self {
         match self {
@@ -111,7 +119,7 @@ impl Wheel {
         }
     }
 
-    /// Returns how far the wheel reaches from its centre, in millimetres.
+    /// Returns the largest distance of a point of the rim or ball from the wheel's centre, in millimetres.
     pub fn reach_mm(&self) -> f64 {
         match self {
             Self::Sphere { radius_mm } => *radius_mm,
@@ -119,7 +127,7 @@ impl Wheel {
         }
     }
 
-    /// Returns the wheel with z turned round.
+    /// Returns the wheel mirrored in z: the z component of the spindle changes sign.
     #[must_use]
     pub fn mirrored(mut self) -> Self {
         if let Self::Torus { spindle, .. } | Self::Cup { spindle, .. } = &mut self {
@@ -128,7 +136,7 @@ impl Wheel {
         self
     }
 
-    /// Returns what the wheel is, for the header of a program.
+    /// Returns a description of the wheel for the header of a program.
     pub fn description(&self) -> String {
         let of = |v: &Vector| format!("{:.4} {:.4} {:.4}", v.x, v.y, v.z);
         match self {
@@ -170,7 +178,7 @@ mod tests {
                 let contact = contact(normal);
                 let from = contact.point - wheel.centre(&contact).unwrap();
                 assert!(wheel.distance_mm(&from).abs() < 1e-12, "{wheel:?}");
-                // Outwards along the normal is into the wheel, inwards is out of it.
+                // A step along the normal goes into the wheel; a step against it goes out of the wheel.
                 assert!((wheel.distance_mm(&(from + contact.normal * 0.1)) + 0.1).abs() < 1e-12);
                 assert!((wheel.distance_mm(&(from - contact.normal * 0.1)) - 0.1).abs() < 1e-12);
                 for k in 0..16 {
@@ -205,7 +213,8 @@ mod tests {
 
     #[test]
     fn a_cup_on_a_hollow_sphere_touches_with_all_of_its_ring_at_the_angle_of_the_formula() {
-        // sin a = D / (2 (rho - r)): the normal leans from the spindle by a, and every place of the ring is as far from the middle.
+        // sin a = D / (2 (rho - r)): the angle between normal and spindle is a. Every point of the ring is then at the
+        // same distance from the centre of the sphere.
         let (ring, tube, rho): (f64, f64, f64) = (20.0, 2.0, 100.0);
         let lean = (ring / (rho - tube)).asin();
         let wheel = Wheel::tilted_cup(ring, tube, lean);

@@ -8,7 +8,8 @@ const COMMON: Hyperparameters =
 const OWN: Field = Field::new(4e-3, 150.0);
 const A_SESSION: usize = 40;
 
-/// Points of a part of 102 x 62 mm that was measured so often, each time moved by what nobody knows: known first, then unseen, of one part.
+/// Simulates points of a part of 102 x 62 mm that is measured in several sessions, each with a random field of its own:
+/// first the known sessions, then the unseen ones, of the same part.
 fn planted(own_mm: f64, known: u32, unseen: u32, seed: u64) -> [Sessions; 2] {
     let n = A_SESSION * (known + unseen) as usize;
     let places: Vec<[f64; 2]> = (0..n)
@@ -32,7 +33,7 @@ fn planted(own_mm: f64, known: u32, unseen: u32, seed: u64) -> [Sessions; 2] {
     [of(0..known), of(known..known + unseen)]
 }
 
-/// A session after its best fit of height and tilts.
+/// Returns a session after its best fit of height and tilts.
 fn fitted(places: &[[f64; 2]], found: &[f64], session: usize) -> Observed {
     let rows = session * A_SESSION..(session + 1) * A_SESSION;
     let (places, found) = (&places[rows.clone()], &found[rows]);
@@ -41,7 +42,7 @@ fn fitted(places: &[[f64; 2]], found: &[f64], session: usize) -> Observed {
     Observed { fixed_effects: effects, ..Observed::without_effects(places.to_vec(), left) }
 }
 
-/// The share of what the unseen sessions found that lies within 95 %.
+/// Returns the share of the deviations of the unseen sessions that lie within the 95 % interval.
 fn within(between: &BetweenSessionVariance, [known, unseen]: &[Sessions; 2]) -> f64 {
     let told = between.predict(known, unseen).unwrap();
     let hit = told.iter().zip(unseen.deviations_mm());
@@ -55,7 +56,7 @@ fn what_differs_between_sessions_is_found_again_and_an_unseen_one_is_covered() {
     for seed in 0..PARTS {
         let sessions = planted(OWN.sigma_mm, 6, 2, u64::from(seed));
         let between = sessions[0].between_session_variance(&Prior::for_size(102.0)).unwrap();
-        // A session is fitted: what is left of its field is told by strength and range together.
+        // Each session is after its best fit: only strength and range together determine what remains of its field.
         let bent = |field: Field| field.sigma_mm / field.range_mm.powi(2);
         strength += (bent(between.session_field) / bent(OWN)).ln() / f64::from(PARTS);
         scatter += (between.hyperparameters.noise_sigma_mm / COMMON.noise_sigma_mm).ln() / f64::from(PARTS);
@@ -78,7 +79,8 @@ fn sessions_that_differ_by_nothing_are_told_so() {
 
 #[test]
 fn of_one_point_each_it_is_what_is_worked_out_by_hand() {
-    // Common 4, own 1, scatter 0.25, two sessions of a point at one place: K = 4 + 1.25 I, mean = 4 (d1 + d2) / 9.25.
+    // By hand: common variance 4, session variance 1, noise variance 0.25, and two sessions with a point each at one
+    // place. So K = 4 + 1.25 I, mean = 4 (d1 + d2) / 9.25.
     let one = |deviations: Vec<f64>, of: Vec<u32>| {
         Sessions::new(Observed::without_effects(vec![[1.0, 2.0]; deviations.len()], deviations), of).unwrap()
     };
@@ -98,7 +100,7 @@ fn of_one_point_each_it_is_what_is_worked_out_by_hand() {
     let variance = 4.0 - 2.0 * 16.0 / 9.25 + 1.0 + 0.25;
     assert!((told.mean_mm - 16.0 / 9.25).abs() < 1e-13 && (told.sigma_mm.powi(2) - variance).abs() < 1e-13, "{told:?}");
     assert!((told.degrees_of_freedom - 2.0 * (variance / (2.0 * own_u)).powi(2)).abs() < 1e-9, "{told:?}");
-    // In one session the same two say less: K = 5 + 0.25 I.
+    // In a single session the same two points have less information: K = 5 + 0.25 I.
     let together = between.predict(&one(vec![3.0, 1.0], vec![0, 0]), &one(vec![0.0], vec![0])).unwrap()[0];
     assert!((together.mean_mm - 16.0 / 10.25).abs() < 1e-13, "{together:?}");
 }
