@@ -1,4 +1,4 @@
-//! What the arms of the table do.
+//! Transitions of the cell: the actions that the arms of the table call.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,10 +20,10 @@ use State::{
     Suspending, Unholding, Unsuspending,
 };
 
-/// Fewer failures than these are no sign that it is in vain to try on, however long that has been so.
+/// Minimum number of failures before the time limit `vain` counts them as failing again and again.
 const FEW_FAILURES: u32 = 3;
 
-// Its vocabulary.
+// Basic operations, which the other blocks build on.
 impl Cell {
     pub(super) fn push(&mut self, command: Command) {
         self.commands.push(command);
@@ -49,7 +49,7 @@ impl Cell {
         }
     }
 
-    /// Notes how far the cell has come; failures before that are forgotten.
+    /// Records the furthest place that the cell has reached. Resets the failures of a machine that got further.
     pub(super) fn note_place(&mut self) {
         let Some(phase) = self.state.phase() else { return };
         let place = (self.cycle, phase.place());
@@ -61,7 +61,7 @@ impl Cell {
         }
     }
 
-    /// Forgets the failures of a machine: it has got further.
+    /// Resets the failures of a machine that got further. Withdraws the alarm if no machine has a reported series left.
     fn succeeds(&mut self, device: Device) {
         let was_told = std::mem::take(&mut self.vain[device as usize]).told;
         if was_told && !self.vain.iter().any(|vain| vain.told) {
@@ -69,13 +69,13 @@ impl Cell {
         }
     }
 
-    /// Notes that something of a machine has failed, and tells whether that is enough to try no further.
+    /// Counts one more failure of a machine. Returns true if the failures are enough to stop retrying.
     fn fails_again(&mut self, device: Device) -> bool {
         let Deadlines { vain, vain_failures, .. } = self.plan.deadlines;
         let now = self.now;
         let in_sight = matches!(self.state, Execute(phase) if phase == Phase::of(device, JobStep::Run));
         let Vain { failures, since, last, .. } = &mut self.vain[device as usize];
-        // One that was long ago has nothing to do with this one, nor has one behind which the job ran in sight for a while.
+        // An old failure has nothing to do with this one. Nor has one after which the job was seen running for a while.
         let over = if in_sight { vain / 2 } else { vain.saturating_mul(2) };
         if *failures == 0 || now.saturating_sub(*last) > over {
             (*failures, *since) = (0, now);
@@ -94,8 +94,8 @@ impl Cell {
         );
     }
 
-    /// Takes a state, and the deadline that goes with it. The time to come to a stand counts from the first HOLD, whatever becomes of
-    /// the link meanwhile.
+    /// Enters a state and sets its deadline. The time limit for a hold counts from the first HOLD, even if the link is
+    /// lost and comes back meanwhile.
     pub(super) fn go(&mut self, state: State) {
         if std::mem::take(&mut self.still) {
             self.withdraw(AlarmId::ProgressStands);
@@ -115,7 +115,8 @@ impl Cell {
         }
     }
 
-    /// Returns the present state around another phase.
+    /// Returns the present state with another phase in it. A state that is neither holding nor suspending becomes
+    /// `Execute`.
     pub(super) fn same(&self, phase: Phase) -> State {
         match self.state {
             Holding(_) => Holding(phase),
@@ -128,7 +129,7 @@ impl Cell {
         }
     }
 
-    /// Returns how long the present state may last without a sign of life.
+    /// Returns how long the present state may last without a sign of life. `None` means without a limit.
     fn limit(&self) -> Option<Duration> {
         let limits = &self.plan.deadlines;
         let job = self.state.phase().and_then(Phase::job).map(|(_, step)| step);
@@ -152,7 +153,8 @@ impl Cell {
         }
     }
 
-    /// Returns how long a running job may be without progress: until a person is told, and then until it is held.
+    /// Returns how long a running job may make no progress: first until a person is notified, after that until the job
+    /// is held.
     fn progress_limit(&self, device: Device) -> Duration {
         let limit = self.plan.deadlines.progress[device as usize];
         let notice = self.plan.deadlines.progress_notice[device as usize].map(|least| least.max(3 * self.pace));
@@ -168,7 +170,7 @@ impl Cell {
     }
 }
 
-// The way of a run.
+// The sequence of a run.
 impl Cell {
     pub(super) fn start(&mut self) {
         self.go(Starting);
@@ -195,7 +197,7 @@ impl Cell {
         self.stop(&format!("the {device} is not idle: {message}"), false);
     }
 
-    /// A machine comes back while the cell is held: it may still be at this run's job.
+    /// Handles a machine that connects again while the cell is held. The machine may still run the job of this run.
     pub(super) fn reconnected(&mut self, phase: Phase, device: Device, boot_id: u32, found: &Occupation) {
         let ours = phase.job().is_some_and(|(job, _)| job == device);
         let known = self.know(device);
@@ -204,7 +206,8 @@ impl Cell {
         if !known.ready {
             self.raise(AlarmId::NotIdle, &format!("{device}, {found}"));
         }
-        // Held means still: what became of a job that was out of sight is asked before a person is, and what moves is held.
+        // In HELD nothing may move. So first find out what became of a job that was out of sight, and hold it if it
+        // runs. Only after that ask a person.
         if matches!(self.state, Held(_)) && phase.job() == Some((device, JobStep::Reconcile)) {
             self.go(Holding(phase));
             self.push(Command::Reconcile { device, cycle: self.cycle });
@@ -236,7 +239,7 @@ impl Cell {
 
     pub(super) fn first_cycle(&mut self) {
         self.cycle = 1;
-        // Who loaded the part has seen both machines clear of it.
+        // The person who loaded the part saw that both machines were clear of it.
         self.known.iter_mut().for_each(|known| known.said_clear = true);
         self.enter(match self.plan.begin_with {
             Beginning::Grind => Grind(JobStep::Send),
@@ -244,7 +247,7 @@ impl Cell {
         });
     }
 
-    /// Goes on to a phase, or stops at the border before it if the cell is being held or suspended.
+    /// Continues with the next phase. Stops before it if the cell is being held or suspended.
     pub(super) fn advance(&mut self, next: Phase) {
         match self.state {
             Holding(_) | Held(_) => self.go(Held(restart_of(next))),
@@ -253,7 +256,7 @@ impl Cell {
         }
     }
 
-    /// Enters a phase. Whether the surroundings allow it is looked at here, at every entry, and not only when they change.
+    /// Enters a phase. Checks at every entry, and not only on a change, that the surroundings allow it.
     fn enter(&mut self, phase: Phase) {
         if matches!(phase.job(), Some((_, JobStep::Prepare | JobStep::Start))) && self.is_by_hand() {
             self.raise_by_hand();
@@ -289,7 +292,7 @@ impl Cell {
             JobStep::Collect => self.push(Command::Collect { cycle }),
             JobStep::Qualify => self.push(Command::Qualify { cycle }),
             JobStep::Acknowledge | JobStep::Discard => self.push(Command::Acknowledge { device }),
-            // The machine runs already, or is started with its interlock.
+            // The machine runs already, or `start_machine` starts it after the interlock check.
             JobStep::Run | JobStep::Send | JobStep::Start => {}
         }
     }
@@ -300,14 +303,15 @@ impl Cell {
         self.push(Command::VerifyClear { device });
     }
 
-    /// The machine is clear of the part: the job that waited for it goes on.
+    /// Marks the machine as clear of the part and continues the job that waited for it.
     pub(super) fn cleared(&mut self, phase: Phase, device: Device) {
         let known = self.know(device);
         (known.clear, known.asked_clear) = (true, false);
         self.advance(phase.job().map_or(Measure(JobStep::Send), |(job, _)| Phase::of(job, JobStep::Prepare)));
     }
 
-    /// The machine cannot tell: a person's word counts from its last start on, and without one a person is asked.
+    /// Handles a machine that cannot report whether it is clear of the part. A person's confirmation counts if the
+    /// machine was not started since. If there is none, the cell asks a person.
     pub(super) fn clear_unknown(&mut self, phase: Phase, device: Device) {
         if self.knows(device).said_clear {
             return self.cleared(phase, device);
@@ -332,12 +336,13 @@ impl Cell {
         }
     }
 
-    /// Whether a person is being asked if the machine that has to be clear is.
+    /// Returns true if a person is being asked whether the machine that this phase waits for is clear of the part.
     pub(super) fn asks_whether_clear(&self, phase: Phase) -> bool {
         awaits_clear(phase).is_some_and(|device| self.knows(device).asked_clear)
     }
 
-    /// The interlock: the other machine was seen clear since this job began, and nothing has been heard to the contrary.
+    /// Starts a machine if the interlock allows it: the other machine was seen clear since this job began, and no later
+    /// event contradicts that.
     fn start_machine(&mut self, device: Device) {
         let other = device.other();
         if !self.knows(other).clear {
@@ -353,7 +358,7 @@ impl Cell {
         self.push(Command::StartMachine { device, cycle: self.cycle });
     }
 
-    /// The machine said for certain that it did not start.
+    /// Takes back the count of a pass after proof from the machine that it did not start.
     fn not_started(&mut self, device: Device) {
         self.passes = self.passes.saturating_sub(u32::from(device == Device::Grinder));
     }
@@ -364,7 +369,7 @@ impl Cell {
         }
         self.raise(AlarmId::MachineRefused, &format!("{device}, {what}: {why}"));
         self.keeps[device as usize] = what == Asked::Acknowledge;
-        // The machine still has the job that a person called over: it is asked once more.
+        // The machine still has the job that a person declared over: ask it once more.
         let still_there = what == Asked::Discard && phase == Phase::of(device, JobStep::Discard);
         self.go(Held(if still_there { Phase::of(device, JobStep::Reconcile) } else { restart_of(phase) }));
     }
@@ -387,8 +392,9 @@ impl Cell {
         }
     }
 
-    /// A person says that a job is over of which the machine tells nothing. It may stand there with its result, and would refuse
-    /// the next job: it is asked to forget it, now if it can be.
+    /// Handles the declaration of a person that a job is over when the machine gives no information about it. The
+    /// machine may still have the job with its result, and would then refuse the next job. So the cell asks it to
+    /// discard the result: now if the machine is connected, otherwise later.
     pub(super) fn declared_over(&mut self, device: Device) {
         let discard = Phase::of(device, JobStep::Discard);
         self.keeps[device as usize] = false;
@@ -400,7 +406,7 @@ impl Cell {
         }
     }
 
-    /// A person says that a machine has nothing more to be told of a result.
+    /// Handles the declaration of a person that a machine need not be asked again to discard its result.
     pub(super) fn given_up(&mut self, phase: Phase) {
         self.withdraw(AlarmId::MachineRefused);
         self.keeps = [false; 2];
@@ -420,7 +426,7 @@ impl Cell {
         }
     }
 
-    /// A measurement is repeated under the next number, after a person has resumed: no START is ever given twice.
+    /// Repeats a measurement under the next cycle number, after a person resumes. No START is sent twice.
     pub(super) fn measure_anew(&mut self) {
         self.cycle += 1;
         self.go(Held(Measure(JobStep::Send)));
@@ -459,7 +465,7 @@ impl Cell {
         self.advance(Measure(JobStep::Discard));
     }
 
-    /// A measurement of which nothing can be made.
+    /// Raises an alarm for an unusable measurement and repeats the measurement.
     pub(super) fn useless(&mut self, id: AlarmId, case: &str) {
         self.raise(id, case);
         self.measure_anew();
@@ -481,7 +487,7 @@ impl Cell {
             let case = format!("{shift:.3} mm of at most {most:.3} mm, {turn:.2} of at most {most_turn:.2} degrees");
             self.useless(AlarmId::PartMisplaced, &case);
         } else if figures.touch_on.is_some() {
-            // Of the same measurement: nothing is judged by a part of it.
+            // More points of the same measurement follow. A partial measurement is not judged.
             self.advance(Measure(JobStep::Send));
         } else {
             self.figures = Some(Arc::new(figures.clone()));
@@ -494,12 +500,13 @@ impl Cell {
         let Judged { verdict, mut reason } = judge::judge(&self.plan, self.previous.as_deref(), &figures, self.passes);
         let response = figures.response;
         if verdict == Verdict::LeftOut {
-            // The figures of the part are not known yet: nothing is compared with them.
+            // The figures of the part are not known yet, so nothing is compared with them.
             self.push(Command::Announce(Judgement { cycle: self.cycle, verdict, reason: reason.clone() }));
             if !figures.left_out.as_ref().is_some_and(|left_out| left_out.again) {
                 return self.useless(AlarmId::LeftOut, &reason);
             }
-            // Only the places that are named, and of the same measurement: a touch that is not made again stays as it is.
+            // Touch only the named places again, in the same measurement. A point that is not touched again keeps its
+            // value.
             self.raise(AlarmId::LeftOut, &reason);
             return self.go(Held(Measure(JobStep::Send)));
         }
@@ -582,7 +589,8 @@ impl Cell {
 
 // Interruptions.
 impl Cell {
-    /// A hold by a person or from inside: what moves is told to hold, anything else comes to its border.
+    /// Holds on the order of a person or for a cause inside the cell. A machine that moves gets HOLD; anything else
+    /// runs to the end of its phase.
     pub(super) fn hold(&mut self, phase: Phase) {
         match phase.job() {
             Some((device, JobStep::Run)) => {
@@ -594,17 +602,18 @@ impl Cell {
         }
     }
 
-    /// A hold while the cell is suspended. A machine that is out of sight may still be moving, and is not called held.
+    /// Holds while the cell is suspended. A machine that is out of sight may still be moving, so the state is not
+    /// `Held` yet.
     pub(super) fn hold_suspended(&mut self, phase: Phase) {
         let unseen = matches!(phase.job(), Some((_, JobStep::Reconcile)));
         self.go(if unseen { Holding(phase) } else { Held(phase) });
     }
 
-    /// A machine moves while the cell shows that it stands: it is told to hold, and a person is told.
+    /// Handles a machine that moves while the cell is held or suspended: orders it to hold and raises an alarm.
     pub(super) fn moves_unasked(&mut self, phase: Phase, device: Device) {
         let astray = self.knows(device).astray;
         if phase.moving() == Some(device) {
-            // That it goes on is then a person's decision, whatever it was suspended for.
+            // A person then decides whether it continues, whatever the cause of the suspension was.
             self.go(Holding(Phase::of(device, JobStep::Run)));
         } else if astray {
             return;
@@ -615,7 +624,8 @@ impl Cell {
         self.push(Command::HoldMachine { device });
     }
 
-    /// A machine that no order of the cell has set going moves: it is told to hold, and so is what moves beside it.
+    /// Handles a machine that moves without an order of the cell: orders it to hold, and also holds the machine that
+    /// runs its job.
     pub(super) fn strays(&mut self, phase: Phase, device: Device) {
         let known = self.know(device);
         known.clear = false;
@@ -632,7 +642,7 @@ impl Cell {
         }
     }
 
-    /// Returns whether a machine is in manual mode.
+    /// Returns true if a machine is in manual mode.
     fn is_by_hand(&self) -> bool {
         self.known.iter().any(|known| known.manual)
     }
@@ -643,7 +653,7 @@ impl Cell {
         self.raise(AlarmId::NotAutomatic, &format!("{} in manual mode", names.join(" and ")));
     }
 
-    /// A machine was taken out of automatic mode: nothing moves beside it, and nothing that waits goes on by itself.
+    /// Handles a machine that left automatic mode: no machine moves meanwhile, and no waiting job continues by itself.
     pub(super) fn by_hand(&mut self, device: Device, message: &str) {
         self.know(device).manual = true;
         let Some((phase, moving)) = self.state.phase().and_then(|phase| Some((phase, phase.moving()?))) else { return };
@@ -667,7 +677,7 @@ impl Cell {
         }
     }
 
-    /// The job gives a sign of progress.
+    /// Handles a sign of progress of the running job. Records the longest time between two signs.
     pub(super) fn progressed(&mut self, device: Device) {
         self.succeeds(device);
         if let Some(last) = self.progressed.replace(self.now) {
@@ -676,15 +686,15 @@ impl Cell {
         self.go(self.state);
     }
 
-    /// A command that was to lead on was not given: the cell waits for no answer to it.
+    /// Handles a command that was not sent because it could not be recorded: the cell waits for no answer to it.
     pub(super) fn not_on_record(&mut self, phase: Phase) {
         let runs = matches!(phase.job(), Some((_, JobStep::Run)));
         match self.state {
-            // A HOLD is given whether it is on record or not.
+            // HOLD is sent whether it is recorded or not.
             Execute(_) | Holding(_) | Suspending(_) if runs => {}
-            // That a START was not given is told as a refusal; without one it may have moved the machine.
+            // A START that was not sent is reported as a refusal. Without that report the machine may have moved.
             _ if matches!(phase.job(), Some((_, JobStep::Start))) => {}
-            // A machine that has to come to a stand has to, whether or not it was found out what it does.
+            // A machine that was ordered to hold must stop, even if the cell has not found out what it does.
             Holding(_) if self.hold_due.is_some() => {
                 if let Some(device) = phase.moving() {
                     self.push(Command::HoldMachine { device });
@@ -694,7 +704,8 @@ impl Cell {
         }
     }
 
-    /// The machine shows no more of the job that it was seen at: it is asked what became of it, and nothing is concluded before.
+    /// Handles a machine that no longer shows the job at which it was seen. Asks the machine what became of the job,
+    /// and concludes nothing before the answer.
     pub(super) fn vanished(&mut self, device: Device, why: &str) {
         self.raise(AlarmId::JobVanished, &format!("{device}, {why}"));
         let asked = Phase::of(device, JobStep::Reconcile);
@@ -741,7 +752,7 @@ impl Cell {
                 self.withdraw(alarm);
             }
         }
-        // While it failed again and again it was not told each time.
+        // While the link failed again and again, not every loss raised the alarm.
         if !self.raised.contains_key(&AlarmId::LinkLost)
             && let Some(Cause::Link(device)) = self.causes.iter().find(|cause| matches!(cause, Cause::Link(_))).copied()
         {
@@ -757,7 +768,7 @@ impl Cell {
         }
     }
 
-    /// A condition is missing while a machine moves.
+    /// Suspends because a condition is missing while a machine moves.
     pub(super) fn suspend(&mut self, phase: Phase) {
         self.go(Suspending(phase));
         if let Some((device, JobStep::Run)) = phase.job() {
@@ -803,15 +814,15 @@ impl Cell {
         }
     }
 
-    /// A link is lost: a phase that needs it waits at a place from which it can be taken up again; a job of the other machine goes on.
-    /// A machine that was told to hold is not called held before it has said that it stands.
+    /// Handles a lost link. A phase that needs the link waits at a place from which it can restart. A job of the other
+    /// machine continues. A machine that was ordered to hold counts as held only after it confirms that it stands.
     pub(super) fn link_lost(&mut self, phase: Phase, device: Device, why: &str, wait: fn(Phase) -> State) {
         self.note_link(device, true);
         let needed = phase.job().map(|(job, _)| job) == Some(device) || awaits_clear(phase) == Some(device);
         let fails_again = self.fails_again(device);
-        // The cell does without a machine that it does not need.
+        // The cell continues without a machine that it does not need.
         let is_vain = fails_again && needed;
-        // A failure that was told as one that comes again and again is not told each time.
+        // A failure that was already reported as recurring is not reported each time.
         let was_told = self.vain[device as usize].told && (!needed || self.raised.contains_key(&AlarmId::FailsAgain));
         if !(fails_again && was_told) {
             self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
@@ -826,7 +837,7 @@ impl Cell {
         if is_holding && phase.moving() == Some(device) {
             self.go(Holding(out_of_sight(phase)));
             if is_vain {
-                // However often the line comes back meanwhile.
+                // Keep this deadline, however often the link comes back meanwhile.
                 self.hold_due = self.hold_due.or(self.deadline);
                 self.deadline = self.hold_due;
             }
@@ -835,7 +846,8 @@ impl Cell {
         }
     }
 
-    /// This program can no longer speak to a machine. Nothing brings that back, so nothing waits for it but a person.
+    /// Handles a station of this program that has failed and can no longer talk to its machine. It does not recover by
+    /// itself, so a phase that needs it is held for a person.
     pub(super) fn station_failed(&mut self, device: Device, why: &str) {
         self.note_link(device, true);
         let case = format!("{device}, {why}");
@@ -884,7 +896,7 @@ impl Cell {
         let Some((_, step)) = restart_of(phase).job().filter(|(job, _)| *job == device) else { return };
         match step {
             JobStep::Send => {}
-            // That the job is over is known; whether its result is still there is asked again.
+            // The job is known to be over. The answer to a later request shows whether its result is still there.
             JobStep::Acknowledge | JobStep::Discard => self.go(Held(phase)),
             _ => self.go(Held(Phase::of(device, JobStep::Reconcile))),
         }
@@ -930,10 +942,10 @@ impl Cell {
                 self.raise(AlarmId::MachineHeldItself, &device.to_string());
                 self.go(Held(run));
             }
-            // It was held before it is told to go on, and is seen so once more where its link has just come back.
+            // It was held before RESUME is sent, and is seen held once more if its link has just come back.
             Unholding(_) | Unsuspending(_) if at_job => {}
             Held(_) | Suspended(_) if at_job => {}
-            // It had no job, moved, and was told to hold.
+            // It had no job, moved, and was ordered to hold.
             _ if !at_job && self.raised.contains_key(&AlarmId::MovesUnasked) => {}
             state => return Err(format!("the {device} has no job that could be held in the state {state}")),
         }
@@ -957,10 +969,11 @@ impl Cell {
         Ok(())
     }
 
-    /// The machine moves. If a condition went missing meanwhile it is held again.
+    /// Enters the running state. Holds or suspends the machine again if one is in manual mode or a condition is
+    /// missing.
     pub(super) fn runs(&mut self, run: Phase) {
         self.go(Execute(run));
-        // What passed while it stood says nothing of its pace.
+        // The time during which the machine was held is no measure of its pace.
         self.progressed = None;
         if self.is_by_hand() {
             self.raise_by_hand();
@@ -984,13 +997,14 @@ impl Cell {
             }
             (Reconciliation::Running, _) => self.runs(run),
             (Reconciliation::Held, Holding(_)) => self.go(Held(run)),
-            // It held itself, as it should when nobody talks to it: that it moves again is a person's decision.
+            // It held itself, as it should when the link is silent. A person decides whether it moves again.
             (Reconciliation::Held, _) => {
                 self.raise(AlarmId::MachineHeldItself, &device.to_string());
                 self.go(Held(run));
             }
             (Reconciliation::Ended(result), _) => self.ended(device, *result),
-            // A machine that has forgotten its job says so too; a second start would go over what the first one ground.
+            // A machine that has forgotten its job gives this answer too. A second start would grind again what the
+            // first one ground.
             (Reconciliation::NotStarted, _) if self.begun[device as usize] => {
                 self.unknown(device, "it says that this job never began, and it was seen at it");
             }
@@ -1022,7 +1036,7 @@ impl Cell {
         self.push(Command::Reconcile { device, cycle: self.cycle });
     }
 
-    /// This program was started again: nothing is known of the machines but that they may be at this run's job.
+    /// Handles a restart of this program. The cell then knows only that the machines may still run the job of this run.
     pub(super) fn restarted(&mut self, actor: &str) {
         if self.state == Completing {
             self.raise(AlarmId::NotClear, "not both were seen clear before the program ended");
@@ -1045,7 +1059,7 @@ impl Cell {
 
 // The ends, and time.
 impl Cell {
-    /// Ends in order: a machine at a job is stopped, a result is given back, and then the run is over.
+    /// Ends in order: stops a machine that is at a job, or acknowledges its result. After that the run is over.
     pub(super) fn stop(&mut self, reason: &str, judged_out: bool) {
         reason.clone_into(&mut self.reason);
         self.judged_out = judged_out;
@@ -1073,7 +1087,8 @@ impl Cell {
         self.push(Command::Finish(ending));
     }
 
-    /// The safe sequence: every machine that was met in this run is told to end at once; then each is seen to be clear.
+    /// Runs the safe sequence: sends ABORT to every machine that was connected in this run; after that checks that each
+    /// is clear.
     pub(super) fn abort(&mut self, reason: &str) {
         reason.clone_into(&mut self.reason);
         self.repeated = false;
@@ -1093,7 +1108,7 @@ impl Cell {
         }
     }
 
-    /// The program was started again in the middle of the safe sequence.
+    /// Starts the safe sequence again, because the program was restarted in the middle of it or of a stop.
     pub(super) fn abort_again(&mut self) {
         for device in Device::BOTH {
             if self.knows(device).met {
@@ -1109,7 +1124,7 @@ impl Cell {
         self.verify_clear(device);
     }
 
-    /// A machine was seen, at the end of a run.
+    /// Handles the last look at a machine at the end of a run. Raises an alarm if it is not clear of the part.
     pub(super) fn seen(&mut self, device: Device, clear: bool, message: &str) {
         if !clear {
             self.raise(AlarmId::NotClear, &format!("{device}, {message}"));
@@ -1136,7 +1151,7 @@ impl Cell {
         self.push(Command::Finish(Ending::Accepted { cycle, reason }));
     }
 
-    /// Time has passed. A tick before its time is no fault and does nothing.
+    /// Handles a deadline. An event that comes before the deadline is allowed and does nothing.
     pub(super) fn due(&mut self) {
         if !self.is_due() {
             return;
@@ -1197,7 +1212,7 @@ impl Cell {
         }
     }
 
-    /// Returns whether a person is told of a job without progress before it is held.
+    /// Returns true if a person is notified of a job without progress before the job is held.
     fn is_to_be_told(&self, device: Device) -> bool {
         !self.still && self.progress_limit(device) < self.plan.deadlines.progress[device as usize]
     }
@@ -1230,7 +1245,7 @@ impl Cell {
     }
 }
 
-/// Returns the place from which a phase is taken up again while its machine has not been started.
+/// Returns the phase from which to restart if the machine has not been started.
 pub(super) fn restart_of(phase: Phase) -> Phase {
     match phase.job() {
         Some((device, JobStep::Clear | JobStep::Prepare | JobStep::Start)) => Phase::of(device, JobStep::Send),
@@ -1238,7 +1253,7 @@ pub(super) fn restart_of(phase: Phase) -> Phase {
     }
 }
 
-/// Returns the place from which a phase is taken up again after its machine was out of sight.
+/// Returns the phase from which to restart after the machine was out of sight.
 fn out_of_sight(phase: Phase) -> Phase {
     match phase.moving() {
         Some(device) => Phase::of(device, JobStep::Reconcile),
@@ -1246,7 +1261,7 @@ fn out_of_sight(phase: Phase) -> Phase {
     }
 }
 
-/// Returns the machine that is to be seen clear of the part.
+/// Returns the machine that this phase waits to see clear of the part.
 pub(super) fn awaits_clear(phase: Phase) -> Option<Device> {
     match phase.job() {
         Some((device, JobStep::Clear)) => Some(device.other()),
@@ -1255,12 +1270,12 @@ pub(super) fn awaits_clear(phase: Phase) -> Option<Device> {
     }
 }
 
-/// Returns the machine whose result is being given back.
+/// Returns the machine whose result this phase acknowledges or discards.
 pub(super) fn awaits_acknowledge(phase: Phase) -> Option<Device> {
     phase.job().filter(|(_, step)| matches!(step, JobStep::Acknowledge | JobStep::Discard)).map(|(device, _)| device)
 }
 
-/// Returns whether a phase waits for the answer to a question.
+/// Returns true if a phase waits for the machine's answer to this request.
 pub(super) fn awaits(phase: Phase, device: Device, what: Asked) -> bool {
     let steps: &[JobStep] = match what {
         Asked::Load => &[JobStep::Send],
@@ -1273,12 +1288,12 @@ pub(super) fn awaits(phase: Phase, device: Device, what: Asked) -> bool {
     phase.job().is_some_and(|(job, step)| job == device && steps.contains(&step))
 }
 
-/// Returns the machine that is at a job, if one is.
+/// Returns the machine that is at a job, if there is one.
 pub(super) fn running(state: State) -> Option<Device> {
     state.phase().and_then(Phase::moving)
 }
 
-/// Returns the machine whose job is being found out about.
+/// Returns the machine whose job is being reconciled.
 pub(super) fn reconciling(state: State) -> Option<Device> {
     match state {
         Execute(phase) | Holding(phase) | Suspending(phase) | Unsuspending(phase) | Unholding(phase) => {
@@ -1288,7 +1303,7 @@ pub(super) fn reconciling(state: State) -> Option<Device> {
     }
 }
 
-/// Writes the reason that a person gave, if any.
+/// Formats the reason that a person gave, as ", because ...". Returns an empty string if there is none.
 pub(super) fn because(reason: &str) -> String {
     if reason.is_empty() { String::new() } else { format!(", because {reason}") }
 }

@@ -1,5 +1,5 @@
-//! What is to be done: imperatives. The drive journals each before it carries it out. Big data travels by the number of its
-//! cycle only.
+//! Commands of the cell. The drive records each in the journal before it executes it. Large data is not in a command:
+//! the cycle number refers to it.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,90 +7,92 @@ use super::alarm::{Alarm, AlarmId};
 use super::event::Event;
 use super::state::{Device, State};
 
-/// An imperative to a machine or about a cycle, and the event that answers it.
+/// Command to a machine or about a cycle, and the event that answers it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[expect(missing_docs, reason = "the fields are named for what they are")]
 #[serde(tag = "command", rename_all = "snake_case")]
 pub enum Command {
-    /// Open the link and prove which machine is there: `Connected` or `NotConnected`.
+    /// Open the link and verify the identity of the machine. Answer: `Connected` or `NotConnected`.
     Connect { device: Device },
-    /// Ask a person, or the recipe, for the part: `LoadConfirmed`.
+    /// Ask a person, or the recipe, for the part. Answer: `LoadConfirmed`.
     AskToLoad,
-    /// Send the pass and the map of this cycle to the grinder, read them back and compare: `PassLoaded` or `Refused`.
+    /// Send the pass and the map of this cycle to the grinder, read them back and compare. Answer: `PassLoaded` or
+    /// `Refused`.
     LoadPass { cycle: u32 },
-    /// Send the plan of this cycle to the CMM, read it back and compare: `PlanLoaded` or `Refused`.
+    /// Send the plan of this cycle to the CMM, read it back and compare. Answer: `PlanLoaded` or `Refused`.
     LoadPlan { cycle: u32 },
-    /// Read a fresh status, moving nothing: `Cleared`, `Obstructed` or `ClearUnknown`.
+    /// Read a fresh status without moving anything. Answer: `Cleared`, `Obstructed` or `ClearUnknown`.
     VerifyClear { device: Device },
-    /// Ask a person to see whether a machine that cannot tell it is clear of the part: `ClearConfirmed`.
+    /// Ask a person to check that a machine is clear of the part, if the machine cannot report it. Answer:
+    /// `ClearConfirmed`.
     AskWhetherClear { device: Device },
-    /// Prepare the job; a preparation that still stands is taken back first: `Prepared` or `Refused`.
+    /// Prepare the job; first take back a preparation that is still active. Answer: `Prepared` or `Refused`.
     Prepare { device: Device, cycle: u32 },
-    /// Start the prepared job, at most once: `Started`, `StartUnknown` or, if the machine said no, `Refused`.
+    /// Start the prepared job, at most once. Answer: `Started`, `StartUnknown` or, if the machine refused, `Refused`.
     StartMachine { device: Device, cycle: u32 },
-    /// Bring the machine to its safe place: `MachineHeld`, or `Ended` if the job was over before.
+    /// Bring the machine to its safe place. Answer: `MachineHeld`, or `Ended` if the job was over before.
     HoldMachine { device: Device },
-    /// Let the held machine go on: `MachineResumed` or `Refused`.
+    /// Resume the held machine. Answer: `MachineResumed` or `Refused`.
     ResumeMachine { device: Device },
-    /// End the job in order, also one that is only prepared: `Ended`.
+    /// End the job in order, even if it is only prepared. Answer: `Ended`.
     StopMachine { device: Device },
-    /// End at once, by the machine's own safe sequence: `AbortConfirmed`.
+    /// End at once, by the machine's own safe sequence. Answer: `AbortConfirmed`.
     AbortMachine { device: Device },
-    /// Bring a machine that was aborted or faulted in an earlier run back to idle: `Connected` or `Refused`.
+    /// Bring a machine that was aborted or faulted in an earlier run back to idle. Answer: `Connected` or `Refused`.
     ClearMachine { device: Device },
-    /// Find out what became of the job: `Reconciled`.
+    /// Find out what became of the job. Answer: `Reconciled`.
     Reconcile { device: Device, cycle: u32 },
-    /// Read, check and store the points of this cycle: `Collected`.
+    /// Read, check and store the points of this cycle. Answer: `Collected`.
     Collect { cycle: u32 },
-    /// Compare the probe with the reference sphere: `Qualified`.
+    /// Compare the probe with the reference sphere. Answer: `Qualified`.
     Qualify { cycle: u32 },
-    /// Let the machine forget its result, also where it has none: `Acknowledged`.
+    /// Let the machine discard its result, even if it has none. Answer: `Acknowledged`.
     Acknowledge { device: Device },
-    /// Register the measurement of this cycle: `Registered` or `RegistrationFailed`.
+    /// Register the measurement of this cycle. Answer: `Registered` or `RegistrationFailed`.
     Register { cycle: u32 },
-    /// Compute the map of the next pass from this cycle: `Compensated` or `CompensationRefused`.
+    /// Compute the map of the next pass from this cycle. Answer: `Compensated` or `CompensationRefused`.
     Compensate { cycle: u32 },
-    /// Tell how the cycle was judged. No answer.
+    /// Announce the judgement of the cycle. No answer.
     Announce(Judgement),
     /// Show an alarm. No answer.
     Raise(Alarm),
-    /// Take an alarm back. No answer.
+    /// Withdraw an alarm. No answer.
     Withdraw { alarm: AlarmId },
-    /// Tell that an event did not fit in this state, and why, for the person who sent it. No answer.
+    /// Report that an event did not fit in this state, and why, to the person who sent it. No answer.
     Refuse { event: Box<Event>, state: State, why: String },
-    /// The run is over: the last command. No answer.
+    /// End the run: the last command. No answer.
     Finish(Ending),
 }
 
-/// How a cycle was judged.
+/// Judgement of a cycle.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Judgement {
     /// The cycle.
     pub cycle: u32,
-    /// What follows.
+    /// Verdict.
     pub verdict: Verdict,
-    /// Why, for the operator.
+    /// Reason, for the operator.
     pub reason: String,
 }
 
-/// What follows from the figures of a cycle.
+/// Verdict on the figures of a cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Verdict {
     /// In tolerance: the part is done.
     Accept,
-    /// Another pass.
+    /// Not in tolerance yet: another pass.
     Continue,
     /// Worse than before.
     Diverging,
-    /// The part does not answer to the map as it should.
+    /// Wrong response of the part to the map.
     WrongResponse,
-    /// No better than before, or not going to be.
+    /// No better than before, or no improvement expected.
     Stalled,
-    /// The uncertainty reaches over a limit, and another pass would not help.
+    /// The uncertainty reaches across a limit, and another pass would not help.
     Undecided,
-    /// In tolerance but for points that were left out: those places are to be touched again.
+    /// In tolerance only without the outliers: touch those places again.
     LeftOut,
     /// No pass is left.
     MaxCycles,
@@ -98,38 +100,38 @@ pub enum Verdict {
     BudgetSpent,
 }
 
-/// How a run ended: the last cycle, 0 if none had begun, and why, for the operator.
+/// Ending of a run, with the last cycle (0 if none had begun) and the reason, for the operator.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[expect(missing_docs, reason = "the fields are told above")]
 #[serde(tag = "ending", rename_all = "snake_case")]
 pub enum Ending {
     /// The part is accepted.
     Accepted { cycle: u32, reason: String },
-    /// The run came to its end in order and the part is not in tolerance, or was never judged to be.
+    /// The run ended in order, but the part is not in tolerance or was never judged.
     NotAccepted { cycle: u32, reason: String },
-    /// The run could not begin, or was stopped; `ordered` where a person did.
+    /// The run could not begin, or was stopped. `ordered` is true if a person ordered the stop.
     Stopped {
         cycle: u32,
         reason: String,
         #[serde(default)]
         ordered: bool,
     },
-    /// The run was aborted; `confirmed` where both machines said that they stand.
+    /// The run was aborted. `confirmed` is true if both machines confirmed that they stand still.
     Aborted { cycle: u32, confirmed: bool, reason: String },
 }
 
-/// Spells a label as it is recorded.
+/// Formats a label as it is recorded.
 pub(super) fn spelled((name, device): (&'static str, Option<Device>)) -> String {
     device.map_or(name.to_owned(), |device| format!("{name} {device}"))
 }
 
 impl Command {
-    /// Returns the name of the command, as it is recorded, with the machine that it is for.
+    /// Returns the name of the command as it is recorded, with its machine.
     pub fn name(&self) -> String {
         spelled(self.label())
     }
 
-    /// Returns what [`Self::name`] is made of.
+    /// Returns the parts of [`Self::name`]: the kind of command and the machine.
     pub(super) fn label(&self) -> (&'static str, Option<Device>) {
         let (name, device) = match self {
             Self::Connect { device } => ("connect", Some(device)),

@@ -1,5 +1,5 @@
-//! What happened: orders of people, facts from machines, results of computations. Everything the cell ever learns comes
-//! as one of these, so that a run can be replayed from its journal.
+//! Events: orders of people, facts from machines, results of computations. The cell gets all its information as events,
+//! so a run can be replayed from its journal.
 
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -7,20 +7,21 @@ use std::fmt;
 use super::figure::Interval;
 use super::state::Device;
 
-/// A person, and where the order was given.
+/// Person, and the place at which the order was given.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Actor {
-    /// The name of the person, or of the program that acts for one.
+    /// Name of the person, or of the program that acts for one.
     pub name: String,
-    /// The terminal or the computer.
+    /// Terminal or computer.
     pub station: String,
 }
 
-/// A fact, an order or a result.
+/// Fact, order or result.
 ///
-/// `device` is the machine that it comes from or is about, and `boot_id` the number of this start of its application. `cycle` travels with
-/// everything that belongs to one: what belongs to another cycle is refused. `actor` gave the order, looked, or started the program, and
-/// says `reason`, which may be empty, and `evidence`. What was seen stands in words, with the value and the limit, in `why` and `message`.
+/// `device` is the machine that the event comes from or is about. `boot_id` identifies this start of its application.
+/// `cycle` is in every event that belongs to a cycle; the cell refuses an event of another cycle. `actor` is the person
+/// who gave the order, looked at the machine, or started the program. `reason`, which can be empty, and `evidence` are
+/// this person's words. `why` and `message` describe the observation, with the value and the limit.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[expect(missing_docs, reason = "the fields are told above")]
 #[serde(tag = "event", rename_all = "snake_case")]
@@ -39,41 +40,44 @@ pub enum Event {
     Stop { actor: Actor, reason: String },
     /// End at once: the safe sequence only.
     Abort { actor: Actor, reason: String },
-    /// A person has looked at a machine that cannot tell it: it is clear of the part.
+    /// A person has checked a machine that cannot report it: it is clear of the part.
     ClearConfirmed { actor: Actor, device: Device },
-    /// A person has looked at a machine that cannot tell what became of its START: the job is over, the machine stands still and
-    /// is clear of the part. The START is never repeated; the part is measured as it is.
+    /// A person has checked a machine that cannot report what became of its START: the job is over, the machine stands
+    /// still and is clear of the part. The cell never repeats the START; the part is measured as it is.
     DeclaredOver { actor: Actor, device: Device, evidence: String },
-    /// The program was started again in the middle of this run; the links are new.
+    /// The program was restarted in the middle of this run; the links are new.
     Restarted { actor: Actor },
 
     // Facts from machines.
-    /// The machine is the right one, its signature is sound and it is owned. Answers `Connect` and `ClearMachine`.
+    /// The machine is the right one, its signature is valid and this program owns it. Answers `Connect` and
+    /// `ClearMachine`.
     Connected { device: Device, boot_id: u32, simulated: bool, found: Occupation },
     /// The machine cannot be used. Answers `Connect`.
     NotConnected { device: Device, why: Mismatch },
-    /// The machine cannot be reached, or its application stands still.
+    /// The machine cannot be reached, or its application does not run.
     LinkLost { device: Device, why: String },
-    /// The link is open again, its signature and its sync are proven.
+    /// The link is open again; the signature and the synchronisation are verified.
     LinkBack { device: Device, boot_id: u32 },
-    /// What attends to the machine in this program has failed: nothing speaks to the machine any more, whose own silence limit holds it.
+    /// The station task of the machine in this program has failed. No part of this program can talk to the machine,
+    /// whose own silence limit holds it.
     StationFailed { device: Device, why: String },
-    /// Something that the cell needs from outside is missing. Reported as a level: again after every reconnection.
+    /// A condition that the cell needs from outside is missing. Reported as a level: again after every reconnection.
     ConditionLost {
         device: Device,
         condition: Condition,
         #[serde(rename = "words")]
         message: String,
     },
-    /// It is there again; hysteresis is the business of who reports.
+    /// The condition is back. The reporting side applies the hysteresis.
     ConditionBack { device: Device, condition: Condition },
-    /// The machine is not in automatic mode: a person may move it at its panel. Reported as a level, as a missing condition is.
+    /// The machine is not in automatic mode: a person may move it at its panel. Reported as a level, like a missing
+    /// condition.
     NotAutomatic {
         device: Device,
         #[serde(rename = "words")]
         message: String,
     },
-    /// It is in automatic mode again.
+    /// The machine is in automatic mode again.
     AutomaticAgain { device: Device },
     /// The grinder holds the pass and the map of this cycle, read back and compared. Answers `LoadPass`.
     PassLoaded { cycle: u32 },
@@ -81,52 +85,56 @@ pub enum Event {
     PlanLoaded { cycle: u32 },
     /// The machine is prepared for this cycle. Answers `Prepare`.
     Prepared { device: Device, cycle: u32 },
-    /// The machine was seen at this run's job, and shows now that it is at none, or at another one, and tells of no end.
+    /// The machine was seen at the job of this run. Now it shows no job or another one, and reports no end.
     JobVanished { device: Device, why: String },
-    /// START was taken. Answers `StartMachine`.
+    /// The machine took START. Answers `StartMachine`.
     Started { device: Device, cycle: u32 },
-    /// It is not known whether START was taken. Answers `StartMachine`.
+    /// It is not known whether the machine took START. Answers `StartMachine`.
     StartUnknown { device: Device, cycle: u32, why: String },
-    /// The job goes on: so many points measured, or thousandths of the path, of so many. Comes too from a machine that moves without one.
+    /// The job makes progress: `done` of `total` points, or thousandths of the path. A machine that moves without a job
+    /// also sends it.
     Progressed { device: Device, done: u32, total: u32 },
-    /// The machine stands in its safe place. Answers `HoldMachine`, also where it was held already, or comes by itself.
+    /// The machine is in its safe place and stands still. Answers `HoldMachine`, also if it was held already, or comes
+    /// without an order.
     MachineHeld { device: Device },
-    /// The machine moves again. Answers `ResumeMachine`, or comes by itself.
+    /// The machine moves again. Answers `ResumeMachine`, or comes without an order.
     MachineResumed { device: Device },
-    /// The job is over; for the grinder its pass record has been read. Answers `StopMachine` too, also where nothing ran.
+    /// The job is over. For the grinder the pass record has been read. Also answers `StopMachine`, even if no job ran.
     Ended { device: Device, cycle: u32, result: JobResult },
-    /// What the grinder says of the pass that is over cannot be, or is of another pass. Comes before `Ended` or `Reconciled`.
+    /// The pass record of the grinder is implausible, or of another pass. Comes before `Ended` or `Reconciled`.
     RecordDoubted { cycle: u32, why: String },
-    /// A fresh status shows the machine standing clear of the part. Answers `VerifyClear`.
+    /// A fresh status shows that the machine is clear of the part. Answers `VerifyClear`.
     Cleared { device: Device },
-    /// A fresh status shows that it is not. Answers `VerifyClear`, or comes by itself.
+    /// A fresh status shows that the machine is not clear of the part. Answers `VerifyClear`, or comes without a
+    /// request.
     Obstructed {
         device: Device,
         #[serde(rename = "words")]
         message: String,
     },
-    /// The machine stands, and nothing tells whether it is clear of the part. Answers `VerifyClear`.
+    /// The machine stands still, but no signal shows whether it is clear of the part. Answers `VerifyClear`.
     ClearUnknown { device: Device },
-    /// The machine was asked and said no.
+    /// The machine refused the request.
     Refused { device: Device, what: Asked, why: String },
-    /// The machine is in FAULTED. (A machine that held itself because the link was silent is `MachineHeld`.)
+    /// The machine is in FAULTED. (A machine that held because the link was silent is `MachineHeld`.)
     Fault {
         device: Device,
         code: u16,
         #[serde(rename = "words")]
         message: String,
     },
-    /// The machine has forgotten its result and is idle. Answers `Acknowledge`.
+    /// The machine has discarded its result and is idle. Answers `Acknowledge`.
     Acknowledged { device: Device },
-    /// The machine has ended its own safe sequence and stands. Answers `AbortMachine`.
+    /// The machine has finished its own safe sequence and stands still. Answers `AbortMachine`.
     AbortConfirmed { device: Device },
-    /// What became of the job. Answers `Reconcile`.
+    /// Outcome of the job. Answers `Reconcile`.
     Reconciled { device: Device, cycle: u32, outcome: Reconciliation },
 
     // Results of computations.
-    /// The points of this cycle, so many found of the planned, are read and stored. Answers `Collect`.
+    /// The points of this cycle are read and stored: `found` of the `targets` planned. Answers `Collect`.
     Collected { cycle: u32, targets: u32, found: u32, gate: Gate },
-    /// The radius of the probe was compared with the reference sphere: the one found minus the one in the recipe. Answers `Qualify`.
+    /// The radius of the probe was compared with the reference sphere. `radius_error_mm` is the radius found minus the
+    /// radius in the recipe. Answers `Qualify`.
     Qualified {
         cycle: u32,
         #[serde(with = "super::number")]
@@ -134,30 +142,30 @@ pub enum Event {
     },
     /// The measurement is registered. Answers `Register`.
     Registered { cycle: u32, figures: Figures },
-    /// It could not be registered. Answers `Register`.
+    /// The measurement could not be registered. Answers `Register`.
     RegistrationFailed { cycle: u32, why: String },
     /// The next map is computed and stored. Answers `Compensate`.
     Compensated { cycle: u32, summary: CompensationSummary },
     /// There is no next map. Answers `Compensate`.
     CompensationRefused { cycle: u32, why: CompensationRefusal },
 
-    /// What was computed from a measurement cannot be written: nothing is made of it before it can. Answers `Collect`, `Register` and
-    /// `Compensate`.
+    /// The result of a computation from a measurement cannot be written. The cell does not use it before it can be.
+    /// Answers `Collect`, `Register` and `Compensate`.
     NotSaved { cycle: u32, why: RecordFailure },
 
-    /// The journal or the run folder cannot be written: nothing may begin to move.
+    /// The journal or the run folder cannot be written: no motion may begin.
     RecordFailed { why: RecordFailure },
-    /// A command that is answered was not given, for it did not come on record.
+    /// A command that expects an answer was not sent, because it could not be recorded.
     NotOnRecord { command: String },
-    /// The way by which orders come in is gone: who gives them may not find the cell.
+    /// The channel for orders is lost: the sender of an order may not find the cell.
     ControlLost { why: String },
-    /// It was made again.
+    /// The channel for orders is back.
     ControlBack,
-    /// Time has passed; what is due is done.
+    /// Time has passed; the cell does what is due.
     Deadline,
 }
 
-/// What a machine was found doing when it was connected.
+/// Occupation of a machine at the time of the connection.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Occupation {
@@ -165,40 +173,40 @@ pub enum Occupation {
     Idle,
     /// Aborted or faulted in an earlier run; it can be cleared.
     ToClear,
-    /// Busy with something that is not this run's, in words.
+    /// Busy with a job that is not of this run, in words.
     Busy(String),
 }
 
-/// Why a machine cannot be used.
+/// Reason why a machine cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mismatch {
-    /// Nothing answers there.
+    /// No device answers at the address.
     Unreachable(String),
-    /// Something answers, but it is not this machine.
+    /// A device answers, but it is not this machine.
     WrongDevice(String),
-    /// Its sentinels are scrambled: the order of words is not the one in the cell file.
+    /// The sentinels have another word order than the cell file.
     WordOrder(String),
     /// Its unit of length is the inch.
     Inches,
     /// Another client owns it.
     Owned(String),
-    /// It is at the job of another run, which is left alone, also by an abort.
+    /// It runs the job of another run. The cell does not touch this job, not even with an abort.
     AtAnotherJob(String),
 }
 
-/// Something that the cell needs from outside.
+/// Condition that the cell needs from outside.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Condition {
     /// Air, coolant.
     Supplies,
-    /// Every signal that the cell file asks for, a temperature for one, is within its range.
+    /// Every signal that the cell file requires, for example a temperature, is within its range.
     #[serde(alias = "temperature")]
     Signals,
 }
 
-/// What a machine was asked for.
+/// Request to a machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Asked {
@@ -206,7 +214,7 @@ pub enum Asked {
     Load,
     /// To prepare.
     Prepare,
-    /// To start. It says no for certain: nothing moves.
+    /// To start. A refusal is certain: nothing moves.
     Start,
     /// To hold.
     Hold,
@@ -220,13 +228,13 @@ pub enum Asked {
     Clear,
     /// To give its result.
     Collect,
-    /// To forget its result.
+    /// To discard its result.
     Acknowledge,
-    /// To forget the result of a job at which it still is.
+    /// To discard the result of a job that it still has.
     Discard,
 }
 
-/// How a job of a machine ended.
+/// Result of a job of a machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum JobResult {
@@ -240,66 +248,66 @@ pub enum JobResult {
     Failed,
 }
 
-/// What became of a job whose machine was out of sight.
+/// Outcome of a job whose machine was out of sight.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Reconciliation {
-    /// It was taken and runs.
+    /// The machine took the job and runs it.
     Running,
-    /// It was taken, and the machine holds.
+    /// The machine took the job and holds.
     Held,
-    /// It was taken and is over.
+    /// The machine took the job, and the job is over.
     Ended(JobResult),
-    /// It was proven not to have been taken.
+    /// The machine proved that it did not take the job.
     NotStarted,
-    /// The machine cannot tell; a person must look. In words.
+    /// The machine cannot report the outcome; a person must look. The reason in words.
     Unknown(String),
 }
 
-/// Whether a measurement may be used.
+/// Verdict of the gate on a measurement.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Gate {
-    /// It may.
+    /// The measurement can be used.
     Passed,
-    /// It may not.
+    /// The measurement cannot be used.
     Failed(GateFailure),
 }
 
-/// Why a measurement may not be used.
+/// Reason why a measurement cannot be used.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum GateFailure {
     /// Too few points were found, or too little of the aperture is covered. In words, with the value and the limit.
     Coverage(String),
-    /// Nothing was touched where the part should be.
+    /// The probe touched nothing at the expected place of the part.
     NoPart,
-    /// The coordinates are contact points, or look like them.
+    /// The coordinates are contact points, or look like contact points.
     Contacts,
-    /// The coordinates are in inches, or look like it.
+    /// The coordinates are in inches, or look like inches.
     Inches,
     /// The result is of another part, plan or cycle.
     Foreign(String),
-    /// The result is broken: its CRC, its count, a number that is none.
+    /// The result is broken: its CRC, its count, or a value that is not a number.
     Broken(String),
     /// The temperature was outside its window.
     Temperature(String),
 }
 
-/// What a registration found, as far as the cell decides upon it.
+/// Figures of a registration on which the cell decides.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Figures {
     /// Peak to valley of the deviations.
     #[serde(with = "super::number")]
     pub pv_mm: f64,
-    /// Peak to valley of all deviations but the outermost 0.2 %; none where it was not worked out.
+    /// Peak to valley of all deviations but the outermost 0.2 %. `None` if it was not computed.
     #[serde(default, with = "super::number::optional")]
     pub pv_robust_mm: Option<f64>,
     /// Root mean square of the deviations.
     #[serde(with = "super::number")]
     pub rms_mm: f64,
-    /// The figures of the part itself, which are judged: the scatter of the probe is taken off them. None in records of earlier versions,
-    /// which judged those of the points.
+    /// Figures of the part itself, which are judged: without the noise of the probe. `None` in records of earlier
+    /// versions, which judged the figures of the points.
     #[serde(default)]
     pub form: Option<FormFigures>,
     /// Expanded measuring uncertainty (k = 2) of the peak to valley.
@@ -315,36 +323,38 @@ pub struct Figures {
     pub points: u32,
     /// Points left out as outliers.
     pub outliers: u32,
-    /// The figures with those points, and where they lie; none where there are none, and in records of earlier versions.
+    /// Figures with the outliers included, and the places of the outliers. `None` if there are no outliers, and in
+    /// records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub left_out: Option<Box<LeftOut>>,
-    /// How far the part lies from where it was expected.
+    /// Distance of the part from its expected place.
     #[serde(with = "super::number")]
     pub shift_mm: f64,
-    /// How far it is turned from how it was expected.
+    /// Angle of the part from its expected orientation.
     #[serde(with = "super::number")]
     pub turn_rad: f64,
-    /// The directions in which the surface does not hold the part, in words.
+    /// Directions of the pose that the surface determines weakly, in words.
     pub weak_directions: Vec<String>,
-    /// What else a person should know.
+    /// Other warnings for a person.
     pub warnings: Vec<String>,
-    /// How the part answered to the map before; none before the second pass.
+    /// Response of the part to the previous map. `None` before the second pass.
     pub response: Option<Response>,
-    /// What another pass is expected to leave; none where nobody can tell.
+    /// Expected result of another pass. `None` if it cannot be predicted.
     #[serde(default)]
     pub forecast: Option<Forecast>,
-    /// The most that was taken off anywhere since the run began; none where nobody knows.
+    /// Maximum removal at any place since the run began. `None` if it is not known.
     #[serde(default, with = "super::number::optional")]
     pub removed_mm: Option<f64>,
-    /// How many contributions to the uncertainty nobody states, and of how many: they are taken for 0. None where nothing is told of them.
+    /// Number of contributions to the uncertainty for which no value is stated, and the number of all. An unstated
+    /// contribution counts as 0. `None` if there is no budget.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unstated: Option<[u32; 2]>,
-    /// What is to be touched before anything is decided; none where enough is known, and where all is touched at once.
+    /// Points to touch before any decision. `None` if enough is known, and if all targets are touched at once.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub touch_on: Option<Box<TouchOn>>,
 }
 
-/// What the figures are with the points that were left out.
+/// Figures with the outliers included.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LeftOut {
     /// Peak to valley of the deviations.
@@ -353,127 +363,128 @@ pub struct LeftOut {
     /// Root mean square of the deviations.
     #[serde(with = "super::number")]
     pub rms_mm: f64,
-    /// Which points, where they lie and how far off they are, in words.
+    /// Outliers: which points, where they are and how large their deviations are, in words.
     pub places: String,
-    /// Whether these places can be touched again by themselves; else the whole part is measured again.
+    /// True if these places can be touched again alone. Otherwise the whole part is measured again.
     #[serde(default)]
     pub again: bool,
 }
 
-/// More that is to be touched.
+/// Further points to touch.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TouchOn {
-    /// How many targets are next.
+    /// Number of the next targets.
     pub targets: u32,
-    /// Why, in words.
+    /// Reason, in words.
     pub why: String,
 }
 
-/// The figures of the form of a part.
+/// Figures of the form of a part.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FormFigures {
     /// Peak to valley.
     pub pv: Interval,
-    /// Peak to valley of the aperture: the touched points and the places between them, without the outermost 0.1 % of these at either end.
+    /// Peak to valley of the aperture: of the touched points and the places between them, without the outermost 0.1 %
+    /// at each end.
     pub pv_robust: Interval,
     /// Root mean square.
     pub rms: Interval,
-    /// How far a single point scatters (rms).
+    /// Standard deviation of the noise of a single point.
     #[serde(with = "super::number")]
     pub scatter_mm: f64,
 }
 
-/// What another pass is expected to leave.
+/// Expected result of another pass.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Forecast {
     /// Root mean square of the deviations.
     #[serde(with = "super::number")]
     pub rms_mm: f64,
-    /// Its standard deviation.
+    /// Standard deviation of the expected rms.
     #[serde(with = "super::number")]
     pub sigma_mm: f64,
-    /// What no correction can go below, as far as the passes have told.
+    /// Lower limit that no correction can improve on, as estimated from the passes so far.
     #[serde(default, with = "super::number::optional")]
     pub floor_mm: Option<f64>,
 }
 
-/// How the part answered to the last map.
+/// Response of the part to the last map.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Response {
-    /// As it should.
+    /// As expected.
     Expected,
-    /// The map was too small, or its effect too noisy, to tell.
+    /// Unknown: the map was too small, or its effect too noisy.
     Unclear,
-    /// The other way round: the sign of the map is wrong.
+    /// In the opposite direction: the sign of the map is wrong.
     SignFlipped,
-    /// As to a mirrored or turned map: an axis points another way.
+    /// As to a mirrored or turned map: the direction of an axis is wrong.
     Mirrored,
-    /// Not at all.
+    /// No response.
     NoEffect,
-    /// Twice: the map was applied two times.
+    /// Twice the expected response: the map was applied two times.
     Doubled,
 }
 
-/// What the next map will do.
+/// Expected effect of the next map.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CompensationSummary {
     /// Largest absolute value of the map.
     #[serde(with = "super::number")]
     pub largest_mm: f64,
-    /// The most that the next pass takes off anywhere.
+    /// Maximum removal of the next pass at any place.
     #[serde(with = "super::number")]
     pub depth_mm: f64,
-    /// The PV that is expected after it.
+    /// Expected PV after the next pass.
     #[serde(with = "super::number")]
     pub predicted_pv_mm: f64,
-    /// The RMS that is expected after it.
+    /// Expected RMS after the next pass.
     #[serde(default, with = "super::number")]
     pub predicted_rms_mm: f64,
-    /// Share of the part where the wheel will cut air, as far as it can be foreseen.
+    /// Share of the part where the wheel will not cut, as far as it can be predicted.
     #[serde(default, with = "super::number")]
     pub air_share: f64,
-    /// Share of the error that is taken back, with the wavelength in millimetres from which each counts.
+    /// Gains: the share of the error that is taken back, with the wavelength in millimetres from which on each applies.
     #[serde(default, with = "super::number::pairs")]
     pub gains: Vec<[f64; 2]>,
-    /// Share of a correction that the part answers with.
+    /// Share of a correction to which the part responds.
     #[serde(default, with = "super::number")]
     pub response: f64,
-    /// What else a person should know.
+    /// Other warnings for a person.
     pub warnings: Vec<String>,
-    /// Parameters of the machine that the recipe has taken back beside the map, as far as they are told.
+    /// Parameters of the machine that the recipe compensates in addition to the map, as far as they are estimated.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub parameters: Vec<ParameterTold>,
-    /// Root mean square of what is left for the map, where parameters are taken back beside it.
+    /// Root mean square of the residual error for the map, if parameters are compensated in addition.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub map_rms_mm: Option<f64>,
-    /// What of them a person is to agree to first, in words: more than the recipe's tolerance.
+    /// Parameters to which a person must agree first, in words: their corrections exceed the tolerance of the recipe.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub asks: Vec<String>,
 }
 
-/// What a measurement told of a parameter of the machine, and what of it is taken back.
+/// Estimate of a parameter of the machine from a measurement, and its compensation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ParameterTold {
-    /// What it is called.
+    /// Name of the parameter.
     pub name: String,
-    /// The unit of all its values.
+    /// Unit of all its values.
     pub unit: String,
-    /// How far it is off, beside what the pass was told of it already.
+    /// Estimated error of the parameter, in addition to the correction that the pass already had.
     pub off: f64,
-    /// The expanded uncertainty of that (k = 2).
+    /// Expanded uncertainty of the estimate (k = 2).
     pub expanded: f64,
-    /// What of it is taken back.
+    /// Part of the error that is compensated.
     pub taken: f64,
-    /// How far the next pass is told that it is off what the recipe states, in all.
+    /// Total correction that the next pass gets, relative to the value of the recipe.
     pub told: f64,
-    /// By how much the root mean square falls by it, in micrometres.
+    /// Reduction of the root mean square by the compensation, in micrometres.
     pub removes_rms_um: f64,
 }
 
 impl ParameterTold {
-    /// For people.
+    /// Formats the estimate for people.
     pub fn in_words(&self) -> String {
         let Self { name, unit, off, expanded, taken, told, removes_rms_um } = self;
         let found = format!("{name}: off by {off:.2} \u{b1} {expanded:.2} {unit}");
@@ -484,19 +495,19 @@ impl ParameterTold {
     }
 }
 
-/// Why there is no next map.
+/// Reason why there is no next map.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CompensationRefusal {
-    /// The next pass would take off more than the recipe allows in all. In words, with the value and the limit.
+    /// The next pass would exceed the total removal that the recipe allows. In words, with the value and the limit.
     BudgetSpent(String),
-    /// The pose is undetermined along these directions, so a map would be at the wrong place.
+    /// The pose is undetermined in these directions, so a map would be at the wrong place.
     WeakDirections(Vec<String>),
     /// Another reason, in words.
     Failed(String),
 }
 
-/// Why the record cannot be kept.
+/// Reason why the record cannot be kept.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RecordFailure {
@@ -561,7 +572,7 @@ impl fmt::Display for JobResult {
 }
 
 impl Event {
-    /// Returns the cycle that the event belongs to, if it belongs to one.
+    /// Returns the cycle that the event belongs to, if there is one.
     pub fn cycle(&self) -> Option<u32> {
         match self {
             Self::PassLoaded { cycle }
@@ -583,7 +594,7 @@ impl Event {
         }
     }
 
-    /// Returns the machine that it comes from or is about.
+    /// Returns the machine that the event comes from or is about.
     pub fn device(&self) -> Option<Device> {
         match self {
             Self::DeclaredOver { device, .. }
@@ -617,12 +628,12 @@ impl Event {
         }
     }
 
-    /// Returns whether a person gave it as an order.
+    /// Returns true if a person gave the event as an order.
     pub fn is_order(&self) -> bool {
         self.actor().is_some() && !matches!(self, Self::Restarted { .. })
     }
 
-    /// Returns who is behind it, as it is recorded: the person, the machine or the cell itself, and where.
+    /// Returns the origin of the event as it is recorded: the person, the machine or the cell itself, and the place.
     pub fn origin(&self) -> (String, String) {
         match (self.actor(), self.device()) {
             (Some(Actor { name, station }), _) => (name.clone(), station.clone()),
@@ -631,7 +642,7 @@ impl Event {
         }
     }
 
-    /// Says what it is to a person whom it did not fit.
+    /// Describes the event for a person when it does not fit the state.
     pub(super) fn in_words(&self) -> String {
         match self {
             Self::LoadConfirmed { .. } => "the word that the part is loaded".to_owned(),

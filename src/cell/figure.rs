@@ -1,32 +1,33 @@
-//! A figure as it is recorded: what a measurement leaves possible of it, and with what probability it is within a limit.
+//! Figure as it is recorded: its credible interval after a measurement, and the probability that it is within a limit.
 
 use serde::{Deserialize, Serialize};
 
-/// What a measurement leaves possible of a figure, on record.
+/// Credible interval of a figure after a measurement, as it is recorded.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Interval {
-    /// As probably above as below.
+    /// Median.
     #[serde(with = "super::number")]
     pub median_mm: f64,
-    /// Below it with a probability of 2.5 %; 0 where the figure is known from above alone.
+    /// Quantile at 2.5 %. It is 0 if only an upper bound of the figure is known.
     #[serde(with = "super::number")]
     pub low_mm: f64,
-    /// Above it with a probability of 2.5 %.
+    /// Quantile at 97.5 %.
     #[serde(with = "super::number")]
     pub high_mm: f64,
-    /// Below each of them with one of [`Interval::PROBABILITIES`]; none where the figure is as a normal one, and in records of earlier
+    /// Quantiles at [`Interval::PROBABILITIES`]. `None` if the figure is treated as normal, and in records of earlier
     /// versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub quantiles_mm: Option<[f64; Interval::COUNT]>,
 }
 
 impl Interval {
-    /// How many quantiles tell a figure.
+    /// Number of quantiles of a figure.
     pub const COUNT: usize = 15;
-    /// Of what probabilities: close where limits are, and none beyond what a thousand forms can tell.
+    /// Probabilities of the quantiles: dense where limits are usual, and no further out than a thousand samples can
+    /// show.
     pub const PROBABILITIES: [f64; Self::COUNT] =
         [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999];
-    /// The same as standard normal deviates: between them a figure is taken for as good as normal.
+    /// Standard normal deviates of the same probabilities. Between two of them the figure is interpolated as normal.
     const DEVIATES: [f64; Self::COUNT] = [
         -3.090_232_306_167_813_5,
         -2.575_829_303_548_901,
@@ -45,17 +46,18 @@ impl Interval {
         3.090_232_306_167_813_5,
     ];
 
-    /// A normal figure that is as uncertain to either side.
+    /// Returns the interval of a normal figure with the same uncertainty on both sides.
     pub fn about(median_mm: f64, expanded_mm: f64) -> Self {
         Self { median_mm, low_mm: median_mm - expanded_mm, high_mm: median_mm + expanded_mm, quantiles_mm: None }
     }
 
-    /// Returns the expanded uncertainty: half of its width.
+    /// Returns the expanded uncertainty: half of the width.
     pub fn expanded_mm(&self) -> f64 {
         0.5 * (self.high_mm - self.low_mm)
     }
 
-    /// Returns the probability that the figure is not above a limit. What is less than one in a thousand nobody knows, so it is 0.001 to 0.999.
+    /// Returns the probability that the figure is not above a limit. The result is clamped to 0.001 to 0.999, because
+    /// nothing is known beyond these quantiles.
     pub fn probability_within(&self, limit_mm: f64) -> f64 {
         let quantiles = self.quantiles();
         let (Some(below), last) = (quantiles.iter().rposition(|q| *q <= limit_mm), Self::COUNT - 1) else {
@@ -71,9 +73,9 @@ impl Interval {
         normal_probability(Self::DEVIATES[below] + share * (Self::DEVIATES[below + 1] - Self::DEVIATES[below]))
     }
 
-    /// Returns what the figure is below with some probability.
+    /// Returns the quantile of the figure at a probability.
     pub fn quantile_mm(&self, probability: f64) -> f64 {
-        // A share of one and what is left of it differ in their last digit.
+        // `p` and `1 - (1 - p)` differ in their last digits.
         const SAME: f64 = 1e-9;
         if probability.is_nan() {
             return f64::NAN;
@@ -88,8 +90,8 @@ impl Interval {
         quantiles[next - 1] + share * (quantiles[next] - quantiles[next - 1])
     }
 
-    /// The quantiles on record, or those of a normal figure with these ends, of whose half widths (k = 2) each is taken for 1.96 standard
-    /// uncertainties.
+    /// Returns the recorded quantiles. If there are none, returns those of a normal figure with these ends: each half
+    /// width (k = 2) counts as 1.96 standard uncertainties.
     fn quantiles(&self) -> [f64; Self::COUNT] {
         let Self { median_mm, low_mm, high_mm, quantiles_mm } = *self;
         let of_normal = |k: usize| {
@@ -112,7 +114,7 @@ impl Interval {
     }
 }
 
-/// The probability that a standard normal number is not above another (Abramowitz and Stegun 26.2.17, to 1e-7).
+/// Returns the standard normal distribution function at a deviate (Abramowitz and Stegun 26.2.17, accurate to 1e-7).
 fn normal_probability(deviate: f64) -> f64 {
     const FACTORS: [f64; 5] = [0.319_381_530, -0.356_563_782, 1.781_477_937, -1.821_255_978, 1.330_274_429];
     let t = 1.0 / (1.0 + 0.231_641_9 * deviate.abs());
@@ -121,7 +123,7 @@ fn normal_probability(deviate: f64) -> f64 {
     if deviate < 0.0 { above } else { 1.0 - above }
 }
 
-/// The standard normal number that another is not above with some probability, from 0.001 to 0.999: by halving.
+/// Returns the standard normal quantile of a probability from 0.001 to 0.999, by bisection.
 fn normal_deviate(probability: f64) -> f64 {
     let (mut low, mut high) = (-4.0, 4.0);
     for _ in 0..60 {
@@ -145,14 +147,14 @@ mod tests {
 
     #[test]
     fn a_normal_figure_is_within_its_limit_as_the_table_says() {
-        // u = 1: 1.96 beside it on either side.
+        // u = 1, so the expanded uncertainty is 1.96.
         let of = Interval::about(10.0, 1.959_963_984_540_054_2);
         for (limit, probability) in [(10.0, 0.5), (11.0, 0.841_344_7), (12.0, 0.977_249_9), (8.5, 0.066_807_2)] {
             assert!((of.probability_within(limit) - probability).abs() < 1e-6, "{limit}");
         }
         assert_eq!((of.probability_within(30.0), of.probability_within(-30.0)), (0.999, 0.001), "nobody knows more");
         assert!((of.quantile_mm(0.841_344_7) - 11.0).abs() < 1e-5);
-        // The ends of the interval are what they are, to the last digit.
+        // The ends of the interval are exact, to the last digit.
         assert_eq!([of.quantile_mm(1.0 - 0.975), of.quantile_mm(0.975)], [of.low_mm, of.high_mm]);
         assert_eq!([of.probability_within(of.high_mm), of.probability_within(of.low_mm)], [0.975, 0.025]);
     }
@@ -166,7 +168,7 @@ mod tests {
 
     #[test]
     fn what_is_on_record_decides_where_it_is_there() {
-        // Known from above alone: all below the middle is 0.
+        // Only an upper bound is known: all quantiles below the median are 0.
         let quantiles: [f64; Interval::COUNT] = std::array::from_fn(|k| if k < 7 { 0.0 } else { k as f64 });
         let of = Interval { quantiles_mm: Some(quantiles), median_mm: 7.0, low_mm: 0.0, high_mm: 11.0 };
         assert!(of.is_sound());

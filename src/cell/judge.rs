@@ -1,21 +1,21 @@
-//! What follows from the figures of a cycle, and why, in words.
+//! Judgement of the figures of a cycle: the verdict and its reason, in words.
 
 use super::command::Verdict;
 use super::event::{Figures, Response};
 use super::figure::Interval;
 use super::plan::{CellPlan, PvOf, Tolerance};
 
-/// A figure that is worse than the one before by more than this share makes a cycle worse.
+/// Factor by which a figure must exceed the one of the cycle before to make the cycle worse.
 const WORSE: f64 = 1.05;
 
-/// A verdict and its reason.
+/// Verdict and its reason.
 pub(super) struct Judged {
     pub(super) verdict: Verdict,
     pub(super) reason: String,
 }
 
 impl Figures {
-    /// Returns whether all figures are numbers, and those that cannot be negative are not.
+    /// Returns true if all figures are finite numbers, and none that cannot be negative is negative.
     pub(super) fn are_sound(&self) -> bool {
         let all = [
             self.pv_mm,
@@ -35,7 +35,8 @@ impl Figures {
         all.iter().all(|figure| figure.is_finite() && *figure >= 0.0) && form.into_iter().all(|of| of.is_sound())
     }
 
-    /// The peak to valley of all points or of most, if that was worked out, and the root mean square, as far as they are known.
+    /// Returns the intervals of the peak to valley and of the root mean square, as far as they are known. The flag is
+    /// true if the first is the PV 99.8 %; otherwise it is the PV of all points.
     fn known(&self, pv_of: PvOf) -> ([Interval; 2], bool) {
         match &self.form {
             Some(form) if pv_of == PvOf::MostPoints => ([form.pv_robust, form.rms], true),
@@ -49,13 +50,13 @@ impl Figures {
     }
 }
 
-/// Where a figure lies beside its limit once its uncertainty is counted (ISO 14253-1, JCGM 106): within with the probability of the
-/// tolerance at least, beyond with the same, or neither.
+/// Position of a figure relative to its limit with its uncertainty counted (ISO 14253-1, JCGM 106): within the limit
+/// with at least the probability of the tolerance, beyond it with at least this probability, or neither.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Conformity {
     /// Within, for certain.
     Within,
-    /// The uncertainty reaches over the limit: nothing is proven.
+    /// The uncertainty reaches across the limit: nothing is proven.
     Undecided,
     /// Beyond, for certain.
     Beyond,
@@ -73,29 +74,32 @@ impl Conformity {
     }
 }
 
-/// A figure that is judged, beside its limit.
+/// Figure that is judged, with its limit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Compared {
-    /// What the figure is called.
+    /// Name of the figure.
     pub name: &'static str,
-    /// What was found: as probably too large as too small.
+    /// Median of the figure.
     pub found_mm: f64,
-    /// Its expanded measuring uncertainty (k = 2), whether it is counted or not: half of what lies between the next two.
+    /// Expanded measuring uncertainty (k = 2), whether the tolerance counts it or not: half of the width of
+    /// `between_mm`.
     pub expanded_mm: f64,
-    /// The least and the most that it may be, with 95 %; whether they are counted or not.
+    /// Lower and upper end of the 95 % interval, whether the tolerance counts them or not.
     pub between_mm: [f64; 2],
-    /// The largest that is accepted; infinite where it is not limited.
+    /// Largest accepted value; infinite if the figure is not limited.
     pub limit_mm: f64,
-    /// The probability that it is within its limit, 0.001 to 0.999, whether it is counted or not; none where it is not limited.
+    /// Probability that the figure is within its limit, 0.001 to 0.999, whether the tolerance counts it or not. `None`
+    /// if the figure is not limited.
     pub within: Option<f64>,
-    /// What is held against the limit: the least and the most that it may be by the probability of the tolerance, or twice what was found.
+    /// Values that are compared with the limit: the lower and upper quantile for the probability of the tolerance, or
+    /// twice the median.
     pub held_mm: [f64; 2],
-    /// What follows, with the uncertainty where the tolerance counts it.
+    /// Conformity, with the uncertainty if the tolerance counts it.
     pub conformity: Conformity,
 }
 
 impl Compared {
-    /// Returns with what probability the figure is within its limit, for people; none where it is not limited.
+    /// Describes the probability that the figure is within its limit, for people. Returns `None` if it is not limited.
     pub fn within_in_words(&self) -> Option<String> {
         let [least, most] = [Interval::PROBABILITIES[0], Interval::PROBABILITIES[Interval::COUNT - 1]];
         self.within.map(|within| match within {
@@ -106,13 +110,14 @@ impl Compared {
     }
 }
 
-/// Writes a probability, for people: never more than it is.
+/// Formats a probability for people. Rounds down, so that it is never overstated.
 fn percent(probability: f64) -> String {
     format!("{:.1} %", 0.1 * (1e3 * probability + 1e-6).floor())
 }
 
 impl Tolerance {
-    /// Compares the two figures that are judged with their limits: the peak to valley of the points that it is taken of, and the RMS.
+    /// Compares the two figures that are judged with their limits: the peak to valley that the tolerance selects, and
+    /// the RMS.
     pub fn compare(&self, figures: &Figures) -> [Compared; 2] {
         let ([pv, rms], is_robust) = figures.known(self.pv_of);
         let compared = |name, of: Interval, limit_mm: f64| {
@@ -128,15 +133,16 @@ impl Tolerance {
         [compared(if is_robust { "PV 99.8 %" } else { "PV" }, pv, self.pv_mm), compared("RMS", rms, self.rms_mm)]
     }
 
-    /// Returns whether the part is within its limits without the points that were left out, and beyond one with them.
+    /// Returns true if the part is within its limits without the outliers, and beyond one with them.
     pub fn left_out_decides(&self, figures: &Figures) -> bool {
         let [pv, rms] = self.compare(figures).map(|compared| compared.conformity);
         pv.max(rms) == Conformity::Within && self.beyond_with_left_out(figures).is_some()
     }
 
-    /// Names the points that were left out where the part would exceed a limit with them: what was touched counts until it is touched again.
+    /// Describes the outliers if the part would exceed a limit with them. Returns `None` otherwise. A touched point
+    /// counts until it is touched again.
     ///
-    /// They add to what was found as much as they add to the figures of the points.
+    /// The outliers increase the figures of the part by as much as they increase the figures of the points.
     fn beyond_with_left_out(&self, now: &Figures) -> Option<String> {
         let left_out = now.left_out.as_ref()?;
         let [pv, rms] = self.compare(now);
@@ -153,7 +159,7 @@ impl Tolerance {
     }
 }
 
-/// Judges the figures of a cycle after `passes` passes. The order of the rules is the order of what cannot be undone.
+/// Judges the figures of a cycle after `passes` passes. The rules come in the order of what cannot be undone.
 pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, passes: u32) -> Judged {
     let tell = |verdict, reason| Judged { verdict, reason };
     let figures = told(plan, now);
@@ -201,19 +207,19 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
     go_on(plan, before, now, conformity)
 }
 
-/// Whether another pass is worth its material.
+/// Returns the verdict on another pass: continue if the expected gain is worth its material.
 fn go_on(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: Conformity) -> Judged {
     let (tell, figures) = (|verdict, reason| Judged { verdict, reason }, told(plan, now));
     let undecided = conformity == Conformity::Undecided;
     let so_far = if undecided { "neither in tolerance nor out of it for certain" } else { "not yet in tolerance" };
-    // Before the first correction nobody knows what one can do.
+    // Before the first correction nothing is known about the effect of a correction.
     let forecast = now.forecast.filter(|_| before.is_some());
     let Some(forecast) = forecast else { return tell(Verdict::Continue, format!("{so_far}: {figures}")) };
     let (expected, sigma) = (um(forecast.rms_mm), um(forecast.sigma_mm));
     let floor = forecast.floor_mm.map_or(String::new(), |floor| format!(", no pass can go below {}", um(floor)));
     let expected = format!("RMS {expected} ± {sigma} is expected of another pass{floor}");
     let [_, rms] = plan.tolerance.compare(now);
-    // What the floor is known to as well as what was found is not gone below by another pass.
+    // If the found rms exceeds the floor by no more than its uncertainty, another pass cannot improve it.
     let at_floor = forecast.floor_mm.is_some_and(|floor| rms.found_mm <= floor + rms.expanded_mm);
     if !at_floor && rms.found_mm - forecast.rms_mm > plan.stall_mm.max(plan.stall_share * rms.found_mm) {
         return tell(Verdict::Continue, format!("{so_far}: {figures}; {expected}"));
@@ -222,13 +228,13 @@ fn go_on(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: C
     tell(verdict, format!("no gain is to be expected, and {so_far}: {figures}; {expected}"))
 }
 
-/// The worse of the two figures that are limited.
+/// Returns the worse conformity of the two figures.
 fn conformity(plan: &CellPlan, now: &Figures) -> Conformity {
     let [pv, rms] = plan.tolerance.compare(now);
     pv.conformity.max(rms.conformity)
 }
 
-/// The two figures that are judged.
+/// Returns the medians of the two figures that are judged: peak to valley and RMS.
 fn judged(plan: &CellPlan, figures: &Figures) -> [f64; 2] {
     plan.tolerance.compare(figures).map(|compared| compared.found_mm)
 }
@@ -240,14 +246,15 @@ fn has_stalled(plan: &CellPlan, before: &Figures, now: &Figures) -> bool {
     still(pv_before, pv.found_mm, pv.expanded_mm) && still(rms_before, rms.found_mm, rms.expanded_mm.max(plan.stall_mm))
 }
 
-/// How far figures are from what is accepted: the larger of the two as a share of its limit; the RMS where there is none.
+/// Returns how far the figures are from acceptance: the larger ratio of a figure to its limit. Returns the RMS if there
+/// is no limit.
 pub(super) fn distance(plan: &CellPlan, figures: &Figures) -> f64 {
     let compared = plan.tolerance.compare(figures);
     let shares = compared.iter().filter(|of| of.limit_mm.is_finite() && of.limit_mm > 0.0);
     shares.map(|of| of.found_mm / of.limit_mm).reduce(f64::max).unwrap_or(compared[1].found_mm)
 }
 
-/// Names a cycle that was better than the last one.
+/// Describes a cycle that was better than the last one.
 pub(super) fn best_in_words(plan: &CellPlan, cycle: u32, figures: &Figures) -> String {
     let [pv, rms] = judged(plan, figures);
     format!(
@@ -257,7 +264,7 @@ pub(super) fn best_in_words(plan: &CellPlan, cycle: u32, figures: &Figures) -> S
     )
 }
 
-/// Says what a wrong response means.
+/// Describes a wrong response. Returns `None` if the response is not wrong.
 fn wrong(response: Response) -> Option<&'static str> {
     match response {
         Response::Expected | Response::Unclear => None,
@@ -291,7 +298,7 @@ fn told(plan: &CellPlan, now: &Figures) -> String {
     format!("{pv}, {rms}; {counts}")
 }
 
-/// Writes a length in micrometres, for people.
+/// Formats a length in micrometres, for people.
 pub(super) fn um(mm: f64) -> String {
     format!("{:.2} um", 1e3 * mm)
 }

@@ -1,20 +1,23 @@
-//! The machine that decides what to do next.
+//! State machine of the cell: it decides the next command.
 //!
-//! Facts come in as [`Event`]s, imperatives go out as [`Command`]s, and between them stands one table: [`Cell::handle`]. It has no
-//! clock, no wire and no file; the time since the run began comes in as an argument, [`Cell::next_deadline`] is its only timer.
-//! So a run can be replayed from its journal, and every pair of state and event can be tried.
+//! The input is [`Event`]s and the output is [`Command`]s. One function, [`Cell::handle`], maps the first to the second
+//! by a transition table. It uses no clock, no network and no file. The time since the run began is an argument, and
+//! [`Cell::next_deadline`] is the only timer. So a run can be replayed from its journal, and every pair of state and
+//! event can be tested.
 //!
-//! A run: *Starting* connects both machines. A cycle is Load (the first only), Grind, Transfer, Measure, Register, Judge, and
-//! then Compensate and the next cycle, or the end. A job of a machine goes in steps: send the payload, see by a fresh status that
-//! the other machine is clear of the part, prepare, start, run, collect, acknowledge.
+//! Sequence of a run: *Starting* connects both machines. A cycle is Load (in the first cycle only), Grind, Transfer,
+//! Measure, Register, Judge; after that comes Compensate and the next cycle, or the end. A job of a machine has these
+//! steps: send the payload, check by a fresh status that the other machine is clear of the part, prepare, start, run,
+//! collect, acknowledge.
 //!
-//! Four ways to interrupt it are kept apart. *Hold* comes from inside or from a person, lets what runs come to its safe place or
-//! the computation to its end, and waits for a person. *Suspend* comes from outside and goes on by itself. *Stop* ends in
-//! order. *Abort*, and every fault of a machine, sends the safe sequence and nothing else: both machines are told to abort, then
-//! seen to be clear, within bounded time; if they do not confirm, the alarm names the machine's own emergency circuit.
+//! There are four different interruptions. *Hold* comes from inside or from a person. It lets a running job come to its
+//! safe place, or a computation end, and waits for a person. *Suspend* comes from outside; the cell resumes by itself.
+//! *Stop* ends in order. *Abort*, and every fault of a machine, runs only the safe sequence: both machines get ABORT,
+//! and the cell then checks that they are clear, within bounded time. If they do not confirm, the alarm names the
+//! machine's own emergency circuit.
 //!
-//! A machine is started at most once for a cycle. Only the machine's own proof that START was not taken allows another; a
-//! measurement that failed its gate is repeated under the next number, and a pass is never repeated.
+//! The cell starts a machine at most once for a cycle. Only the machine's own proof that START was not taken allows
+//! another START. A measurement that failed its gate is repeated under the next cycle number. A pass is never repeated.
 
 mod act;
 mod alarm;

@@ -1,4 +1,4 @@
-//! The table: what follows from an event in a state.
+//! Transition table: the reaction to an event in a state.
 
 use std::time::Duration;
 
@@ -16,9 +16,9 @@ use State::{
 };
 
 impl Cell {
-    /// Takes an event in and returns what is to be done, in this order. After an end state that is nothing.
+    /// Handles an event and returns the commands to execute, in this order. After an end state there are none.
     ///
-    /// An event that does not fit is answered by [`Command::Refuse`] and leaves the state as it is.
+    /// If the event does not fit, the answer is [`Command::Refuse`], and the state does not change.
     pub fn handle(&mut self, now: Duration, event: Event) -> Vec<Command> {
         if let Err(why) = self.answer(now, &event) {
             let (event, state) = (Box::new(event), self.state);
@@ -28,8 +28,11 @@ impl Cell {
         std::mem::take(&mut self.commands)
     }
 
-    /// Takes an event in, and leaves what is to be done in `commands`. An event is refused for a reason, or for none where nothing of it fits
-    /// the state: then nothing has changed, and only who reads it needs the words.
+    /// Handles an event and leaves the commands in `commands`.
+    ///
+    /// # Errors
+    /// The reason of a refusal, or `None` if the event does not fit the state at all. In the second case nothing has
+    /// changed; only the display to a person needs words.
     pub(super) fn answer(&mut self, now: Duration, event: &Event) -> Result<(), Option<String>> {
         if self.state.is_end() {
             return Ok(());
@@ -47,9 +50,10 @@ impl Cell {
         answered
     }
 
-    /// Tells why an event cannot belong to what the cell is doing, whatever its state.
+    /// Returns why an event cannot belong to the present work of the cell, in any state.
     fn foreign(&self, event: &Event) -> Option<String> {
-        // A STOP waits for no record, and comes to a machine before the preparation of this cycle: it stands, with the job of the one before.
+        // A STOP does not wait for the record. It can reach the machine before the preparation of this cycle: the
+        // machine then still has the job of the cycle before.
         if matches!((self.state, event), (Stopping, Event::Ended { device, .. }) if self.stopping == Some(*device)) {
             return None;
         }
@@ -57,7 +61,8 @@ impl Cell {
         cycle.map(|cycle| format!("it belongs to cycle {cycle}, and this is cycle {}", self.cycle))
     }
 
-    /// The table. Abort and fault come first, then orders, then what interrupts, then the way of a run, then time.
+    /// Applies the transition table. Abort and fault come first, then orders, then interruptions, then the sequence of
+    /// a run, then time.
     fn take(&mut self, event: &Event) -> Result<(), Option<String>> {
         match (self.state, event) {
             // The safe sequence.
@@ -85,7 +90,7 @@ impl Cell {
             }
             (Aborting, Event::Restarted { .. }) => self.abort_again(),
             (Aborting, Event::Deadline) => self.due(),
-            // What was under way when the abort came may still be told; nothing follows from it.
+            // A machine may still report what was in progress when the abort came. It has no effect.
             (Aborting, event) if !event.is_order() => {}
 
             // Orders.
@@ -101,12 +106,12 @@ impl Cell {
             (Holding(_) | Held(_), Event::Hold { .. }) => {}
             (Held(phase), Event::Resume { .. }) => self.resume(phase)?,
             (Held(Grind(JobStep::Reconcile)), Event::DeclaredOver { device: device @ Device::Grinder, .. })
-            // A result that is gone, with the machine's memory or a file, is measured once more too.
+            // If the result is lost, with the machine's memory or a file, the part is also measured once more.
             | (
                 Held(Measure(JobStep::Reconcile | JobStep::Collect)),
                 Event::DeclaredOver { device: device @ Device::Cmm, .. },
             ) => self.declared_over(*device),
-            // A result that the machine will not be told to forget: whether it is gone shows when the next job is prepared.
+            // The machine does not discard its result: the next preparation shows whether the result is gone.
             (Held(phase), Event::DeclaredOver { device, .. }) if awaits_acknowledge(phase) == Some(*device) => {
                 let was_asked = self.keeps[*device as usize] || phase == Phase::of(*device, JobStep::Acknowledge);
                 if was_asked { self.given_up(phase) } else { self.declared_over(*device) }
@@ -124,7 +129,7 @@ impl Cell {
             }
             (_, Event::Restarted { actor }) => self.restarted(&actor.to_string()),
 
-            // What the record and the surroundings do to us.
+            // Failures of the record, and conditions outside.
             (_, Event::RecordFailed { why }) => self.record_failed(why),
             (Execute(phase), Event::LinkLost { device, why }) => self.link_lost(phase, *device, why, Suspended),
             (
@@ -160,7 +165,7 @@ impl Cell {
                 Execute(phase) | Holding(phase) | Suspending(phase) | Unholding(phase) | Unsuspending(phase),
                 Event::NotOnRecord { .. },
             ) => self.not_on_record(phase),
-            // Its result stays at the machine, which is told when the next run comes.
+            // The result stays at the machine, which gets the acknowledgement in the next run.
             (Stopping, Event::NotOnRecord { command }) if command.starts_with("acknowledge") => self.stopped(),
             (_, Event::NotOnRecord { .. }) => {}
             (_, Event::ControlLost { why }) => self.raise(AlarmId::ControlLost, why),
@@ -180,7 +185,8 @@ impl Cell {
                 self.stop(&format!("the {device} could not be cleared: {why}"), false);
             }
 
-            // A job of a machine, in its steps. `advance` goes on, or stays at the border where the cell is being held.
+            // Job of a machine, in its steps. `advance` continues, or stays at the border of the phase if the cell is
+            // being held.
             (Execute(p) | Holding(p), Event::PassLoaded { .. }) if p == Grind(JobStep::Send) => {
                 self.advance(Grind(JobStep::Clear))
             }
@@ -211,7 +217,7 @@ impl Cell {
                 self.go(self.same(Phase::of(*device, JobStep::Run)));
                 self.push(Command::HoldMachine { device: *device });
             }
-            // Late, and asked for meanwhile: that it was taken is known all the same.
+            // A late answer to a request that the cell already clarifies: the job was taken.
             (state, Event::Started { device, .. }) if reconciling(state) == Some(*device) => {}
             (Execute(p) | Holding(p) | Suspending(p), Event::StartUnknown { device, .. })
                 if p.job() == Some((*device, JobStep::Start)) =>
@@ -221,7 +227,7 @@ impl Cell {
             (state, Event::JobVanished { device, why }) if state.phase() == Some(Phase::of(*device, JobStep::Run)) => {
                 self.vanished(*device, why);
             }
-            // It is being asked already, or its end is known.
+            // The cell already asks the machine, or knows the end of the job.
             (_, Event::JobVanished { .. }) => {}
             (Execute(p), Event::Progressed { device, .. }) if p.job() == Some((*device, JobStep::Run)) => {
                 self.progressed(*device)
@@ -290,7 +296,7 @@ impl Cell {
             }
             (Completing, Event::Obstructed { device, message }) => self.seen(*device, false, message),
             (_, Event::Obstructed { device, .. }) => self.know(*device).clear = false,
-            // Nothing is to be started any more: who takes the part out sees for himself.
+            // Nothing is started any more: the person who takes the part out can see whether the machine is clear.
             (Completing, Event::ClearUnknown { device }) => self.seen(*device, true, ""),
             (_, Event::ClearUnknown { device }) => self.know(*device).clear = false,
 
@@ -327,7 +333,7 @@ impl Cell {
     }
 }
 
-/// Whether an event shows a machine at the job that it was asked for, or at its end.
+/// Returns true if an event shows a machine at the requested job, or at its end.
 fn shows_at_work(event: &Event, of: Device) -> bool {
     match event {
         Event::Started { device, .. }

@@ -1,4 +1,4 @@
-//! What the cell keeps between two events.
+//! State that the cell keeps between two events.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -10,91 +10,93 @@ use super::event::{Condition, Figures};
 use super::plan::CellPlan;
 use super::state::{Device, JobStep, Phase, State};
 
-/// Why the cell is suspended.
+/// Cause of a suspension.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Cause {
     Link(Device),
     Condition(Device, Condition),
 }
 
-/// What the cell knows of one machine.
+/// State of one machine as far as the cell knows it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Known {
-    /// The boot id of the connection; none before the first and after a restart of this program.
+    /// Boot id of the connection. `None` before the first one and after a restart of this program.
     pub(super) boot_id: Option<u32>,
-    /// Whether it was ever connected in this run, so that an abort must reach it.
+    /// True if it was ever connected in this run, so that an abort must reach it.
     pub(super) met: bool,
-    /// Whether it is connected and idle, or busy with this run's job.
+    /// True if it is connected and idle, or busy with the job of this run.
     pub(super) ready: bool,
-    /// Whether a fresh status has shown it clear of the part, and it has not been started since.
+    /// True if a fresh status has shown it clear of the part, and it has not been started since.
     pub(super) clear: bool,
-    /// Whether a person has seen it clear of the part, and it has not been started since.
+    /// True if a person has confirmed it clear of the part, and it has not been started since.
     pub(super) said_clear: bool,
-    /// Whether it cannot tell, and a person is being asked.
+    /// True if it cannot report this, and a person is being asked.
     pub(super) asked_clear: bool,
-    /// Whether it has ended its safe sequence.
+    /// True if it has ended its safe sequence.
     pub(super) stands: bool,
-    /// Whether it is in manual mode.
+    /// True if it is in manual mode.
     pub(super) manual: bool,
-    /// Whether it moves without an order, was told to hold, and has not said yet that it stands.
+    /// True if it moves without an order, was ordered to hold, and has not yet confirmed that it stands still.
     pub(super) astray: bool,
 }
 
-/// The failures of a machine in a row, without getting any further.
+/// Series of failures of a machine without progress in between.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Vain {
     pub(super) failures: u32,
-    /// When the first and the last of them were.
+    /// Time of the first and of the last failure.
     pub(super) since: Duration,
     pub(super) last: Duration,
-    /// Whether a person was told that it fails again and again.
+    /// True if the series was reported to a person.
     pub(super) told: bool,
 }
 
-/// A cell in the middle of a run. What is large is shared by its copies, of which [`super::table()`] makes millions.
+/// Cell in the middle of a run. Large parts are shared by its copies, of which [`super::table()`] makes millions.
 #[derive(Clone, Debug)]
 pub struct Cell {
     pub(super) plan: Arc<CellPlan>,
     pub(super) state: State,
     pub(super) cycle: u32,
-    /// Passes of the grinder begun.
+    /// Number of passes that the grinder has begun.
     pub(super) passes: u32,
-    /// What the grinder said of the pass of this cycle cannot be.
+    /// True if the pass record of this cycle is implausible.
     pub(super) doubted: bool,
-    /// Whether each machine was seen at the job for which it was asked last: no answer of the machine undoes that.
+    /// True for each machine that was seen at the job last requested from it. A later answer of the machine does not
+    /// reset it.
     pub(super) begun: [bool; 2],
     pub(super) known: [Known; 2],
     pub(super) causes: BTreeSet<Cause>,
     pub(super) raised: BTreeMap<AlarmId, Arc<Alarm>>,
-    /// The figures of this cycle, and of the last one that was judged.
+    /// Figures of this cycle, and of the last one that was judged.
     pub(super) figures: Option<Arc<Figures>>,
     pub(super) previous: Option<Arc<Figures>>,
-    /// The cycle that came nearest to what is accepted, and its figures.
+    /// Cycle that came nearest to acceptance, and its figures.
     pub(super) best: Option<(u32, Arc<Figures>)>,
-    /// Cycles in a row that were worse than the one before.
+    /// Number of consecutive cycles that were worse than the one before.
     pub(super) worse: u32,
-    /// How the run ends when the state that leads to the end is over.
+    /// Reason of the ending, when the state that leads to it is over; and whether the ending is `NotAccepted`.
     pub(super) reason: String,
     pub(super) judged_out: bool,
-    /// Whether a person ordered it.
+    /// True if a person ordered the ending.
     pub(super) ordered: bool,
     pub(super) repeated: bool,
-    /// The machine that is being stopped, while the cell is.
+    /// Machine that is being stopped, while the cell is being stopped.
     pub(super) stopping: Option<Device>,
-    /// Whether each machine was asked to give its result back, and would not.
+    /// True for each machine that was asked to give its result back and refused.
     pub(super) keeps: [bool; 2],
-    /// The time of the event that is being handled, and when the next deadline is due.
+    /// Time of the event that is being handled, and time of the next deadline.
     pub(super) now: Duration,
     pub(super) deadline: Option<Duration>,
-    /// When a machine that was told to hold has to stand.
+    /// Time by which a machine that was ordered to hold must stand still.
     pub(super) hold_due: Option<Duration>,
-    /// When the running job gave its last sign of progress, the longest that it took for one, and whether a person was told that none comes.
+    /// Time of the last sign of progress of the running job, the longest interval between two signs, and whether a
+    /// person was notified that no sign comes.
     pub(super) progressed: Option<Duration>,
     pub(super) pace: Duration,
     pub(super) still: bool,
-    /// How far the cell has come: the cycle, and the place in it.
+    /// Furthest place that the cell has reached: the cycle, and the place in it.
     pub(super) furthest: (u32, u8),
-    /// The failures of each machine.
+    /// Failure series of each machine.
     pub(super) vain: [Vain; 2],
     pub(super) commands: Vec<Command>,
 }
@@ -139,7 +141,8 @@ impl Cell {
         self.state
     }
 
-    /// Returns the state in words for people. Whatever has not confirmed that it stands is named beside a state that says so.
+    /// Returns the state in words for people. If the state implies a standstill, adds each machine that has not
+    /// confirmed it.
     pub fn in_words(&self) -> String {
         match (self.state, &self.unconfirmed()[..]) {
             (State::Aborted, [device]) => format!("{}: the {device} has not confirmed that it stands", self.state),
@@ -148,7 +151,7 @@ impl Cell {
         }
     }
 
-    /// Returns the machines that have not confirmed that they stand, in a state that is taken for standing still.
+    /// Returns the machines that have not confirmed their standstill, in a state that implies it.
     pub fn unconfirmed(&self) -> Vec<Device> {
         match self.state {
             State::Aborted => self.met_and_not_standing(),
@@ -161,7 +164,7 @@ impl Cell {
         Device::BOTH.into_iter().filter(|device| known(*device).met && !known(*device).stands).collect()
     }
 
-    /// Returns the number of the cycle; 0 before the first.
+    /// Returns the number of the cycle; 0 before the first one.
     pub fn cycle(&self) -> u32 {
         self.cycle
     }
@@ -176,8 +179,8 @@ impl Cell {
         self.figures.as_deref().or(self.previous.as_deref())
     }
 
-    /// Returns whether a command that was given earlier, and has waited, is still to be carried out. What sets something in motion is
-    /// wanted in the very state that asked for it only; on the way to an end nothing is that does not lead there.
+    /// Returns true if a command that has waited must still be executed. A command that causes motion is wanted only in
+    /// the state that issued it. On the way to an end, only commands that lead there are wanted.
     pub fn wants(&self, command: &Command) -> bool {
         let at = |device, step| self.state.phase() == Some(Phase::of(device, step));
         match (self.state, command) {
@@ -199,17 +202,17 @@ impl Cell {
         }
     }
 
-    /// Returns the alarms that stand.
+    /// Returns the active alarms.
     pub fn alarms(&self) -> impl Iterator<Item = &Alarm> + '_ {
         self.raised.values().map(AsRef::as_ref)
     }
 
-    /// Returns the machine of which a person is being asked whether it is clear of the part.
+    /// Returns the machine for which a person is being asked whether it is clear of the part.
     pub fn asks_whether_clear_of(&self) -> Option<Device> {
         self.state.phase().filter(|phase| self.asks_whether_clear(*phase)).and_then(super::act::awaits_clear)
     }
 
-    /// Returns when `Event::Deadline` is due, as time since the run began.
+    /// Returns the time at which `Event::Deadline` is due, as time since the run began.
     pub fn next_deadline(&self) -> Option<Duration> {
         self.deadline
     }

@@ -1,15 +1,16 @@
-//! How a number that may be none stands in the record: JSON has no NaN and no infinity, and a run is replayed from what stands there.
+//! Serialization of a number that can be missing or not finite. JSON has no NaN and no infinity, but a run is replayed
+//! from its record.
 
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// A number as it is recorded.
+/// Number as it is recorded.
 #[derive(Serialize, Deserialize)]
 #[serde(untagged)]
 enum Recorded {
     Number(f64),
     Word(String),
-    /// As records of earlier versions have a NaN.
+    /// NaN in records of earlier versions.
     Nothing(()),
 }
 
@@ -35,7 +36,7 @@ pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::
     Recorded::deserialize(from)?.value()
 }
 
-/// The same for a number that may be missing.
+/// Serialization of a number that can be missing.
 pub(super) mod optional {
     use super::{Deserialize, Deserializer, Recorded, Serialize, Serializer};
 
@@ -48,12 +49,12 @@ pub(super) mod optional {
     }
 }
 
-/// Reads a limit: where nothing stands there is none, and JSON has no infinity.
+/// Reads a limit. A missing one is infinite, because JSON has no infinity.
 pub(super) fn limit<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
     Option::<Recorded>::deserialize(from)?.map_or(Ok(f64::INFINITY), Recorded::value)
 }
 
-/// The same for pairs of numbers.
+/// Serialization of pairs of numbers.
 pub(super) mod pairs {
     use super::{Deserialize, Deserializer, Recorded, Serialize, Serializer};
 

@@ -1,38 +1,38 @@
-//! What the recipe and the cell file ask of the cell, as far as the cell decides upon it.
+//! Parameters of the recipe and of the cell file on which the cell decides.
 
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-/// The numbers that the cell decides by. Checked by who builds it; a number that is none makes the cell accept nothing.
+/// Parameters by which the cell decides. The builder checks them; a NaN makes the cell accept nothing.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CellPlan {
-    /// Where the first cycle begins.
+    /// Start of the first cycle.
     pub begin_with: Beginning,
-    /// The most passes of the grinder.
+    /// Maximum number of passes of the grinder.
     pub max_cycles: u32,
-    /// What is accepted.
+    /// Accepted tolerance.
     pub tolerance: Tolerance,
-    /// Improvement, as a share of the cycle before, below which the run is taken as stalled.
+    /// Minimum improvement, as a share of the cycle before. Below it the run counts as stalled.
     pub stall_share: f64,
-    /// Improvement of the rms below which the run is taken as stalled, whatever share that is.
+    /// Minimum improvement of the rms in absolute terms. Below it the run counts as stalled, whatever the share is.
     #[serde(default)]
     pub stall_mm: f64,
-    /// What to do when it stalls.
+    /// Action when the run stalls.
     pub on_stall: Disposal,
-    /// What to do when it has diverged twice.
+    /// Action after two cycles in a row that are worse than the one before.
     pub on_divergence: Disposal,
-    /// What to do when there is no next map for another reason than the budget.
+    /// Action when there is no next map for another reason than the budget.
     pub on_refusal: Disposal,
-    /// The limits that a measurement must keep.
+    /// Limits that a measurement must satisfy.
     pub gates: Gates,
-    /// The most material that may be taken off anywhere in the whole run.
+    /// Maximum removal at any place in the whole run.
     pub removal_budget_mm: f64,
-    /// The least that a pass takes off anywhere.
+    /// Minimum removal of a pass at any place.
     pub least_depth_mm: f64,
-    /// Whether a machine found aborted or faulted at the start is cleared without asking.
+    /// True if a machine found aborted or faulted at the start is cleared without a question.
     pub clear_at_start: bool,
-    /// How long each thing may take.
+    /// Time limits.
     pub deadlines: Deadlines,
 }
 
@@ -47,28 +47,28 @@ pub enum Beginning {
     Measure,
 }
 
-/// What is accepted.
+/// Accepted tolerance.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Tolerance {
-    /// Peak to valley; infinite where it is not limited.
+    /// Limit of the peak to valley; infinite if it is not limited.
     #[serde(deserialize_with = "super::number::limit")]
     pub pv_mm: f64,
-    /// Root mean square; infinite where it is not limited.
+    /// Limit of the root mean square; infinite if it is not limited.
     #[serde(deserialize_with = "super::number::limit")]
     pub rms_mm: f64,
-    /// Whether the uncertainty of the figures is counted; else what is as probably above as below is held against the limit.
+    /// True if the uncertainty of the figures counts. Otherwise the median is compared with the limit.
     pub with_uncertainty: bool,
-    /// The probability with which a figure must be within its limit to be accepted, and beyond it to be rejected, 0.5 to below 1. Recorded where it is not
-    /// the usual one.
+    /// Probability with which a figure must be within its limit to be accepted, and beyond it to be rejected: 0.5 to
+    /// below 1. Recorded only if it is not the default one.
     #[serde(default = "Tolerance::usual", skip_serializing_if = "Tolerance::is_usual")]
     pub probability: f64,
-    /// Which points the peak to valley is taken of.
+    /// Points from which the peak to valley is taken.
     pub pv_of: PvOf,
 }
 
 impl Tolerance {
-    /// The probability that is asked for where nobody asks for another: of a normal figure its guard band is the expanded uncertainty with
-    /// k = 2 (ISO 14253-1).
+    /// Default probability. For a normal figure the guard band is then the expanded uncertainty with k = 2 (ISO
+    /// 14253-1).
     pub const USUAL: f64 = 0.975;
 
     fn usual() -> f64 {
@@ -104,55 +104,56 @@ pub enum Disposal {
     Stop,
 }
 
-/// The limits that a measurement must keep before anything is made of it.
+/// Limits that a measurement must satisfy before it is used.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Gates {
-    /// Least share of the planned points that must be found, 0 to 1.
+    /// Minimum share of the planned points that must be found, 0 to 1.
     pub least_found: f64,
-    /// Least share of the aperture that must be covered, 0 to 1.
+    /// Minimum share of the aperture that must be covered, 0 to 1.
     pub least_coverage: f64,
-    /// Most shift of the part from where it is expected.
+    /// Maximum shift of the part from its expected place.
     pub most_shift_mm: f64,
-    /// Most turn of the part from how it is expected.
+    /// Maximum turn of the part from its expected orientation.
     pub most_turn_rad: f64,
-    /// Most error of the radius of the probe; none where there is no reference sphere.
+    /// Maximum error of the radius of the probe; `None` if there is no reference sphere.
     pub most_radius_error_mm: Option<f64>,
 }
 
-/// How long each thing may take.
+/// Time limits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Deadlines {
-    /// To connect and check both machines.
+    /// Time to connect and check both machines.
     pub connect: Duration,
-    /// To load the part; none waits for ever.
+    /// Time to load the part; `None` means no limit.
     pub load: Option<Duration>,
-    /// To send a payload, and to collect a result.
+    /// Time to send a payload, and to collect a result.
     pub transfer: Duration,
-    /// For any other answer of a machine: prepare, start, clear, acknowledge, resume, reconcile.
+    /// Time for any other answer of a machine: prepare, start, clear, acknowledge, resume, reconcile.
     pub answer: Duration,
-    /// Between two signs of progress of a running job of each machine: CMM, grinder. A job done by hand gives none before its end.
+    /// Maximum time between two signs of progress of a running job of each machine: CMM, grinder. A manual job gives no
+    /// sign before its end.
     pub progress: [Duration; 2],
-    /// After how long without a sign of progress a person is told, or after three times the longest that this job took for one; none where
-    /// a job gives no such signs.
+    /// Time without a sign of progress after which a person is notified; at least three times the longest interval of
+    /// this job. `None` if a job gives no such signs.
     #[serde(default)]
     pub progress_notice: [Option<Duration>; 2],
-    /// Since the first of several failures at the same place, without getting any further, before the cell is held.
+    /// Time since the first of several failures at the same place, without progress, after which the cell is held.
     #[serde(default = "Deadlines::vain")]
     pub vain: Duration,
-    /// How many failures in a row, without getting any further, are enough for that.
+    /// Number of failures in a row, without progress, after which the cell is held.
     #[serde(default = "Deadlines::vain_failures")]
     pub vain_failures: u32,
-    /// From HOLD to the safe place of each machine: CMM, grinder.
+    /// Time from HOLD to the safe place of each machine: CMM, grinder.
     pub hold: [Duration; 2],
-    /// From STOP to the end of the job of each machine: CMM, grinder.
+    /// Time from STOP to the end of the job of each machine: CMM, grinder.
     pub stop: [Duration; 2],
-    /// From ABORT to its confirmation; then the alarm, one repetition, and as long again.
+    /// Time from ABORT to its confirmation. Then follow the alarm, one repetition, and the same time again.
     pub abort: Duration,
-    /// For a registration or a compensation.
+    /// Time for a registration or a compensation.
     pub compute: Duration,
-    /// How long the cell stays suspended before it is held.
+    /// Time in the suspended state before the cell is held.
     pub suspended: Duration,
-    /// How long it stays held before it ends in order; none waits for ever.
+    /// Time in the held state before the run ends in order; `None` means no limit.
     pub held: Option<Duration>,
 }
 

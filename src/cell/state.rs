@@ -1,4 +1,4 @@
-//! Where the cell is: the states of PackML, and inside them the phases of a cycle and the steps of a machine's job.
+//! State of the cell: the states of PackML, and inside them the phases of a cycle and the steps of a machine's job.
 
 use std::fmt;
 
@@ -16,10 +16,10 @@ pub enum Device {
 }
 
 impl Device {
-    /// Both, in the order in which they are commanded.
+    /// Both machines, in the order in which they get commands.
     pub const BOTH: [Self; 2] = [Self::Cmm, Self::Grinder];
 
-    /// Returns the name of the machine, as it is recorded.
+    /// Returns the name of the machine as it is recorded.
     pub fn name(self) -> &'static str {
         match self {
             Self::Cmm => "cmm",
@@ -45,7 +45,7 @@ impl fmt::Display for Device {
     }
 }
 
-/// A step of one job of one machine, named for what is waited for.
+/// Step of one job of one machine, named for the event that it waits for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum JobStep {
@@ -55,23 +55,23 @@ pub enum JobStep {
     Clear,
     /// The machine checks its payload and interlocks.
     Prepare,
-    /// START is on its way. From here on the machine may move.
+    /// START is on its way. From now on the machine may move.
     Start,
     /// The machine moves.
     Run,
-    /// Whether START was taken is not known and is being found out.
+    /// It is unknown whether the machine took START; the cell asks it.
     Reconcile,
     /// The result is being read and gated (CMM only).
     Collect,
     /// The radius of the probe is being compared with the reference sphere (CMM only).
     Qualify,
-    /// The machine is told that its result may be forgotten.
+    /// The machine gets the order to discard its result, which is used.
     Acknowledge,
-    /// The same for a result that is of no use.
+    /// The machine gets the order to discard its result, which is not used.
     Discard,
 }
 
-/// A phase of a cycle. The number of the cycle is kept beside, in [`super::Cell::cycle`].
+/// Phase of a cycle. [`super::Cell::cycle`] has the number of the cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Phase {
@@ -79,13 +79,13 @@ pub enum Phase {
     Load,
     /// A pass of the grinder.
     Grind(JobStep),
-    /// The grinder leaves the part to the CMM.
+    /// The grinder leaves the part free for the CMM.
     Transfer,
     /// A measurement.
     Measure(JobStep),
     /// The measurement is registered to the nominal surface.
     Register,
-    /// The figures are judged; at once, unless the cell is held before it.
+    /// The figures are judged. This takes no time, unless the cell is held before it.
     Judge,
     /// The next map is computed.
     Compensate,
@@ -100,7 +100,7 @@ impl Phase {
         }
     }
 
-    /// Returns the machine whose job this phase is, and the step of it.
+    /// Returns the machine whose job this phase is, and its step.
     pub fn job(self) -> Option<(Device, JobStep)> {
         match self {
             Self::Grind(step) => Some((Device::Grinder, step)),
@@ -116,7 +116,8 @@ impl Phase {
             .map(|(device, _)| device)
     }
 
-    /// Returns how far it is in a cycle: what comes later has a higher number. A job that is being found out about is not as far as one that is seen.
+    /// Returns the position in a cycle: a later phase has a higher number. A job that is being reconciled counts as
+    /// less far than one that is seen running.
     pub(super) fn place(self) -> u8 {
         let step = |step: JobStep| match step {
             JobStep::Send => 0,
@@ -164,49 +165,49 @@ impl fmt::Display for Phase {
     }
 }
 
-/// The state of the cell, by PackML's names. A phase beside a state tells where the cycle goes on.
+/// State of the cell, with the name of PackML. A phase in a state shows where the cycle continues.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
-    /// Nothing has been asked for yet.
+    /// No command has been given yet.
     Idle,
     /// Both machines are being connected and checked.
     Starting,
     /// A cycle runs.
     Execute(Phase),
-    /// Held from inside or by a person: what runs comes to its safe place first.
+    /// Held from inside or by a person: a moving machine comes to its safe place first.
     Holding(Phase),
-    /// Held. A person resumes.
+    /// Held. A person must resume.
     Held(Phase),
     /// The held machine is being resumed.
     Unholding(Phase),
-    /// Suspended from outside (a link, supplies, temperature): what runs comes to its safe place first.
+    /// Suspended from outside (a link, supplies, temperature): a moving machine comes to its safe place first.
     Suspending(Phase),
     /// Suspended; resumes by itself when the cause is gone.
     Suspended(Phase),
-    /// The cause is gone: the machine is being asked where it is, or resumed.
+    /// The cause is gone: the machine is asked about its state, or resumed.
     Unsuspending(Phase),
-    /// An orderly end is under way.
+    /// An orderly end is in progress.
     Stopping,
     /// Ended in order, without an accepted part. An end state.
     Stopped,
-    /// The declared safe sequence runs.
+    /// The safe sequence runs.
     Aborting,
     /// The safe sequence is over. An end state.
     Aborted,
-    /// Accepted; both machines are seen to be clear of the part.
+    /// Accepted; the cell checks that both machines are clear of the part.
     Completing,
     /// Ended with an accepted part. An end state.
     Complete,
 }
 
 impl State {
-    /// Returns whether the run is over: from here no command, ever.
+    /// Returns true if the run is over. No command follows after that.
     pub fn is_end(self) -> bool {
         matches!(self, Self::Stopped | Self::Aborted | Self::Complete)
     }
 
-    /// Returns the phase in which the cell is, or in which it will go on.
+    /// Returns the phase in which the cell is, or in which it will continue.
     pub fn phase(self) -> Option<Phase> {
         match self {
             Self::Execute(phase)
@@ -220,8 +221,8 @@ impl State {
         }
     }
 
-    /// Returns the machine that has not confirmed that it stands, while the cell is held or suspended: it was last seen, or may
-    /// have been started, at a job that nobody has told the end of.
+    /// Returns the machine that has not confirmed its standstill, while the cell is held or suspended. It was last seen
+    /// at a job, or may have been started, and its end is not known.
     pub fn unconfirmed(self) -> Option<Device> {
         match self {
             Self::Held(phase) | Self::Suspended(phase) => {
@@ -231,7 +232,7 @@ impl State {
         }
     }
 
-    /// Returns PackML's name.
+    /// Returns the name of the state in PackML.
     pub fn name(self) -> StateName {
         match self {
             Self::Idle => StateName::Idle,
@@ -253,7 +254,7 @@ impl State {
     }
 }
 
-/// The names of the states by PackML, without their phases.
+/// Names of the states in PackML, without their phases.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[allow(missing_docs)]
 pub enum StateName {

@@ -1,5 +1,5 @@
-//! The transition table, found by trying: every event in every state that can be reached. So it is what the machine does, and
-//! not what somebody wrote down once.
+//! Transition table, found by trial: every event in every reachable state. So it shows the actual behaviour, and not a
+//! list written by hand.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::hash::Hash;
@@ -14,34 +14,34 @@ use super::memory::Cell;
 use super::plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
 use super::state::{Device, JobStep, Phase, State};
 
-/// The version of the table. A run is gone on with by a program of the version that began it only; a change of what follows from
-/// anything is another version.
+/// Version of the table. Only a program of the version that began a run can continue it. Any change of a reaction is a
+/// new version.
 pub const TABLE_VERSION: u32 = 12;
 
-/// What an event does in a state.
+/// Reaction to an event in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Row {
-    /// The state.
+    /// State.
     pub state: State,
-    /// The name of the event, with the machine that it comes from.
+    /// Name of the event, with the machine that it comes from.
     pub event: String,
-    /// What can follow; more than one where it depends on the values of the event or on what happened before.
+    /// Possible answers. There is more than one if the answer depends on the values of the event or on earlier events.
     pub answers: BTreeSet<Answer>,
 }
 
-/// The name of the command that follows from an event which does not fit.
+/// Name of the command that answers an event which does not fit.
 const REFUSE: &str = "refuse";
 
-/// One thing that can follow.
+/// Possible answer.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Answer {
-    /// The next state.
+    /// Next state.
     pub next: State,
-    /// The commands, by name.
+    /// Commands, by name.
     pub commands: Vec<String>,
 }
 
-/// The next state, and the labels of the commands.
+/// Next state, and the labels of the commands.
 type Labelled = (State, Vec<(&'static str, Option<Device>)>);
 
 impl Answer {
@@ -49,7 +49,7 @@ impl Answer {
         Self { next, commands: labels.into_iter().map(spelled).collect() }
     }
 
-    /// Returns whether the event did not fit.
+    /// Returns true if the event did not fit.
     pub fn is_refusal(&self) -> bool {
         self.commands.iter().any(|command| command == REFUSE)
     }
@@ -63,19 +63,19 @@ pub fn table() -> Vec<Row> {
     while let Some(cell) = open.pop_front() {
         let events: &Vec<Event> = sampled.entry(cell.cycle()).or_insert_with(|| samples(cell.cycle()));
         let answers = answers.entry(cell.state()).or_insert_with(|| vec![Vec::new(); events.len()]);
-        // Late enough for whatever is due.
+        // Late enough for every deadline.
         let now = cell.next_deadline().unwrap_or(Duration::ZERO);
         let mut next = cell.clone();
         for (event, answers) in events.iter().zip(answers) {
             let answered = next.answer(now, event);
             let state = next.state();
             let labels = || next.commands.iter().map(Command::label).chain(answered.is_err().then_some((REFUSE, None)));
-            // Almost all of millions of answers are known.
+            // Almost all of the millions of answers are already known.
             if !answers.iter().any(|(then, commands)| *then == state && commands.iter().copied().eq(labels())) {
                 answers.push((state, labels().collect()));
             }
             next.commands.clear();
-            // What does not fit at all has changed nothing: the next event finds the cell as it was.
+            // An event that does not fit at all has changed nothing: the next event gets the cell as it was.
             if answered != Err(None) {
                 if seen.insert(key(&next)) {
                     open.push_back(next);
@@ -94,14 +94,14 @@ pub fn table() -> Vec<Row> {
     rows.into_iter().map(|((state, event), answers)| Row { state, event: event.to_owned(), answers }).collect()
 }
 
-/// What decides how a cell answers, without times and counts, and no finer than the table needs.
+/// Returns everything that decides the answer of a cell, without times and counts, and only as fine as the table needs.
 fn key(cell: &Cell) -> impl Eq + Hash + use<> {
     let known = cell.known.map(|known| (known.ready, known.met && known.stands));
     let clear = cell.known.map(|known| (known.clear, known.said_clear, known.asked_clear));
     let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
     let grinds = cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
     let by_hand = cell.known.iter().any(|known| known.manual);
-    // Only what became of a job is asked by it.
+    // Only a reconciliation reads it.
     let asked = cell.state().phase().and_then(Phase::job).filter(|(_, step)| *step == JobStep::Reconcile);
     let begun = asked.map(|(device, _)| (cell.begun[device as usize], cell.vain[device as usize].told));
     let discarded = cell.state().phase().and_then(Phase::job).filter(|(_, step)| *step == JobStep::Discard);
@@ -143,7 +143,7 @@ fn plan(disposal: Disposal) -> CellPlan {
         removal_budget_mm: 1.0,
         least_depth_mm: 0.001,
         clear_at_start: disposal == Disposal::Stop,
-        // One of the two tries nothing twice, so that it shows what follows when trying is in vain.
+        // One of the two plans retries nothing, so that the table shows the reaction to a failure that recurs.
         deadlines: Deadlines {
             vain_failures: if disposal == Disposal::Stop { 1 } else { u32::MAX },
             vain: Duration::MAX,
@@ -152,7 +152,7 @@ fn plan(disposal: Disposal) -> CellPlan {
     }
 }
 
-/// Returns events of every kind, with the values upon which the cell decides, for a cycle.
+/// Returns sample events of every kind for a cycle, with the values on which the cell decides.
 pub fn samples(cycle: u32) -> Vec<Event> {
     let mut events = orders();
     for device in Device::BOTH {

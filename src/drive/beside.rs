@@ -1,5 +1,5 @@
-//! What blocks is done beside the loop: on threads of the computer, or in turn with everything else where the run's whole time is
-//! simulated and no thread would keep to it.
+//! Execution of blocking work outside the loop: on threads of the computer, or in turn with all other tasks if the time
+//! of the run is simulated, because threads would not follow the simulated time.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -8,28 +8,28 @@ use std::time::Duration;
 
 use tokio::task::{AbortHandle, JoinSet};
 
-/// What blocks.
+/// Kind of blocking work.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Blocking {
-    /// A registration, a correction, files that are written and read.
+    /// Registration, correction, or files that are written and read.
     Computation,
-    /// A record on its way to the disk.
+    /// Record on its way to the disk.
     Record,
 }
 
-/// Where a run does what blocks.
+/// Executor of blocking work.
 #[derive(Clone, Default)]
 pub enum Beside {
-    /// On threads of the computer.
+    /// Threads of the computer.
     #[default]
     Threads,
-    /// In turn with everything else, each after the time that this gives for it.
+    /// In turn with everything else, each after the duration that this function returns for it.
     InTurn(Arc<dyn Fn(Blocking) -> Duration + Send + Sync>),
 }
 
 impl Beside {
-    /// Does a piece of work among others.
+    /// Runs a piece of work as one of a set of tasks. Returns the handle to abort it.
     pub(super) fn compute<T: Send + 'static>(
         &self,
         among: &mut JoinSet<T>,
@@ -44,7 +44,7 @@ impl Beside {
         }
     }
 
-    /// Lets something that blocks attend to what it is given; returns its thread, if it has one.
+    /// Runs a task that may block for long. Returns its thread, if it has one.
     pub(super) fn attend(
         &self,
         name: &str,
@@ -59,7 +59,7 @@ impl Beside {
         Some(thread.expect("a thread can be had"))
     }
 
-    /// Lets the time pass that something takes, where it is simulated.
+    /// Waits for the simulated duration of a piece of work, if the time is simulated.
     pub(super) async fn take_its_time(&self, what: Blocking) {
         if let Self::InTurn(time) = self {
             tokio::time::sleep(time(what)).await;

@@ -1,6 +1,6 @@
-//! What is known of the cycles of a run, and what each next step begins with.
+//! Knowledge about the cycles of a run, and the inputs of each next step.
 //!
-//! The loop and the replay of a record go through here alike, so that a run that is gone on with has what it had.
+//! The loop and the replay of a record both use it, so a run that continues has the same state as before.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use crate::device::{CorrectionMap, Pass, Plan};
 use crate::geometry::Pose;
 use crate::model::{FIRST_BATCH, PartPriors, farthest_points, short_tour};
 
-/// The cycles, by number.
+/// Cycles, by number.
 #[derive(Default)]
 pub(super) struct Cycles(BTreeMap<u32, Cycle>);
 
@@ -21,18 +21,19 @@ impl Cycles {
         self.0.get(&number)
     }
 
-    /// Returns the payloads of the pass of a cycle; the first begins with what the task does.
+    /// Returns the payloads of the pass of a cycle. The first pass uses the first correction of the task.
     pub(super) fn pass(&mut self, task: &Task, number: u32) -> (CorrectionMap, Pass) {
         let cycle = self.0.entry(number).or_insert_with(|| Cycle::new(task.first_correction()));
         task.payloads(&cycle.correction)
     }
 
-    /// Lays the plan of a cycle and keeps it.
+    /// Creates the plan of a cycle and stores it.
     pub(super) fn plan(&mut self, task: &Task, number: u32) -> Arc<Plan> {
-        // A part that is measured before any pass, or measured once more, stands as the last pass left it.
+        // A part that is measured before any pass, or measured once more, has the state that the last pass left.
         let last = self.0.range(..=number).next_back().map(|(_, c)| Arc::clone(&c.correction));
         let correction = last.unwrap_or_else(|| Arc::new(task.first_correction()));
-        // Where the part was found by a measurement that was judged. After one that a gate refused it may have been seated anew.
+        // Start from the pose of the last judged measurement. After a measurement that a gate refused, the part may
+        // have been clamped again.
         let last = self.0.range(..number).next_back().map(|(_, cycle)| cycle);
         let judged = last.filter(|cycle| cycle.is_judged()).and_then(|cycle| cycle.registration.as_ref());
         let pose = judged.map_or(task.fixture_cmm_from_model, |found| found.cmm_from_model);
@@ -50,12 +51,13 @@ impl Cycles {
         cycle.plan.insert(Arc::new(plan)).clone()
     }
 
-    /// Returns which batch of touches the plan of a cycle is.
+    /// Returns the batch of touches to which the plan of a cycle belongs.
     pub(super) fn batch(&self, number: u32) -> u32 {
         self.get(number).map_or(0, |cycle| cycle.batch)
     }
 
-    /// Returns how many touches of the part were tried, and how many the whole pattern would have been, in all measurements.
+    /// Returns the number of touches tried on the part, and the number that the whole pattern would have needed, in all
+    /// measurements.
     pub(super) fn touches(&self, task: &Task) -> [usize; 2] {
         let measured = self.0.values().filter_map(|cycle| cycle.points.as_ref());
         let tried = measured.clone().map(|points| match points.tried.is_empty() {
@@ -65,8 +67,8 @@ impl Cycles {
         [tried.sum(), measured.count() * task.targets.len()]
     }
 
-    /// Returns the last measurement of an earlier pass that was judged. What a gate refused, and what was measured once more after
-    /// the same pass, is no pass before this one.
+    /// Returns the last measurement of an earlier pass that was judged. A measurement that a gate refused, or that
+    /// repeats one after the same pass, does not count.
     pub(super) fn before(&self, number: u32) -> Option<&Cycle> {
         let pass = self.get(number)?.correction.cycle;
         let earlier = |c: &&Cycle| c.is_judged() && c.known.is_some() && c.correction.cycle < pass;
@@ -78,7 +80,7 @@ impl Cycles {
         self.0.range(..number).rev().find_map(|(earlier, cycle)| Some((*earlier, cycle.points.clone()?)))
     }
 
-    /// Takes what was computed of a cycle.
+    /// Stores the result of a computation of a cycle.
     pub(super) fn take(&mut self, number: u32, product: Product) {
         if let Product::Correction(next) = product {
             self.0.insert(number + 1, Cycle::new(next));
@@ -87,20 +89,20 @@ impl Cycles {
         }
     }
 
-    /// Counts a judgement of a cycle and returns how many it has had.
+    /// Counts a judgement of a cycle. Returns how many it has had.
     pub(super) fn judged(&mut self, number: u32) -> u32 {
         let Some(cycle) = self.0.get_mut(&number) else { return 1 };
         cycle.judgements += 1;
         cycle.judgements
     }
 
-    /// Returns the last cycle that tells something of the grinder.
+    /// Returns the last cycle with information about the grinder.
     pub(super) fn last_known(&self) -> Option<&Cycle> {
         self.0.values().rev().find(|cycle| cycle.is_judged() && cycle.known.is_some())
     }
 
-    /// Returns what earlier parts taught of the fields of errors, with the last judged pass of either kind of this one. What other cells taught is
-    /// left out: it would come back to them as this one's.
+    /// Returns the priors from earlier parts for the fields of errors, updated with the last judged pass of each kind
+    /// in this run. Priors from other cells are not included: they would come back to them as those of this cell.
     pub(super) fn taught(&self, task: &Task) -> PartPriors {
         let of_this_cell = task.learned.as_ref().filter(|learned| learned.taught_by.is_none());
         let mut taught = of_this_cell.map(|learned| learned.fields).unwrap_or_default();
@@ -113,7 +115,7 @@ impl Cycles {
         taught
     }
 
-    /// What is shown of them.
+    /// Returns the rows of the table of cycles.
     pub(super) fn rows(&self, tolerance: &Tolerance) -> Vec<CycleRow> {
         let rows = self.0.iter().filter_map(|(&cycle, c)| {
             let figures = c.figures.as_ref()?;
@@ -133,8 +135,8 @@ impl Cycles {
     }
 }
 
-/// Lays the next batch of touches of a measurement: where nothing was found yet some that lie far apart, slowly where the part may have been
-/// seated anew.
+/// Creates the next batch of touches of a measurement. The first batch has targets that are far apart; they are
+/// approached slowly if the part may have been clamped again.
 fn batch(task: &Task, cycle: &mut Cycle, pose: &Pose, seated_anew: bool) -> Plan {
     cycle.batch = cycle.points.as_ref().map_or(0, |points| points.tried.len() as u32);
     cycle.asked = match &cycle.next {

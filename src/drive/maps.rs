@@ -1,4 +1,4 @@
-//! What a cycle leaves behind of the part's error: figures, the map as text, X3P and picture, and the points in colours.
+//! Output of a cycle on the part's error: figures, the map as text, X3P and picture, and the points in colours.
 
 use std::time::SystemTime;
 
@@ -16,10 +16,10 @@ use crate::model::{AreaOptions, Form};
 use crate::registration::{Deviation, Registration};
 use crate::report::{HeatMap, ReportError, save_coloured_ply};
 
-/// Length over which slopes are taken, in cut-offs of the map's filter: shorter waves are not in the map.
+/// Length over which slopes are computed, as a share of the cut-off of the map's filter. The map has no shorter waves.
 const INTEGRATION: f64 = 0.5;
 
-/// Writes the figures of a cycle; where there are none the file says why.
+/// Writes the figures of a cycle. If there are none, the file gives the reason.
 pub(super) fn save_figures(
     task: &Task,
     files: &mut Files,
@@ -29,7 +29,7 @@ pub(super) fn save_figures(
 ) -> Result<(), FormatError> {
     let options = FormOptions { aperture: task.nominal.outline().cloned(), ..FormOptions::default() };
     let made = figures(&readings(found), &options);
-    // Slopes of the form and of the map are compared: both over the same length, which is what the places allow.
+    // Slopes of the form and of the map are compared, so both use the same length. The places of the form determine it.
     let told_mm = form.and_then(|form| form.slope).map(|slope| slope.integration_mm);
     let integration_mm = told_mm.unwrap_or(INTEGRATION * task.map.cutoff_mm);
     let slopes = map.map(|map| slope(&map.grid, &map.values_mm, &map.valid, integration_mm));
@@ -37,7 +37,8 @@ pub(super) fn save_figures(
     write_figures(&files.place("figures.json"), (made.as_ref(), slopes, form), &taken_out(task), task.simulation)
 }
 
-/// What the figures of an area go by: the middle of the aperture, and the length over which slopes are taken.
+/// Returns the options for the figures of an area: the middle of the aperture, and the length over which slopes are
+/// computed.
 pub(super) fn area(task: &Task) -> AreaOptions {
     let middle = |[low, high]: [[f64; 2]; 2]| std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
     AreaOptions {
@@ -46,7 +47,7 @@ pub(super) fn area(task: &Task) -> AreaOptions {
     }
 }
 
-/// What registration and filter take out, in words.
+/// Returns in words what registration and filter remove from the deviations.
 fn taken_out(task: &Task) -> TakenOut {
     let names = ["x", "y", "z", "rx", "ry", "rz"].into_iter().zip(task.registration.locked);
     let held: Vec<&str> = names.filter(|(_, held)| *held).map(|(name, _)| name).collect();
@@ -63,8 +64,8 @@ fn taken_out(task: &Task) -> TakenOut {
     TakenOut { motion, filter: format!("waves below {} mm ({smoothing})", task.map.cutoff_mm) }
 }
 
-/// Says what of the deviations the machine's parameters explain: the wheel's radius and setting, the tilt of the part, wear. What is offered is better
-/// corrected there than ground in with every map.
+/// Separates the part of the deviations that parameters of the machine explain: radius and setting of the wheel, tilt
+/// of the part, wear. An offered parameter is better corrected in the machine than ground with every map.
 pub(super) fn parameters(
     task: &Task,
     files: &mut Files,
@@ -82,7 +83,7 @@ pub(super) fn parameters(
     }
 }
 
-/// The points that took part in a registration, as parameters are told by them.
+/// Returns the points used in a registration, as the separation of parameters needs them.
 pub(super) fn contacts(found: &Registration) -> Vec<Contact> {
     let contact = |d: &Deviation| Contact { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
     used(found).map(contact).collect()
@@ -104,7 +105,7 @@ fn document(task: &Task, told: &Parameters) -> Value {
     })
 }
 
-/// The parameters that the next pass is told: those of this one, and what was found of them beside.
+/// Returns the parameter corrections of the next pass: those of this pass plus those now compensated.
 pub(super) fn set(task: &Task, cycle: &Cycle, contacts: &[Contact], told: &Parameters) -> Option<Set> {
     let taken = task.parameters.as_ref()?;
     let before = cycle.correction.set.as_ref();
@@ -116,7 +117,8 @@ pub(super) fn set(task: &Task, cycle: &Cycle, contacts: &[Contact], told: &Param
     Set::of(values, cycle.correction.cycle + 1, [contacts, &taken.nodes], &task.parameter_options(before))
 }
 
-/// What of values at the nodes of the correction parameters and slides make; none where no parameter is taken back.
+/// Returns a function that extracts, from values at the nodes of the correction, the part that parameters and slides
+/// explain. Returns `None` if no parameter is compensated.
 pub(super) fn smoother<'t>(
     task: &'t Task,
     cycle: &'t Cycle,
@@ -128,7 +130,7 @@ pub(super) fn smoother<'t>(
     Some(move |values_mm: &[f64]| compensation::smooth_of(values_mm, &grid, [contacts, &taken.nodes], &options))
 }
 
-/// Writes the map of a cycle's error and the points that it was made from.
+/// Writes the error map of a cycle and the points from which it was computed.
 pub(super) fn save(
     task: &Task,
     files: &mut Files,

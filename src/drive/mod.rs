@@ -1,15 +1,16 @@
-//! The only room where commands meet machines: one loop, one select.
+//! Drive: the only module where commands meet machines. One loop, one select.
 //!
 //! ```text
 //!  orders (control socket, Ctrl-C) --+                       +--> stations: a task for each machine
 //!  facts (stations, computations) ---+--> Cell::handle --> commands --> computations, off the asynchronous threads
 //!  the deadline of the cell ---------+       ^      |        +--> notices, for whoever shows the run
 //!                                            |      v
-//!                                        journal: every event before it is handled, every command before it is carried out
+//!                                        journal: events before they are handled, commands before execution
 //! ```
 //!
-//! The loop never waits for the disk. An event is decided upon at once, and what makes safe goes out at once; everything else that
-//! follows, the answer to who gave an order among it, waits in line until the journal has all that came before it.
+//! The loop never waits for the disk. It decides on an event at once, and sends commands that make the cell safe at
+//! once. Everything else waits in a queue until the journal has all earlier records; this includes the answer to the
+//! person who gave an order.
 
 mod beside;
 mod cycles;
@@ -72,31 +73,32 @@ use task::Product;
 pub(crate) use task::correction_grid;
 pub use task::{Adaptive, Probing, Sphere, TakenBack, Task};
 
-/// Everything a run needs besides its machines.
+/// Inputs of a run besides its machines.
 pub struct Run {
-    /// What the cell decides by.
+    /// Parameters by which the cell decides.
     pub plan: CellPlan,
-    /// What is computed, and from what.
+    /// Data and options of the computations.
     pub task: Task,
-    /// The journal of the run, just created, or opened to go on with it.
+    /// Journal of the run: a new one, or an open one of an interrupted run.
     pub journal: Box<dyn Ledger>,
-    /// The number of the part's run, for the machines.
+    /// Number of the part's run, for the machines.
     pub job: u32,
-    /// Who began it.
+    /// Person who began the run.
     pub actor: Actor,
-    /// Whether loading the part is not asked for: the cell is simulated, or who begins the run has said it.
+    /// True if the cell need not ask to load the part: the cell is simulated, or the person who begins the run has
+    /// confirmed it.
     pub loaded: bool,
-    /// Time between two looks at each machine: CMM, grinder.
+    /// Poll interval of each machine: CMM, grinder.
     pub poll: [Duration; 2],
-    /// Where notices go.
+    /// Channel for notices.
     pub notices: mpsc::UnboundedSender<Notice>,
-    /// A run that was interrupted and is gone on with.
+    /// Interrupted run to continue.
     pub interrupted: Option<Interrupted>,
-    /// Where what blocks is done.
+    /// Executor of blocking work.
     pub beside: Beside,
 }
 
-/// Orders from this process itself: Ctrl-C, a prompt.
+/// Channel for orders from this process itself: Ctrl-C, a prompt.
 #[derive(Clone)]
 pub struct Orders {
     orders: mpsc::Sender<Ordered>,
@@ -104,31 +106,31 @@ pub struct Orders {
 }
 
 impl Orders {
-    /// Gives an order; it is handled in its turn.
+    /// Sends an order, which the loop handles in its turn.
     pub async fn give(&self, request: Request, actor: Actor) {
         // A run that is over needs no orders.
         let _ = self.orders.send(Ordered { request, actor, answer: None }).await;
     }
 
-    /// Gives an order, and returns what the control socket would answer; none where the run is over.
+    /// Sends an order, and returns the answer that the control socket would give. Returns `None` if the run is over.
     pub async fn ask(&self, request: Request, actor: Actor) -> Option<Reply> {
         let (answer, answered) = oneshot::channel();
         self.orders.send(Ordered { request, actor, answer: Some(answer) }).await.ok()?;
         answered.await.ok()
     }
 
-    /// Returns what is shown of the run from here on.
+    /// Returns a receiver for the snapshots of the run from now on.
     pub fn status(&self) -> watch::Receiver<Snapshot> {
         self.status.clone()
     }
 
-    /// Whether the cell goes about its work: neither held, nor on its way to a stand or from one.
+    /// Returns true if the cell is in Execute: neither held nor suspended, and not on the way there or back.
     pub fn is_working(&self) -> bool {
         self.status.borrow().state == StateName::Execute
     }
 }
 
-/// A run that is ready to begin.
+/// Run that is ready to begin.
 pub struct Drive {
     cell: Cell,
     task: Arc<Task>,
@@ -140,17 +142,17 @@ pub struct Drive {
     actor: Actor,
     loaded: bool,
     began: Instant,
-    /// Time of the run before it was interrupted.
+    /// Duration of the run before it was interrupted.
     before: Duration,
     asks: [mpsc::Sender<Ask>; 2],
     interrupts: [Interrupt; 2],
-    /// Counts the aborts of each station, which so gives up what it is at.
+    /// Counters of the aborts for each station, which then gives up its present work.
     aborts: [watch::Sender<u64>; 2],
     pulse: Pulse,
     reports: mpsc::Receiver<StationReport>,
     beside: Beside,
     computations: JoinSet<Computed>,
-    /// Which of them computes what.
+    /// Cycle and kind of each computation.
     computing: HashMap<tokio::task::Id, (u32, Computation)>,
     orders: mpsc::Receiver<Ordered>,
     status: watch::Sender<Snapshot>,
@@ -158,43 +160,43 @@ pub struct Drive {
     cycles: Cycles,
     pace: Pace,
     touching: Touching,
-    /// What each machine waits for, in words.
+    /// Notes of each machine on why it waits, in words.
     notes: [Vec<String>; 2],
-    /// What the files of each cycle take on the disk, and the most of them.
+    /// Disk usage of the files of each cycle, and the maximum of all.
     cycle_bytes: BTreeMap<u32, u64>,
     largest_cycle_bytes: u64,
-    /// Counts the states of the cell.
+    /// Number of changes of state of the cell.
     states: u64,
-    /// Counts what was computed for each cycle.
+    /// Number of attempts of each computation of each cycle.
     attempts: BTreeMap<(u32, Computation), u32>,
     armed: [Option<Value>; 2],
-    /// Commands that no event has answered yet, by the numbers that the recorder gave them.
+    /// Commands without an answering event so far, by the numbers of the recorder.
     open: Vec<(u64, Command)>,
-    /// What waits to be on record, in order.
+    /// Entries that wait to be recorded, in order.
     backlog: VecDeque<Waiting>,
-    /// Why nothing comes on record at present.
+    /// Reason why nothing is recorded at present.
     failing: Option<String>,
-    /// A judgement that the program did not come to leave before it ended.
+    /// Judgement that the program did not write before it ended.
     unannounced: Option<(u32, Judgement)>,
-    /// Files that it did not come to bring on record.
+    /// Files that the program did not record before it ended.
     left: Vec<String>,
     ending: Option<Ending>,
     stations: Vec<tokio::task::JoinHandle<()>>,
     control: Control,
 }
 
-/// What is computed for a cycle.
+/// Kind of computation for a cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Computation {
     Gate,
     Registration,
     Compensation,
-    /// The registration that the cell decides by, where touches are chosen.
+    /// Registration on which the cell decides, if touches are chosen.
     Settled,
 }
 
 impl Computation {
-    /// Returns which makes a file of this name, if one does.
+    /// Returns the computation that writes a file of this name, if there is one.
     fn of(file: &str) -> Option<Self> {
         Some(match file {
             "measured.csv" | "reference_sphere.csv" | "touches.json" => Self::Gate,
@@ -215,7 +217,8 @@ impl Computation {
     }
 }
 
-/// The folder of a cycle, below that of the run. What is on record is never written again: another attempt has a folder of its own.
+/// Returns the folder of a cycle, below that of the run. Recorded files are never overwritten: another attempt has a
+/// folder of its own.
 fn folder_of(cycle: u32, attempt: u32) -> String {
     match attempt {
         0 | 1 => format!("cycle-{cycle}"),
@@ -223,12 +226,12 @@ fn folder_of(cycle: u32, attempt: u32) -> String {
     }
 }
 
-/// The folder of what is known after a batch of touches, where they are chosen.
+/// Returns the folder of the results after a batch of touches, if touches are chosen.
 fn batch_folder(cycle: u32, batch: u32) -> String {
     format!("cycle-{cycle}/batch-{batch}")
 }
 
-/// Something that waits to be on record, and what follows then.
+/// Record that is not yet written, and the action that follows it.
 struct Waiting {
     ticket: Ticket,
     then: Then,
@@ -241,7 +244,7 @@ enum Then {
     Confirm { device: Device, word: Word, answer: oneshot::Sender<Result<(), String>> },
 }
 
-/// Tells the cell what became of the way by which orders come in.
+/// Converts a change of the channel for orders into an event.
 fn door_event(change: DoorChange) -> Event {
     match change {
         DoorChange::Lost(why) => Event::ControlLost { why },
@@ -249,24 +252,24 @@ fn door_event(change: DoorChange) -> Event {
     }
 }
 
-/// Makes a folder for results, where it is not there.
+/// Creates a folder for results if it does not exist.
 fn made(folder: &Path) -> Result<(), FormatError> {
     ResultFolder::prepare(folder).map(ResultFolder::keep)
 }
 
-/// What a computation brought.
+/// Result of a computation.
 struct Computed {
     cycle: u32,
-    /// None where nothing follows.
+    /// `None` if no event follows.
     event: Option<Event>,
     product: Product,
-    /// The files that it made, on the disk and read.
+    /// Files that it made, written to the disk and read back.
     files: Result<Vec<Artefact>, RecordFailure>,
 }
 
 impl Drive {
-    /// Makes ready with the machines of a cell file, as [`Drive::new`] does with any. Compiled here once: not anew with every line of
-    /// whoever calls it.
+    /// Prepares a run with the machines of a cell file, like [`Drive::new`] with any machines. Not generic, so that it
+    /// is compiled here once, and not again with each caller.
     ///
     /// # Errors
     /// Those of [`Drive::new`].
@@ -274,10 +277,10 @@ impl Drive {
         Self::new(run, cmm, grinder)
     }
 
-    /// Makes ready: a task for each machine, the control socket, the thread of the journal. Nothing is commanded yet.
+    /// Prepares a run: a task for each machine, the control socket, the thread of the journal. Sends no command yet.
     ///
     /// # Errors
-    /// A run folder in which no control socket can be made.
+    /// A run folder in which the control socket cannot be created.
     pub fn new<C: Cmm + 'static, G: Grinder + 'static>(
         run: Run,
         cmm: C,
@@ -351,10 +354,10 @@ impl Drive {
         Ok((drive, Orders { orders, status: seen }))
     }
 
-    /// Listens to orders at another place too, where the cell is found though its run folder is gone.
+    /// Listens for orders also at another place, so that the cell can be found if its run folder is gone.
     ///
     /// # Errors
-    /// A place where no socket can be made.
+    /// A place where no socket can be created.
     pub fn listen_beside(&mut self, place: &Path) -> std::io::Result<()> {
         self.control.listen_beside(place)
     }
@@ -363,7 +366,7 @@ impl Drive {
         self.before + self.began.elapsed()
     }
 
-    /// Runs until the cell has come to an end, and returns it. Boxed so that it is compiled here.
+    /// Runs until the cell reaches an end state, and returns the ending. Boxed so that it is compiled here.
     pub fn run(self) -> Pin<Box<dyn Future<Output = Ending> + Send>> {
         Box::pin(self.run_to_its_end())
     }
@@ -411,7 +414,7 @@ impl Drive {
         self.end_run().await
     }
 
-    /// Tells of a computation that panicked what it is: a fault of this program, and nothing of the part.
+    /// Reports a computation that panicked for what it is: a fault of this program, and no fact about the part.
     async fn panicked(&mut self, error: JoinError) {
         let Some((cycle, kind)) = self.computing.remove(&error.id()) else { return };
         let why =
@@ -427,7 +430,7 @@ impl Drive {
         self.take(event, None).await;
     }
 
-    /// Goes on with what has waited to be on record. What never comes there is not done.
+    /// Continues with the first waiting record. An action is executed only if its record was written.
     async fn recorded(&mut self, recorded: Result<(), RecordFailure>) {
         let Some(Waiting { then, .. }) = self.backlog.pop_front() else { return };
         match recorded {
@@ -450,7 +453,7 @@ impl Drive {
             Then::Nothing => {}
             Then::Execute(command) if self.cell.wants(&command) => self.execute(*command).await,
             Then::Execute(command) => self.not_carried_out(*command).await,
-            // Who asked may have gone.
+            // The person who asked may be gone.
             Then::Answer { answer, accepted, message } => {
                 drop(answer.send(Reply { taken: accepted, message, status: self.snapshot() }))
             }
@@ -458,7 +461,7 @@ impl Drive {
         }
     }
 
-    /// Tells of a START that it was not given: the cell has come elsewhere while it waited to be on record.
+    /// Reports that a START was not sent: the state of the cell changed while the START waited to be recorded.
     async fn not_carried_out(&mut self, command: Command) {
         if let Command::StartMachine { device, .. } = command {
             let why = "it was not given: it was not on record, or the cell was held before it was".to_owned();
@@ -466,7 +469,7 @@ impl Drive {
         }
     }
 
-    /// Tells the cell that a command for whose answer it waits was not given, since it did not come on record.
+    /// Reports to the cell that a command whose answer it waits for was not sent, because it was not recorded.
     async fn not_on_record(&mut self, command: Command) {
         if !self.cell.wants(&command) && !matches!(command, Command::StartMachine { .. }) {
             return;
@@ -480,11 +483,11 @@ impl Drive {
         }
     }
 
-    /// Lets the cell and people know that something cannot be recorded.
+    /// Reports to the cell and to people that a record cannot be written.
     async fn record_failed(&mut self, why: RecordFailure) {
         let message = message_of(&why);
         let is_known = self.failing.replace(message.clone()).is_some();
-        // What follows from a failure fails too, the record of the failure itself among it, and says nothing new.
+        // The consequences of a failure fail too, including the record of the failure itself. They bring nothing new.
         if !is_known {
             self.notify(Notice::RecordFailed { message });
             self.take(Event::RecordFailed { why }, None).await;
@@ -492,8 +495,9 @@ impl Drive {
         self.answer_without_record();
     }
 
-    /// While nothing comes on record no command waits to be carried out then: the cell would wait for its answer, and nobody could go on before the disk
-    /// does. What waits behind it is the cell's to ask for anew.
+    /// Withdraws the waiting commands while nothing can be recorded. Otherwise the cell would wait for their answers,
+    /// and no one could continue before the disk recovers. The cell requests the withdrawn commands again if it needs
+    /// them.
     async fn withdraw_waiting(&mut self) {
         if self.failing.is_none() || self.ending.is_some() {
             return;
@@ -508,7 +512,8 @@ impl Drive {
         }
     }
 
-    /// While nothing comes on record, who gave an order is not kept waiting, and is told what became of it and what did not.
+    /// Answers waiting orders while nothing can be recorded, so that no one is kept waiting. The answer says what was
+    /// done and what was not.
     fn answer_without_record(&mut self) {
         let Some(why) = &self.failing else { return };
         let status = self.snapshot();
@@ -518,7 +523,7 @@ impl Drive {
                     let message = format!(
                         "{message}; what makes safe was carried out, and nothing else is: it is not on record, {why}"
                     );
-                    // Who asked may have gone.
+                    // The person who asked may be gone.
                     drop(answer.send(Reply { taken: false, message, status: status.clone() }));
                 }
                 then => waiting.then = then,
@@ -531,7 +536,7 @@ impl Drive {
         let ending = self.ending.take().expect("the loop ended with one");
         self.orders.close();
         self.finish_backlog().await;
-        // Whatever is still computed leaves files in the run folder, so it is waited for.
+        // Running computations still write files into the run folder, so wait for them.
         while let Some(computed) = self.computations.join_next().await {
             if let Ok(Computed { cycle, files, .. }) = computed {
                 self.adopt(cycle, files).await;
@@ -558,13 +563,13 @@ impl Drive {
         ending
     }
 
-    /// Handles an order and answers who gave it.
+    /// Handles an order and answers its sender.
     async fn order(&mut self, Ordered { request, actor, answer }: Ordered) {
         if let Request::Resume { seen: Some(seen), .. } = request
             && seen != self.states
         {
             let message = format!("the cell has changed since you saw it; now it is {}", self.cell.in_words());
-            // Who asked may have gone.
+            // The person who asked may be gone.
             if let Some(answer) = answer {
                 drop(answer.send(Reply { taken: false, message, status: self.snapshot() }));
             }
@@ -593,7 +598,7 @@ impl Drive {
         }
     }
 
-    /// Puts on record what a program that speaks for people wants to have there.
+    /// Records a remark of a program that acts for people.
     fn remark(&mut self, what: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
         let origin = (actor.name.clone(), actor.station.clone());
         let payload = json!({ "remark": what });
@@ -605,7 +610,7 @@ impl Drive {
         }
     }
 
-    /// Takes a person's word about a machine that cannot tell it itself.
+    /// Handles a person's confirmation about a machine that cannot report it itself.
     fn confirm(&mut self, request: &Request, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
         let asked = self.word(request).map(|(device, confirmed, word)| {
             let mut payload = serde_json::to_value(request).unwrap_or_default();
@@ -634,7 +639,7 @@ impl Drive {
         });
     }
 
-    /// Returns which machine a person's word is about, how the record calls it, and the word.
+    /// Returns the machine that a person's confirmation is about, its name in the record, and the confirmation.
     fn word(&self, request: &Request) -> Result<(Device, &'static str, Word), String> {
         let at_work = self.cell.state().phase().and_then(Phase::moving);
         let job = || at_work.ok_or("no job of a machine is under way");
@@ -652,7 +657,7 @@ impl Drive {
         })
     }
 
-    /// Returns the whole identity of the map of this cycle, if that is what the digits begin.
+    /// Returns the full identity of the map of this cycle, if the digits are its beginning.
     fn named_map(&self, digits: &str) -> Result<[u8; 32], String> {
         let digits = digits.trim().to_lowercase();
         let grinds = self.cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
@@ -706,7 +711,7 @@ impl Drive {
         }
     }
 
-    /// Shows what a measurement that still runs says so far.
+    /// Shows the preliminary figures of a measurement that still runs.
     fn preview(&mut self, preliminary: &Preliminary) {
         let number = self.cell.cycle();
         let asked = Number { cycle: number, batch: self.cycles.batch(number) };
@@ -718,7 +723,7 @@ impl Drive {
         self.status.send_replace(self.snapshot());
     }
 
-    /// Tells what of a pass record cannot be, beside the pass that was commanded.
+    /// Returns why a pass record is implausible, compared with the commanded pass.
     fn flaw_of(&self, record: &PassRecord) -> Option<String> {
         let number = self.cell.cycle();
         let Some(cycle) = self.cycles.get(number) else { return Some(format!("there is no pass of cycle {number}")) };
@@ -730,7 +735,7 @@ impl Drive {
         pass_record::flaw(&told, record)
     }
 
-    /// Records and shows how fast points came over the wire.
+    /// Records and shows the speed of the transfer of points.
     async fn transferred(&mut self, measurement: &Measurement, taken: Duration) {
         let cycle = Number::of(measurement.cycle).cycle;
         let (points, seconds) = (measurement.points.len(), taken.as_secs_f64());
@@ -748,7 +753,7 @@ impl Drive {
         if let (Err(why), Some(Event::Collected { .. } | Event::Registered { .. } | Event::Compensated { .. })) =
             (&files, &event)
         {
-            // What is not on record is not made use of: it is computed again once a person has seen to the disk.
+            // A result that is not recorded is not used. It is computed again after a person has repaired the disk.
             let event = Event::NotSaved { cycle: number, why: why.clone() };
             self.notify(Notice::RecordFailed { message: message_of(why) });
             self.take(event, None).await;
@@ -764,7 +769,7 @@ impl Drive {
         }
     }
 
-    /// Brings files on record.
+    /// Records files.
     async fn adopt(&mut self, cycle: u32, files: Result<Vec<Artefact>, RecordFailure>) {
         match files {
             Ok(files) if files.is_empty() => {}
@@ -775,14 +780,14 @@ impl Drive {
                 let ticket = self.recorder.adopt(files, self.now(), cycle);
                 self.backlog.push_back(Waiting { ticket, then: Then::Nothing });
             }
-            // Of what the loop itself leaves at the end nobody is told anew.
+            // A failure to write the loop's own final files is only shown, because the run is over.
             Err(why) if self.ending.is_some() => self.notify(Notice::RecordFailed { message: message_of(&why) }),
             Err(why) => Box::pin(self.record_failed(why)).await,
         }
     }
 
-    /// Gives an event to the record, lets the cell handle it, and has carried out what it decides. Returns why it was refused, if it
-    /// was, and a ticket for its record.
+    /// Records an event, lets the cell handle it, and starts the execution of the commands. Returns the reason of a
+    /// refusal, if there was one, and a ticket for the record.
     async fn take(&mut self, event: Event, detail: Option<Value>) -> (Option<String>, Ticket) {
         let now = self.now();
         let ticket = self.record_event(now, &event, detail);
@@ -796,7 +801,7 @@ impl Drive {
             Command::Refuse { why, .. } => Some(why.clone()),
             _ => None,
         });
-        // An order that was refused changed nothing: the refusal itself is shown.
+        // A refused order changed nothing: only the refusal is shown.
         if refusal.is_none() || !event.is_order() {
             self.show_event(now, &event);
         }
@@ -813,7 +818,7 @@ impl Drive {
             map.insert("detail".into(), detail);
         }
         let ticket = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), event.origin(), payload));
-        // What became of the commands that it answers.
+        // Record the outcome of each command that the event answers.
         let (answered, open): (Vec<_>, Vec<_>) =
             std::mem::take(&mut self.open).into_iter().partition(|(_, c)| outcome::answers(event, c));
         self.open = open;
@@ -831,7 +836,7 @@ impl Drive {
         self.backlog.push_back(Waiting { ticket, then: Then::Nothing });
     }
 
-    /// Writes a small document of the loop's own into the run folder and brings it on record.
+    /// Writes a small document of the loop itself into the run folder and records it.
     async fn leave(&mut self, name: String, cycle: u32, document: &impl Serialize) {
         let path = self.folder.join(&name);
         let made = made(path.parent().unwrap_or(&self.folder));
@@ -841,7 +846,7 @@ impl Drive {
         }
     }
 
-    /// Gives a command to the record, after which it is carried out if that has not been done already.
+    /// Records a command. After that the command is executed, if it was not executed already.
     fn line_up(&mut self, command: Command) {
         let mut payload = serde_json::to_value(&command).unwrap_or(Value::Null);
         if let (Command::StartMachine { device, .. }, Some(map)) = (&command, payload.as_object_mut()) {
@@ -859,7 +864,7 @@ impl Drive {
         self.backlog.push_back(Waiting { ticket, then });
     }
 
-    /// The run is over: what is on record by now is shown and kept, and no machine hears of it any more.
+    /// Shows and stores everything recorded so far, after the run is over. No machine gets a command any more.
     async fn finish_backlog(&mut self) {
         let by = Instant::now() + record::PATIENCE;
         while !self.backlog.is_empty() {
@@ -917,13 +922,13 @@ impl Drive {
             Command::Raise(alarm) => self.notify(Notice::Alarm(alarm)),
             Command::Withdraw { alarm } => self.notify(Notice::AlarmGone { alarm }),
             Command::Refuse { event, why, .. } if event.is_order() => self.notify(Notice::Refused { why }),
-            // What a machine tells too late is on record, and nothing for a person to act on.
+            // A late fact from a machine is recorded, but a person has nothing to do.
             Command::Refuse { .. } => {}
             Command::Finish(ending) => self.ending = Some(ending),
         }
     }
 
-    /// Shows how a cycle was judged and leaves it beside its measurement.
+    /// Shows the judgement of a cycle and stores it with the measurement.
     async fn announce(&mut self, judgement: Judgement) {
         let which = self.cycles.judged(judgement.cycle);
         self.leave_judgement(which, &judgement).await;
@@ -949,7 +954,7 @@ impl Drive {
         self.leave(format!("{}/result.json", folder_of(number, which)), number, &result).await;
     }
 
-    /// Leaves what the next part of this kind can begin with, where the run got to its end.
+    /// Stores the initial state for the next part of this kind, if the run reached its end.
     async fn keep_what_was_learned(&mut self, ending: &Ending) {
         if !matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }) {
             return;
@@ -962,7 +967,7 @@ impl Drive {
     }
 
     async fn ask(&mut self, device: Device, ask: Ask) {
-        // A station lives as long as the drive; its channel is wide enough for what one cell has under way.
+        // A station lives as long as the drive; its channel is large enough for the work of one cell.
         let _ = self.asks[device as usize].send(ask).await;
     }
 
@@ -981,8 +986,8 @@ impl Drive {
         }
     }
 
-    /// Sees whether the disk has room for what this cycle will leave. Where it has not the cell is held before anything moves; the
-    /// machine may take its payload meanwhile.
+    /// Checks that the disk has room for the files of this cycle. If it has not, the cell is held before anything
+    /// moves; the machine may get its payload meanwhile.
     fn check_space(&mut self, cycle: u32) {
         let (folder, needed) = (self.folder.clone(), self.task.cycle_bytes().max(2 * self.largest_cycle_bytes));
         self.beside.compute(&mut self.computations, move || {
@@ -1005,7 +1010,7 @@ impl Drive {
         self.ask(Device::Cmm, Ask::Load { cycle: number, load }).await;
     }
 
-    /// Looks through the points of a measurement and writes them.
+    /// Checks the points of a measurement and writes them.
     fn gate(&mut self, measurement: Box<Measurement>) {
         let number = Number::of(measurement.cycle).cycle;
         let cycle = self.cycles.get(number).cloned();
@@ -1037,8 +1042,8 @@ impl Drive {
         });
     }
 
-    /// Computes off the asynchronous threads. The files are brought to the disk and read there too: those of a fine measurement are
-    /// large, and neither the loop nor the journal waits for them.
+    /// Computes off the asynchronous threads. The files are written to the disk and read back there too: those of a
+    /// fine measurement are large, and neither the loop nor the journal waits for them.
     fn compute(
         &mut self,
         kind: Computation,
@@ -1055,7 +1060,7 @@ impl Drive {
             files = Files::new(folder.clone(), batch_folder(cycle, which)).then(folder_of(cycle, settled));
         }
         let computing = self.beside.compute(&mut self.computations, move || {
-            // What cannot be made is told by the first file that cannot be written into it.
+            // A failure to create the folder shows as the error of the first file in it.
             let _ = made(&files.folder());
             let (event, product) = work(&task, &mut files);
             Computed { cycle, event: Some(event), product, files: record::describe(&folder, &files.made()) }
@@ -1063,14 +1068,14 @@ impl Drive {
         self.computing.insert(computing.id(), (cycle, kind));
     }
 
-    /// Lets the cell hear of an event in its turn, like everything else that it hears.
+    /// Sends an event to the cell through the queue of computations, like every other event.
     fn answer(&mut self, cycle: u32, event: Event) {
         let computed = Computed { cycle, event: Some(event), product: Product::Nothing, files: Ok(Vec::new()) };
         self.computations.spawn(std::future::ready(computed));
     }
 
     fn notify(&self, notice: Notice) {
-        // Whoever showed the run may have gone; the run goes on.
+        // The receiver may be gone; the run continues.
         let _ = self.notices.send(notice);
     }
 
@@ -1079,7 +1084,7 @@ impl Drive {
         Notice::State { state, cycle, event: event.name().to_owned(), at_job }
     }
 
-    /// Shows an event that the cell has taken in.
+    /// Shows an event that the cell has handled.
     fn show_event(&mut self, now: Duration, event: &Event) {
         self.pace.follow(self.cell.state());
         if self.pace.progress().is_none_or(|progress| progress.device != Device::Cmm) {
@@ -1095,7 +1100,7 @@ impl Drive {
             }
             Event::Registered { cycle, figures } => {
                 self.notify(Notice::Figures { cycle: *cycle, figures: figures.clone() });
-                // Nothing else may come that tells of the state: the cell may be held by what was computed.
+                // No other notice of the state may follow: the result of a computation may hold the cell.
                 self.state_after(event)
             }
             Event::Compensated { cycle, summary } => {
@@ -1122,8 +1127,8 @@ fn spawn<D: StationDriver>(
     (asks, tokio::spawn(station.attend(asked, poll, Aborts::new(aborts.subscribe()), pulse.clone())))
 }
 
-/// Commands that wait neither for the disk nor for the record of what came before them: they bring machines to rest, only look at
-/// one, tell people, or end the run.
+/// Returns true for a command that waits neither for the disk nor for earlier records: it brings machines to rest, only
+/// reads a status, informs people, or ends the run.
 fn waits_for_nothing(command: &Command) -> bool {
     matches!(
         command,
@@ -1138,9 +1143,9 @@ fn waits_for_nothing(command: &Command) -> bool {
     )
 }
 
-/// Sees whether the disk of a folder has so many bytes left.
+/// Returns an error if the disk of a folder has less free space than needed.
 fn short_of_space(folder: &Path, needed: u64) -> Result<(), RecordFailure> {
-    // A disk that does not tell is tried.
+    // If the free space is unknown, try to write.
     let free = journal::free_bytes(folder).unwrap_or(u64::MAX);
     if free >= needed {
         return Ok(());
@@ -1150,14 +1155,14 @@ fn short_of_space(folder: &Path, needed: u64) -> Result<(), RecordFailure> {
     Err(RecordFailure::DiskFull(format!("the disk of {disk} has {free} MB left, and a cycle may take {needed} MB")))
 }
 
-/// What a task said as it panicked.
+/// Returns the message of a task that panicked.
 fn words_of(error: JoinError) -> String {
     let Ok(panic) = error.try_into_panic() else { return "it was ended".into() };
     let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
     text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "it says no more".into())
 }
 
-/// Waits until the first in line is on record.
+/// Waits until the first entry in the queue is recorded.
 async fn on_record(backlog: &mut VecDeque<Waiting>) -> Result<(), RecordFailure> {
     match backlog.front_mut() {
         Some(next) => (&mut next.ticket)
@@ -1173,7 +1178,7 @@ fn message_of(failure: &RecordFailure) -> String {
     }
 }
 
-/// A figure beside its limit, as the result of a cycle has it.
+/// Returns a figure with its limit, as the result of a cycle contains it.
 fn judged_of(of: &Compared) -> Value {
     json!({
         "name": of.name,

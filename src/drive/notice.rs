@@ -1,36 +1,36 @@
-//! What is shown of a run while it runs.
+//! Display of a run while it runs.
 
 use regrind_control::CycleRow;
 use serde::Serialize;
 
 use crate::cell::{Alarm, AlarmId, CompensationSummary, Device, Ending, Figures, Judgement};
 
-/// Something that a person, or a program that reads lines of JSON, may want to know.
+/// Message for a person, or for a program that reads lines of JSON.
 #[derive(Clone, Debug, Serialize)]
 #[serde(tag = "notice", rename_all = "snake_case")]
 #[allow(missing_docs)]
 #[expect(clippy::large_enum_variant, reason = "notices are few, and never kept in numbers")]
 pub enum Notice {
-    /// The cell took an event in.
+    /// The cell handled an event.
     State {
         state: String,
         cycle: u32,
         event: String,
-        /// Whether a job of a machine is under way, of which progress is told.
+        /// True if a job of a machine with a progress report is in progress.
         #[serde(skip)]
         at_job: bool,
     },
-    /// The right part is to be loaded, and that to be confirmed.
+    /// The right part must be loaded, and the loading confirmed.
     LoadPart,
-    /// A machine cannot tell whether it is clear of the part: a person is to look, and to confirm it.
+    /// A machine cannot report whether it is clear of the part: a person must check and confirm it.
     AskWhetherClear { device: Device },
-    /// What a person should know of a machine: what it waits for, which files were left alone and why.
+    /// Information about a machine for a person: why it waits, which files it ignored and why.
     Note {
         device: Device,
         #[serde(rename = "words")]
         messages: Vec<String>,
     },
-    /// A job goes on, and will take at least and at most so many seconds more.
+    /// A job makes progress. `left_s` is the minimum and the maximum of the remaining time, in s.
     Progress {
         device: Device,
         cycle: u32,
@@ -39,19 +39,19 @@ pub enum Notice {
         #[serde(skip_serializing_if = "Option::is_none")]
         left_s: Option<[f64; 2]>,
     },
-    /// The points of a measurement came over the wire, in this time.
+    /// The points of a measurement were transferred, in this time.
     Transferred { cycle: u32, points: usize, seconds: f64, ms_per_point: f64 },
     /// A measurement is registered.
     Figures { cycle: u32, figures: Figures },
     /// A cycle is judged.
     Judged(Judgement),
-    /// The next correction is there.
+    /// The next correction is ready.
     Compensated { cycle: u32, summary: CompensationSummary },
-    /// A person must see this.
+    /// A new alarm for a person.
     Alarm(Alarm),
-    /// This is over.
+    /// An alarm is gone.
     AlarmGone { alarm: AlarmId },
-    /// An order or an event did not fit.
+    /// An order or an event did not fit the state.
     Refused { why: String },
     /// The journal or a file could not be written.
     RecordFailed {
@@ -62,7 +62,8 @@ pub enum Notice {
     Finished {
         ending: Ending,
         cycles: Vec<CycleRow>,
-        /// The touches of the part, and what the whole pattern would have taken; where touches were chosen.
+        /// Touches of the part, and the number that the whole pattern would have needed. `None` if the touches were not
+        /// chosen.
         touches: Option<[usize; 2]>,
     },
 }

@@ -1,8 +1,8 @@
-//! Which event answers which command, so that the journal shows what became of each.
+//! Mapping of events to the commands that they answer, so that the journal shows the outcome of each command.
 
 use crate::cell::{Asked, Command, Device, Event, Reconciliation};
 
-/// Whether a command is answered by an event at all; the others are done when they are given.
+/// Returns true if an event answers a command. All other commands are complete when they are sent.
 pub(super) fn is_answered(command: &Command) -> bool {
     !matches!(
         command,
@@ -14,7 +14,8 @@ pub(super) fn is_answered(command: &Command) -> bool {
     )
 }
 
-/// Whether an event tells what became of a command. A start whose outcome is not known stays open until it is reconciled.
+/// Returns true if an event is the outcome of a command. A START with an unknown outcome stays open until it is
+/// reconciled.
 pub(super) fn answers(event: &Event, command: &Command) -> bool {
     use Command as C;
     use Event as E;
@@ -31,7 +32,7 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
         (C::AskWhetherClear { device }, E::ClearConfirmed { device: d, .. }) => device == d,
         (C::Prepare { device, .. }, E::Prepared { device: d, .. }) => device == d,
         (C::StartMachine { device, cycle }, E::Started { device: d, cycle: c }) => device == d && cycle == c,
-        // What nobody can tell leaves it open.
+        // An unknown outcome leaves the command open.
         (C::StartMachine { .. }, E::Reconciled { outcome: Reconciliation::Unknown(_), .. }) => false,
         (C::StartMachine { device, cycle }, E::Reconciled { device: d, cycle: c, .. }) => device == d && cycle == c,
         (C::StartMachine { device, .. }, E::DeclaredOver { device: d, .. }) => device == d,
@@ -57,7 +58,7 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
     }
 }
 
-/// What a command asks of which machine, as a refusal names it.
+/// Returns the request and the machine of a command, as a refusal names them.
 fn asked(command: &Command) -> Option<(Device, Asked)> {
     Some(match command {
         Command::LoadPass { .. } => (Device::Grinder, Asked::Load),

@@ -1,4 +1,4 @@
-//! How far the job under way is, and how long it will still take.
+//! Progress of the job that runs, and estimate of its remaining time.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -7,29 +7,30 @@ use regrind_control::JobProgress;
 
 use crate::cell::{Device, JobStep, State};
 
-/// A pace is told once it has been seen for so long.
+/// Minimum observation time of a pace before it is shown.
 const SEEN_FOR: Duration = Duration::from_millis(500);
-/// Marks of the way that are kept: the latest quarter of them tells the present pace.
+/// Maximum number of stored marks. The latest quarter of them determines the present pace.
 const MARKS: usize = 32;
 
-/// The pace of the job under way.
+/// Progress of the job that runs.
 #[derive(Debug, Default)]
 pub(super) struct Pace {
     job: Option<(Device, u32)>,
     done: (u32, u32),
-    /// When it was how far, since it last began to move.
+    /// Times and progress since the job last began to move.
     marks: VecDeque<(Duration, u32)>,
 }
 
 impl Pace {
-    /// Takes a sign of progress.
+    /// Adds a sign of progress.
     pub(super) fn take(&mut self, now: Duration, job: (Device, u32), done: u32, total: u32) {
         if self.job.replace(job) != Some(job) || done < self.done.0 {
             self.marks.clear();
         }
         self.done = (done, total);
         if self.marks.len() == MARKS {
-            // Every other one, but the first and the last: the marks reach back to the beginning, at half the density.
+            // Drop every other mark, but keep the first and the last. The marks still reach back to the beginning, at
+            // half the density.
             let mut index = 0;
             self.marks.retain(|_| {
                 index += 1;
@@ -39,7 +40,7 @@ impl Pace {
         self.marks.push_back((now, done));
     }
 
-    /// Takes the state of the cell: a job that stands has no pace, and one that is over no progress.
+    /// Follows the state of the cell: a job that is held has no pace, and one that is over has no progress.
     pub(super) fn follow(&mut self, state: State) {
         let at = state.phase().and_then(|phase| phase.job());
         let is_at_it = |device| matches!(at, Some((at, JobStep::Run | JobStep::Reconcile)) if at == device);
@@ -51,7 +52,7 @@ impl Pace {
         }
     }
 
-    /// Returns how far the job is, if one is under way.
+    /// Returns the progress of the job, if one runs.
     pub(super) fn progress(&self) -> Option<JobProgress> {
         let (device, _) = self.job?;
         let (done, total) = self.done;
@@ -120,13 +121,13 @@ mod tests {
         pace.follow(State::Held(Phase::Grind(JobStep::Run)));
         let held = pace.progress().unwrap();
         assert_eq!((held.done, held.left_s), (19, None));
-        // The hour that it stood does not count.
+        // The hour of standstill does not count.
         pace.follow(RUNS);
         pace.take(ms(3_600_000), JOB, 20, 100);
         assert_eq!(pace.progress().unwrap().left_s, None, "no pace yet");
         pace.take(ms(3_601_000), JOB, 30, 100);
         assert_eq!(pace.progress().unwrap().left_s, Some([7.0, 7.0]));
-        // The same machine at its next job.
+        // The same machine runs its next job.
         pace.take(ms(3_602_000), (Device::Grinder, 2), 1, 100);
         assert_eq!(pace.progress().unwrap().left_s, None);
         pace.follow(State::Execute(Phase::Transfer));

@@ -1,35 +1,39 @@
-//! What a grinder says of a pass, held against what it was told: a figure that cannot be holds the cell before anything is made of it.
+//! Plausibility check of a grinder's pass record against the commanded pass. An implausible figure holds the cell
+//! before anything is done with it.
 
 use serde_json::{Value, json};
 
 use crate::device::{Job, Outcome, Pass, PassRecord};
 use crate::geometry::Aperture;
 
-/// Share of its stated radius by which a wheel may differ from the recipe's: wear and dressing, not another wheel.
+/// Maximum relative difference of the wheel radius from the recipe. A larger one means another wheel; wear and dressing
+/// stay below it.
 const WHEEL_SHARE: f64 = 0.01;
-/// Least share of the tracks over the part that a pass travels; over its rectangle, where it has no outline: corners and holes may be left out.
+/// Minimum share of the tracks over the part that a pass travels. If the part has no outline, the tracks over its
+/// rectangle count, of which corners and holes may be left out.
 const LEAST_PATH_SHARE: f64 = 0.5;
 const LEAST_SHARE_OF_RECTANGLE: f64 = 0.25;
-/// Most of them that it travels each time it goes over the part: with its ways through the air, and over the edges.
+/// Maximum path as a multiple of the tracks, for each time that the pass goes over the part: includes moves in the air
+/// and over the edges.
 const MOST_PATH_SHARE: f64 = 20.0;
-/// How much larger than the rectangle a surface is that the wheel can follow.
+/// Maximum ratio of a surface that the wheel can follow to its rectangle.
 const STEEPNESS: f64 = 2.0;
-/// What a pass may have taken off beyond the most that it is planned with: scatter, and the rounding of who measured it.
+/// Maximum removal beyond the planned one: allows for noise and for rounding of the measurement.
 const DEPTH_SHARE: f64 = 1.05;
 const DEPTH_SLACK_MM: f64 = 0.01;
 
-/// What a pass was to be.
+/// Commanded pass.
 pub(super) struct Told<'t> {
     pub(super) job: Job,
     pub(super) pass: &'t Pass,
     pub(super) map_identity: [u8; 32],
-    /// The most that may be taken off in one pass anywhere.
+    /// Maximum removal of one pass at any place.
     pub(super) largest_depth_mm: f64,
-    /// The outline of the part, where one was stated.
+    /// Outline of the part, if one was stated.
     pub(super) outline: Option<&'t Aperture>,
 }
 
-/// Names the first figure of a record that cannot be, with its limit; what was not told is not judged.
+/// Returns the first implausible figure of a record, with its limit. A figure that was not reported is not checked.
 pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
     let Told { job, pass, map_identity, largest_depth_mm, outline } = told;
     if (record.job, record.cycle) != (job.job, job.cycle) {
@@ -62,12 +66,12 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
         Some(outline) => LEAST_PATH_SHARE * outline.area_mm2().min(width * height) / pass.track_spacing_mm,
         None => LEAST_SHARE_OF_RECTANGLE * tracks_mm,
     };
-    // It goes over the part once for each cut of what it may take off, once to finish, and then to spark out.
+    // The pass crosses the part once for each cut of the removal, once to finish, and then to spark out.
     let times = (largest_depth_mm / pass.depth_of_cut_mm).ceil() + 1.0 + f64::from(pass.spark_out_passes);
     let most_path_mm = MOST_PATH_SHARE * tracks_mm * times;
-    // Roughing and ways through the air may be faster than the feed; what the last tracks need, it needs at least.
+    // Roughing and moves in the air may be faster than the feed. The last tracks need at least this time.
     let least_s = least_path_mm / (pass.feed_mm_min / 60.0);
-    // When a person says that a pass has begun and ended is no measure of it; who tells the path has a clock.
+    // Manual reports of start and end are no measure of the duration. A machine that reports a path has a clock.
     let measured_s = record.duration_s.filter(|_| record.path_mm.is_some());
     let wheel = [1.0 - WHEEL_SHARE, 1.0 + WHEEL_SHARE].map(|share| share * pass.wheel_radius_mm);
     let any = f64::INFINITY;
@@ -82,19 +86,19 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
         .or_else(|| contradiction(record))
 }
 
-/// Tells where the figures of a record cannot be true together: a wheel that cut took something off.
+/// Returns a contradiction between figures of a record: a wheel that cut must have removed material.
 fn contradiction(record: &PassRecord) -> Option<String> {
     let (removed_mm3, deepest_mm) = (record.removed_mm3?, record.deepest_mm?);
     (removed_mm3 == 0.0 && deepest_mm > 0.0)
         .then(|| format!("the volume removed is 0 mm3, and the largest depth taken off is {deepest_mm:.4} mm"))
 }
 
-/// A figure in a message: one that is absurd is not written out with hundreds of digits.
+/// Formats a figure for a message. An absurd value is not written with hundreds of digits.
 fn figure(value: f64) -> String {
     if value.abs() < 1e9 { format!("{value:.3}") } else { format!("{value:e}") }
 }
 
-/// A pass record as the journal keeps it.
+/// Returns a pass record as the journal stores it.
 pub(super) fn document(record: &PassRecord) -> Value {
     json!({
         "path_mm": record.path_mm,
@@ -157,7 +161,7 @@ mod tests {
     fn a_ring_needs_half_of_its_own_tracks_and_a_part_without_an_outline_a_quarter_of_its_rectangles() {
         let ring = Aperture::Annulus { centre_mm: [0.0; 2], inner_radius_mm: 27.0, outer_radius_mm: 31.0 };
         let of_path = |path_mm| PassRecord { path_mm: Some(path_mm), duration_s: None, ..record() };
-        // 728.8 mm2 in tracks of 0.5 mm.
+        // 728.8 mm2 with tracks every 0.5 mm.
         assert_eq!(judged_of(Some(&ring), &of_path(740.0)), None);
         assert!(judged_of(Some(&ring), &of_path(700.0)).is_some_and(|flaw| flaw.contains("at least 728.849 mm")));
         assert_eq!(judged_of(None, &of_path(3200.0)), None);

@@ -1,4 +1,4 @@
-//! The program of a pass: from the correction to the file that a controller runs.
+//! Program of a pass: from the correction to the file that a controller runs.
 
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
@@ -20,45 +20,45 @@ use crate::surface::Nominal;
 
 use super::record::Files;
 
-/// What a pass leaves beside its correction: the program, with the extension of its dialect, and the table for controllers that compensate
-/// by one.
+/// Name of the program file without its extension, which the dialect gives. A table file for controllers that
+/// compensate by a table is written too.
 pub(super) const PROGRAM_FILE: &str = "toolpath";
 const TABLE_FILE: &str = "toolpath_z.csv";
-/// More points than that are not written beside every correction of a run.
+/// Maximum number of points of a program that a run writes with each correction.
 const MOST_POINTS: u64 = 3_000_000;
 
-/// What the programs of a part have in common.
+/// Common properties of the programs of a part.
 #[derive(Debug)]
 pub struct Programs {
-    /// The part by name.
+    /// Name of the part.
     pub part: String,
-    /// SHA-256 of what the nominal surface came from.
+    /// SHA-256 of the source of the nominal surface.
     pub part_identity: [u8; 32],
-    /// The nominal surface as a height over x and y, and the outline of the part.
+    /// Nominal surface as a height over x and y, and outline of the part.
     pub ground: (Field, Aperture),
-    /// How paths are laid.
+    /// Options of the paths.
     pub options: PathOptions,
-    /// What the grinder can do.
+    /// Limits of the grinder.
     pub limits: Limits,
-    /// How exactly its controller keeps to a program.
+    /// Exactness with which the controller follows a program.
     pub mode: PathMode,
-    /// How far it may round corners off with [`PathMode::Blend`], in millimetres.
+    /// Maximum rounding of corners with [`PathMode::Blend`], in mm.
     pub path_tolerance_mm: f64,
-    /// How far it does by a setting of its own, where that is known, in millimetres.
+    /// Rounding by a setting of the controller, if it is known, in mm.
     pub controller_tolerance_mm: Option<f64>,
-    /// How far arcs may be from the path, in millimetres; none for lines alone.
+    /// Maximum distance of arcs from the path, in mm; `None` for lines only.
     pub arcs_within_mm: Option<f64>,
-    /// How its programs are written.
+    /// Dialect of the programs.
     pub dialect: Dialect,
-    /// Where else the program of each pass is put, for the controller to find it.
+    /// Additional folder for the program of each pass, where the controller finds it.
     pub folder: Option<PathBuf>,
-    /// Passes without in-feed.
+    /// Number of passes without in-feed.
     pub spark_out_passes: u16,
-    /// Whether the cell is simulated.
+    /// True if the cell is simulated.
     pub simulation: bool,
 }
 
-/// Why there is no program.
+/// Reason why there is no program.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -79,23 +79,23 @@ pub enum ProgramError {
 }
 
 impl Programs {
-    /// Returns the nominal surface of a part as programs need it.
+    /// Returns the nominal surface of a part in the form that programs need.
     ///
     /// # Errors
-    /// A surface that is no height over x and y.
+    /// A surface that is not a height over x and y.
     pub fn ground(nominal: &Nominal) -> Result<(Field, Aperture), PathError> {
         height_of(nominal)
     }
 
-    /// Returns what the program of a pass is called in the folder of a cycle.
+    /// Returns the name of a pass's program in the folder of a cycle.
     pub(super) fn file_name(&self) -> String {
         format!("{PROGRAM_FILE}.{}", self.dialect.dialect.extension)
     }
 
-    /// Tells whether the dialect can say how exactly a program is to be followed.
+    /// Checks that the dialect can express the required exactness of a program.
     ///
     /// # Errors
-    /// What it cannot say.
+    /// A requirement that the dialect cannot express.
     pub fn check_dialect(&self) -> Result<(), DialectError> {
         if let Some(rotary) = self.options.leaning() {
             self.dialect.turning(rotary)?;
@@ -116,10 +116,10 @@ impl Programs {
         }
     }
 
-    /// Lays the path of a pass and checks it against what the grinder can do.
+    /// Creates the path of a pass and checks it against the limits of the grinder.
     ///
     /// # Errors
-    /// A wheel that does not fit the corrected surface, and limits of the grinder that the path goes beyond.
+    /// A wheel that does not fit the corrected surface, or a path beyond the limits of the grinder.
     pub fn path(&self, correction: &Correction) -> Result<(ToolPath, Summary), PathError> {
         let (nominal, outline) = (self.nominal(correction), &self.ground.1);
         let wheel = self.wheel(correction);
@@ -130,27 +130,28 @@ impl Programs {
         Ok((path, summary))
     }
 
-    /// Tells what becomes of a path in arcs; none where its program has lines alone.
+    /// Returns the summary of a path with arcs. Returns `None` if its program has lines only.
     ///
     /// # Errors
-    /// What the dialect cannot say.
+    /// A requirement that the dialect cannot express.
     pub fn arcs(&self, path: &ToolPath) -> Result<Option<ArcSummary>, DialectError> {
         let post = self.dialect.post(&self.exactness())?;
         Ok(post.arcs.map(|(_, options)| path.arc_summary(&options)))
     }
 
-    /// The wheel as measurements have made it out.
+    /// Returns the wheel with the radius error that measurements have estimated.
     fn wheel(&self, correction: &Correction) -> Wheel {
         self.options.wheel.larger_by(self.off_mm(correction))
     }
 
-    /// The nominal surface as the zero of the machine has it. It was touched off with the lowest place of the wheel, by the radius of the recipe: the
-    /// centre of a wheel that is larger by dR stands higher by that already.
+    /// Returns the nominal surface relative to the zero of the machine. The zero was touched off with the lowest point
+    /// of the wheel, for the radius of the recipe. So the centre of a wheel that is larger by dR is already higher by
+    /// dR.
     fn nominal(&self, correction: &Correction) -> Field {
         self.ground.0.clone().lowered(self.off_mm(correction))
     }
 
-    /// By how much the wheel is larger than the recipe has it.
+    /// Returns the difference of the wheel radius from that of the recipe.
     fn off_mm(&self, correction: &Correction) -> f64 {
         correction.set.as_ref().map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
@@ -165,8 +166,9 @@ impl Programs {
         Ok(summary)
     }
 
-    /// Writes the program and `toolpath_z.csv` of a pass into a folder; returns why not both: a program that is too long to be kept,
-    /// a table that reaches where the wheel cannot. Where the controller looks for programs, this one is put too.
+    /// Writes the program and `toolpath_z.csv` of a pass into a folder. The program is also copied into the folder
+    /// where the controller looks for programs. Returns the reason if one of the files is missing: the program is too
+    /// long to be kept, or the table reaches where the wheel cannot.
     pub(super) fn keep(
         &self,
         files: &mut Files,
@@ -191,7 +193,7 @@ impl Programs {
         }
     }
 
-    /// Puts a program where the controller looks for it, under its own name, and reads it back.
+    /// Copies a program into the folder where the controller looks for it, under its own name, and reads it back.
     fn hand_over(&self, program: &Path, cycle: u16) -> Result<(), ProgramError> {
         let Some(folder) = &self.folder else { return Ok(()) };
         let bytes = read_bytes(program).map_err(GcodeError::from)?;
@@ -255,7 +257,8 @@ impl Programs {
     }
 }
 
-/// The correction as a path takes it: what is left for the map, and with it what setting and tilt take back.
+/// Returns the correction in the form that a path needs: the residual for the map, plus the compensation of setting and
+/// tilt.
 fn handed(correction: &Correction) -> Cow<'_, Correction> {
     match &correction.set {
         None => Cow::Borrowed(correction),
@@ -263,7 +266,7 @@ fn handed(correction: &Correction) -> Cow<'_, Correction> {
     }
 }
 
-/// Says which parameters a correction takes back, a line each; nothing where it takes none.
+/// Returns the parameters that a correction compensates, one line each. Returns no line if it compensates none.
 pub(super) fn set_in_words(correction: &Correction, wheel_radius_mm: f64) -> Vec<String> {
     let Some(set) = &correction.set else { return Vec::new() };
     let taken = ParameterKind::ALL.into_iter().zip(set.values).filter(|(_, value)| *value != 0.0);

@@ -1,5 +1,5 @@
-//! The journal's own thread. The loop gives it what is to be recorded, in order, and goes on; what may only be done once it is on
-//! record waits for its [`Ticket`]. What cannot be written stays first in the queue and is tried again until it can.
+//! Thread of the journal. The loop queues the entries in order and continues. An action that needs a record waits for
+//! its [`Ticket`]. An entry that cannot be written stays first in the queue and is retried until it can be written.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -16,23 +16,24 @@ use crate::cell::RecordFailure;
 use crate::formats::{FormatError, ResultFolder};
 use crate::journal::{Anchor, Artefact, Entry, Journal, JournalError, Kind};
 
-/// Resolves once what was given is on the disk, or is known never to come there.
+/// Result of a record: resolves when it is on the disk, or when it is certain that it never will be.
 pub(super) type Ticket = oneshot::Receiver<Result<(), RecordFailure>>;
 
-/// Between two looks for the files of the record, where nothing is to be written.
+/// Interval between two checks of the record files while nothing is written.
 const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
-/// Between two tries to write what could not be written.
+/// Interval between two attempts to write an entry.
 const BETWEEN_TRIES: Duration = Duration::from_millis(100);
-/// Every so many tries it is told that they fail.
+/// Number of failed attempts between two reports of the failure.
 const TOLD_EVERY: u32 = 10;
-/// How long the end of a run waits for its record.
+/// Maximum wait for the record at the end of a run.
 pub(super) const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Where a run is recorded. What is acknowledged is on the disk; after an error the same may be given again, and stands once.
+/// Storage of a run's record. An acknowledged entry is on the disk. After an error the same entry may be given again;
+/// it is stored once (idempotent).
 #[expect(missing_docs, reason = "as Journal has them")]
 pub trait Ledger: Send {
     fn folder(&self) -> &Path;
-    /// The serial number of the part; empty where nobody knows.
+    /// Returns the serial number of the part; empty if it is not known.
     fn part(&self) -> &str {
         ""
     }
@@ -40,7 +41,7 @@ pub trait Ledger: Send {
     fn intend(&mut self, entry: Entry) -> Result<u32, JournalError>;
     fn adopt_known(&mut self, found: Artefact, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError>;
     fn end(&mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError>;
-    /// Sees that the record lies where it is written.
+    /// Checks that the record is where it was written.
     fn is_in_place(&mut self) -> Result<(), JournalError> {
         Ok(())
     }
@@ -70,27 +71,27 @@ impl Ledger for Journal {
     }
 }
 
-/// What is to be recorded.
+/// Work for the journal.
 enum Job {
     Append(Box<Entry>),
-    /// With the number by which [`Job::Outcome`] names it.
+    /// Intent, with the number by which [`Job::Outcome`] refers to it.
     Intend(u64, Box<Entry>),
-    /// What became of an intent.
+    /// Outcome of an intent.
     Outcome(u64, Box<Entry>),
     Adopt(Vec<Artefact>, Duration, u32),
     Close(Duration, u32, Value),
-    /// Sees that the record lies where it is written.
+    /// Check that the record is where it was written.
     Look,
 }
 
 type Given = (Job, oneshot::Sender<Result<(), RecordFailure>>);
 
-/// The journal as the loop sees it.
+/// Journal, as the loop uses it.
 pub(super) struct Recorder {
     given: Option<mpsc::UnboundedSender<Given>>,
-    /// Hears of the first failure of each row of failures.
+    /// Failures to write: the first one of each series, and repeated reports while it lasts.
     failures: mpsc::UnboundedReceiver<RecordFailure>,
-    /// Nobody waits any more: what cannot be written now is given up.
+    /// True if no one waits any more: an entry that cannot be written now is given up.
     given_up: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
     folder: PathBuf,
@@ -98,7 +99,8 @@ pub(super) struct Recorder {
 }
 
 impl Recorder {
-    /// Takes a journal, with the numbers of the commands on it that no outcome has named, which are named by 1, 2, 3 from here on.
+    /// Creates a recorder for a journal. `open` are the numbers of the recorded commands that have no outcome yet. This
+    /// recorder refers to them by 1, 2, 3 from now on.
     pub(super) fn new(journal: Box<dyn Ledger>, open: &[u32], beside: &Beside) -> Self {
         let (given, jobs) = mpsc::unbounded_channel();
         let (failed, failures) = mpsc::unbounded_channel();
@@ -120,7 +122,7 @@ impl Recorder {
         &self.folder
     }
 
-    /// Waits for a failure to record.
+    /// Waits for a failure to write a record.
     pub(super) async fn failure(&mut self) -> RecordFailure {
         match self.failures.recv().await {
             Some(failure) => failure,
@@ -128,35 +130,35 @@ impl Recorder {
         }
     }
 
-    /// Records what happened.
+    /// Records an event.
     pub(super) fn append(&self, entry: Entry) -> Ticket {
         self.give(Job::Append(Box::new(entry)))
     }
 
-    /// Records a command before it is carried out. Returns the number by which [`Recorder::outcome`] names it.
+    /// Records a command before it is executed. Returns the number by which [`Recorder::outcome`] refers to it.
     pub(super) fn intend(&mut self, entry: Entry) -> (u64, Ticket) {
         self.intents += 1;
         (self.intents, self.give(Job::Intend(self.intents, Box::new(entry))))
     }
 
-    /// Records what became of an intent.
+    /// Records the outcome of an intent.
     pub(super) fn outcome(&self, intent: u64, entry: Entry) -> Ticket {
         self.give(Job::Outcome(intent, Box::new(entry)))
     }
 
-    /// Brings files of the run folder on record.
+    /// Records files of the run folder.
     pub(super) fn adopt(&self, files: Vec<Artefact>, now: Duration, cycle: u32) -> Ticket {
         self.give(Job::Adopt(files, now, cycle))
     }
 
-    /// Writes the last record, if that can be done within a bounded time.
+    /// Writes the last record, within a bounded time.
     pub(super) async fn close(&mut self, now: Duration, cycle: u32, ending: Value) -> Result<(), RecordFailure> {
         let closed = tokio::time::timeout(PATIENCE, self.give(Job::Close(now, cycle, ending))).await;
         self.given_up.store(true, Ordering::Release);
         if let Ok(Ok(closed)) = closed {
             return closed;
         }
-        // It may hang in the operating system, and is not waited for.
+        // The thread may hang in the operating system, so do not wait for it.
         self.thread = None;
         let (folder, limit) = (self.folder.display(), PATIENCE.as_secs());
         Err(RecordFailure::Unwritable(format!("{folder}: the record could not be brought to its end within {limit} s")))
@@ -172,7 +174,7 @@ impl Recorder {
 
 impl Drop for Recorder {
     fn drop(&mut self) {
-        // The lock on the run folder is free once this returns.
+        // The lock on the run folder is free when this returns.
         self.given_up.store(true, Ordering::Release);
         drop(self.given.take());
         if let Some(thread) = self.thread.take() {
@@ -181,14 +183,14 @@ impl Drop for Recorder {
     }
 }
 
-/// Who writes.
+/// Writer of the journal.
 struct Scribe {
     journal: Option<Box<dyn Ledger>>,
-    /// The command numbers of the intents that no outcome has named.
+    /// Command numbers of the intents that have no outcome yet.
     ids: HashMap<u64, u32>,
     failed: mpsc::UnboundedSender<RecordFailure>,
     given_up: Arc<AtomicBool>,
-    /// Something was given up, and nothing is written behind it.
+    /// True if an entry was given up. After that nothing is written.
     broken_off: bool,
     beside: Beside,
 }
@@ -198,18 +200,18 @@ impl Scribe {
         loop {
             match tokio::time::timeout(BETWEEN_LOOKS, jobs.recv()).await {
                 Ok(Some((job, answer))) => {
-                    // Who asked may have gone; the record stands all the same.
+                    // The person who asked may be gone; the record stays.
                     let _ = answer.send(self.until_written(&job).await.map_err(failure));
                 }
                 Ok(None) => return,
-                // A pass may go on for long without a word: its record is looked for all the same.
+                // A pass may continue for long without an event: still check its record.
                 Err(_) => drop(self.until_written(&Job::Look).await),
             }
         }
     }
 
-    /// Writes a job, however often that has to be tried. The loop is told that it does not go on, and again as long as that is so: what it
-    /// hears in between may be of an earlier job.
+    /// Writes a job, with as many attempts as necessary. Reports the failure to the loop, and again as long as it
+    /// lasts, because an earlier report may be about an earlier job.
     async fn until_written(&mut self, job: &Job) -> Result<(), JournalError> {
         let mut tries = 0_u32;
         loop {
@@ -217,12 +219,12 @@ impl Scribe {
             let error = match self.write(job) {
                 Ok(()) => return Ok(()),
                 Err(error) if !error.may_pass() => {
-                    // A gap among events and commands is the end of the record; a file that cannot come on it is none.
+                    // A missing event or command ends the record. A file that cannot be recorded does not.
                     self.broken_off |= !matches!(job, Job::Adopt(..) | Job::Look);
                     return Err(error);
                 }
                 Err(error) if self.given_up.load(Ordering::Acquire) => {
-                    // What follows would stand in the record as if nothing were missing before it.
+                    // Later entries would look as if nothing were missing before them.
                     self.broken_off |= !matches!(job, Job::Look);
                     return Err(error);
                 }
@@ -267,22 +269,24 @@ impl Scribe {
     }
 }
 
-/// Time since the run began as the journal counts it.
+/// Returns the time since the run began in the unit of the journal, ns.
 pub(super) fn nanoseconds(now: Duration) -> u64 {
     u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
 }
 
-/// Brings files of a run folder to the disk and reads them, for [`Recorder::adopt`]. Blocks, and takes its time for large ones.
+/// Writes files of a run folder to the disk and reads them, for [`Recorder::adopt`]. Blocks, and takes long for large
+/// files.
 pub(super) fn describe(folder: &Path, names: &[String]) -> Result<Vec<Artefact>, RecordFailure> {
     names.iter().map(|name| Artefact::of(folder, name).map_err(failure)).collect()
 }
 
-/// The files that a computation makes in one folder below that of the run. What of them is there when it is over goes on record, however it
-/// ended.
+/// Files that a computation makes in one folder below that of the run. Those that exist when the computation ends are
+/// recorded, whatever its result is.
 pub(super) struct Files {
     run: PathBuf,
     below: String,
-    /// Where what is not decided by yet goes in place of that: a batch of touches.
+    /// Folder that replaces `below` when the result is settled. Before that, `below` is the folder of a batch of
+    /// touches.
     settled: Option<String>,
     names: Vec<String>,
 }
@@ -292,12 +296,12 @@ impl Files {
         Self { run, below, settled: None, names: Vec::new() }
     }
 
-    /// The same, with the folder that [`Files::settle`] goes on to.
+    /// Sets the folder that [`Files::settle`] switches to.
     pub(super) fn then(self, settled: String) -> Self {
         Self { settled: Some(settled), ..self }
     }
 
-    /// Goes on to the folder of what the cell decides by, and makes it where it is another.
+    /// Switches to the folder of the result on which the cell decides, and creates it if it is another one.
     pub(super) fn settle(&mut self) -> Result<(), FormatError> {
         let Some(settled) = self.settled.take() else { return Ok(()) };
         self.below = settled;
@@ -308,7 +312,7 @@ impl Files {
         self.run.join(&self.below)
     }
 
-    /// Keeps the name of a file that is about to be written, and returns where it goes.
+    /// Stores the name of a file that is about to be written, and returns its path.
     pub(super) fn place(&mut self, name: &str) -> PathBuf {
         let name = if self.below.is_empty() { name.to_owned() } else { format!("{}/{name}", self.below) };
         let path = self.run.join(&name);
@@ -316,12 +320,12 @@ impl Files {
         path
     }
 
-    /// Returns the names of all that were to be made, below the folder of the run.
+    /// Returns the names of all planned files, below the folder of the run.
     pub(super) fn names(&self) -> &[String] {
         &self.names
     }
 
-    /// Returns the names of those that were made.
+    /// Returns the names of the files that exist.
     pub(super) fn made(self) -> Vec<String> {
         let Self { run, mut names, .. } = self;
         names.retain(|name| run.join(name).is_file());
@@ -329,13 +333,13 @@ impl Files {
     }
 }
 
-/// Why a computation brought nothing: its files cannot be written, or for a reason of its own.
+/// Failure of a computation: its files cannot be written, or another reason.
 pub(super) enum Unfinished<T> {
     NotSaved(RecordFailure),
     For(T),
 }
 
-/// Tells an error of writing from any other by what the operating system said.
+/// Distinguishes a write error from other errors, by the error of the operating system.
 pub(super) fn unfinished<E: std::error::Error + 'static>(error: E) -> Unfinished<String> {
     let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(&error);
     while let Some(next) = cause {
@@ -358,7 +362,7 @@ fn failure(error: JournalError) -> RecordFailure {
     }
 }
 
-/// Returns an entry for something that happened.
+/// Creates an entry for an event.
 pub(super) fn entry(kind: Kind, now: Duration, cycle: u32, actor: (String, String), payload: Value) -> Entry {
     let (actor, station) = actor;
     Entry { actor, station, ..Entry::new(kind, nanoseconds(now), cycle, payload) }

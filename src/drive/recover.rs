@@ -1,5 +1,5 @@
-//! Bringing a machine home that holds what no run knows: one step after the other, each decided upon by a person who has seen how the
-//! machine stands, and each on record before it is given.
+//! Recovery of a machine that holds a job or result of no known run. A person who has seen the state of the machine
+//! decides on each step. Each step is recorded before it is sent.
 
 use std::time::Duration;
 
@@ -12,26 +12,26 @@ use crate::cell::{Actor, Device};
 use crate::device::{Answer, DeviceError, Fault, Machine, State, Status};
 use crate::journal::{Entry, Journal, JournalError, Kind};
 
-/// Between two looks at a machine that is on its way.
+/// Interval between two status reads of a machine in motion.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
-/// A client that has died is forgotten by then.
+/// Time after which a machine has certainly released a client that has died.
 const GONE_AFTER: Duration = Duration::from_secs(10);
-/// Between two tries to become the client in its place.
+/// Interval between two attempts to claim the machine.
 const BETWEEN_CLAIMS: Duration = Duration::from_millis(500);
 
-/// What brings a machine nearer to idle.
+/// Step that brings a machine nearer to idle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Step {
     /// End its job in order, or take its preparation back.
     Stop,
-    /// Let it forget its result.
+    /// Discard its result.
     Acknowledge,
-    /// Let it leave ABORTED or FAULTED.
+    /// Leave ABORTED or FAULTED.
     Clear,
 }
 
-/// Why a machine was not brought home.
+/// Reason why a machine was not recovered.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -47,7 +47,7 @@ pub enum RecoverError {
 }
 
 impl Step {
-    /// Returns what comes next for a machine in a state: a step, or nothing where it is home. One that moves is stopped.
+    /// Returns the next step for a machine in a state, or `None` if it is idle. A machine that moves is stopped.
     pub fn after(state: State) -> Option<Self> {
         match state {
             State::Idle => None,
@@ -57,7 +57,7 @@ impl Step {
         }
     }
 
-    /// Returns the name by which a person decides upon it.
+    /// Returns the name of the step that a person confirms.
     pub fn name(self) -> &'static str {
         match self {
             Self::Stop => "STOP",
@@ -66,7 +66,7 @@ impl Step {
         }
     }
 
-    /// Says what it does, and what is lost by it.
+    /// Returns the effect of the step, and the loss that it causes.
     pub fn meaning(self, device: Device) -> &'static str {
         match (self, device) {
             (Self::Stop, _) => "ends its job in order, clear of the part, or takes its preparation back",
@@ -83,21 +83,19 @@ impl Step {
     }
 }
 
-/// Opens the wire and returns how a machine stands. Nothing is written to it but the sign of life of its client.
-///
-/// # Errors
-/// A machine that cannot be reached, or is another one.
+/// Connects and returns the status of a machine. Writes nothing to it but the heartbeat of this client.
 pub async fn look<M: Machine>(machine: &mut M) -> Result<Status, RecoverError> {
     machine.connect().await?;
     Ok(machine.status().await?)
 }
 
-/// Gives a machine one step, if it still stands as a person has seen it, and returns how it stands once it has come to rest. The step is
-/// on record before it is given, and what became of it after. `by` says who decided, and where.
+/// Sends one step to a machine if its status is still as a person has seen it. Returns the status when the machine has
+/// come to rest. The step is recorded before it is sent, and its outcome after. `by` is the person who decided, and the
+/// place.
 ///
 /// # Errors
-/// A machine that cannot be reached, is another client's, has changed, refuses, or does not come to rest within the limit; a record
-/// that cannot be written.
+/// A machine that cannot be reached, belongs to another client, has changed, refuses, or does not come to rest within
+/// the limit; a record that cannot be written.
 pub async fn take<M: Machine>(
     machine: &mut M,
     device: Device,
@@ -130,12 +128,13 @@ pub async fn take<M: Machine>(
     };
     let told = ended.as_ref().map_or_else(ToString::to_string, in_short);
     journal.append(Entry { command_id: Some(intent), ..by(Kind::Outcome, json!({ "found": told })) })?;
-    // Nothing depends on it: a machine whose owner falls silent can be claimed by the next.
+    // Optional: a machine whose owner is silent can be claimed by the next client.
     let _ = machine.release().await;
     ended
 }
 
-/// Makes this program the machine's client. Whoever was it may have died this moment: then the machine waits for him a while.
+/// Claims the machine for this program. A previous client may have died a moment ago; the machine then waits for it for
+/// a while.
 async fn claim<M: Machine>(machine: &mut M) -> Result<(), DeviceError> {
     let by = Instant::now() + GONE_AFTER;
     loop {
@@ -148,7 +147,7 @@ async fn claim<M: Machine>(machine: &mut M) -> Result<(), DeviceError> {
     }
 }
 
-/// Says how a machine stands: its state, its job, and which result it holds.
+/// Describes a machine in short: its state, its job, and the result that it holds.
 pub fn in_short(status: &Status) -> String {
     let job = status.job.map_or(String::new(), |job| format!(" with {job}"));
     let fault = status.fault.filter(|fault| *fault != Fault::None).map_or(String::new(), |fault| format!(", {fault}"));
@@ -156,7 +155,7 @@ pub fn in_short(status: &Status) -> String {
     format!("{}{job}{fault}{result}", status.state)
 }
 
-/// Waits until a machine moves no more.
+/// Waits until a machine stands still.
 async fn at_rest<M: Machine>(
     machine: &mut M,
     device: Device,

@@ -1,5 +1,6 @@
-//! From the record of a run that broke off to where it was: every event is handled again, every command held against the one on
-//! record, and every computation done again from the recorded points and held against the recorded files.
+//! Replay of the record of an interrupted run to its last state. Every event is handled again and every command is
+//! compared with the recorded one. Every computation is repeated from the recorded points and compared with the
+//! recorded files.
 //!
 //! ```text
 //!  record --> event  --> Cell::handle --> commands == those on record?
@@ -7,8 +8,8 @@
 //!             intent --> the payloads that it names == those computed again?
 //! ```
 //!
-//! Nothing is commanded here. At the first difference it stops: a program that would have decided or computed otherwise cannot know
-//! what the machines hold.
+//! Replay sends no command. It stops at the first difference: a program that would have decided or computed something
+//! else cannot know what the machines hold.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fs;
@@ -32,31 +33,31 @@ use crate::device::{Armed, Coordinates, Identified, Number, digest};
 use crate::formats::{self, FormatError, ScratchFolder};
 use crate::journal::{Artefact, JournalError, Kind, Reader, Record, sha256_hex};
 
-/// Where computations are done again, below the run folder; gone when that is over.
+/// Folder for the repeated computations, below the run folder; removed afterwards.
 const SCRATCH: &str = "replay";
 
-/// A run that was interrupted, as its record tells it.
+/// Interrupted run, as its record describes it.
 pub struct Interrupted {
     pub(super) cell: Cell,
     pub(super) cycles: Cycles,
-    /// The last preparation of each machine: CMM, grinder.
+    /// Last preparation of each machine: CMM, grinder.
     pub(super) armed: [Option<Value>; 2],
-    /// How often each thing was computed, so that no file is written again.
+    /// Number of attempts of each computation, so that no file is overwritten.
     pub(super) attempts: BTreeMap<(u32, Computation), u32>,
     pub(super) states: u64,
     /// Time since the run began.
     pub(super) before: Duration,
     /// Commands without an outcome, by their numbers.
     pub(super) open: BTreeMap<u32, Command>,
-    /// How it ended, where only the last record is missing.
+    /// Ending, if only the last record is missing.
     pub(super) ending: Option<Ending>,
-    /// A judgement whose file is not on record, and which of its cycle it is.
+    /// Judgement whose file is not recorded, and its number within its cycle.
     pub(super) unannounced: Option<(u32, Judgement)>,
-    /// Files that a computation left which did not come to bring them on record.
+    /// Files of a computation that ended before it recorded them.
     pub(super) left: Vec<String>,
 }
 
-/// Why a run cannot be gone on with.
+/// Reason why a run cannot be continued.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -80,10 +81,10 @@ pub enum ReplayError {
 }
 
 impl Interrupted {
-    /// Reads the record of a run and does again what it tells, for the plan and the task that the run began with.
+    /// Reads the record of a run and replays it, for the plan and the task with which the run began.
     ///
     /// # Errors
-    /// A record that cannot be read, a disk that fails, and the first difference to what this program would have done.
+    /// A record that cannot be read, a disk that fails, or the first difference from the decisions of this program.
     pub fn read(run: &Path, plan: CellPlan, task: &Task) -> Result<Self, ReplayError> {
         let reader = Reader::open(run)?;
         let mut replay = Replay::new(run, plan, task)?;
@@ -93,7 +94,7 @@ impl Interrupted {
         replay.end()
     }
 
-    /// A run of which nothing has happened.
+    /// Returns a run in which nothing has happened yet.
     pub(super) fn none(plan: CellPlan) -> Self {
         Self {
             cell: Cell::new(plan),
@@ -109,7 +110,7 @@ impl Interrupted {
         }
     }
 
-    /// Returns what a machine was prepared for last, with its cycle, and whether it may be at it still.
+    /// Returns the last preparation of a machine with its cycle, and whether the machine may still be at that job.
     pub(super) fn left_at(&self, device: Device) -> (Option<(u32, Armed)>, bool) {
         let intent = self.armed[device as usize].clone();
         let Some(intent) = intent.and_then(|value| serde_json::from_value::<Intent>(value).ok()) else {
@@ -121,7 +122,7 @@ impl Interrupted {
         (Some((cycle, intent.armed())), at_work && cycle == self.cell.cycle())
     }
 
-    /// Returns the state in words in which the run broke off.
+    /// Returns the state in which the run was interrupted, in words.
     pub fn state(&self) -> String {
         format!("{}, cycle {}", self.cell.state(), self.cell.cycle())
     }
@@ -131,13 +132,13 @@ struct Replay<'t> {
     run: &'t Path,
     task: &'t Task,
     found: Interrupted,
-    /// What followed from the last event and has not been seen on record.
+    /// Commands that followed from the last event and are not yet seen in the record.
     due: VecDeque<Command>,
-    /// The newest file of each name in the folder of a cycle.
+    /// Newest file of each name in the folder of a cycle.
     files: BTreeMap<(u32, String), Artefact>,
-    /// All names on record.
+    /// All recorded names.
     names: BTreeSet<String>,
-    /// What the last measurement said that its coordinates are.
+    /// Coordinates that the last measurement reported.
     coordinates: Option<Coordinates>,
     last: u64,
 }
@@ -155,7 +156,7 @@ impl<'t> Replay<'t> {
         let payload = record.value();
         match record.kind {
             Kind::Begin | Kind::End | Kind::Seal => Ok(()),
-            // What the program had decided and not brought on record when it ended was not carried out.
+            // Decisions that the program had not recorded when it ended were not executed.
             Kind::Reopen => {
                 self.due.clear();
                 Ok(())
@@ -209,7 +210,7 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// What a command leaves in this program.
+    /// Applies the effect of a command within this program.
     fn follow(&mut self, command: &Command) {
         let (cycles, task) = (&mut self.found.cycles, self.task);
         match command {
@@ -224,7 +225,7 @@ impl<'t> Replay<'t> {
         }
     }
 
-    /// Holds a command on record against the one that is due.
+    /// Compares a recorded command with the command that is due.
     fn command(&mut self, id: Option<u32>, mut recorded: Value) -> Result<(), ReplayError> {
         let name = recorded["command"].as_str().unwrap_or_default().to_owned();
         let Some(command) = self.due.pop_front() else {
@@ -243,7 +244,7 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Does again what was computed, from what is on record.
+    /// Repeats a computation from recorded data.
     fn compute(&mut self, event: &Event) -> Result<(), ReplayError> {
         let (number, kind) = match event {
             Event::Collected { cycle, gate: Gate::Passed, .. } => (*cycle, Computation::Gate),
@@ -281,7 +282,7 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// The points of a measurement as they were written.
+    /// Returns the points of a measurement as they were written.
     fn points(&self, number: u32) -> Result<super::task::Points, ReplayError> {
         let read = |name: &str| match self.files.get(&(number, name.to_owned())) {
             Some(file) => {
@@ -303,16 +304,16 @@ impl<'t> Replay<'t> {
         })
     }
 
-    /// The newest document of a name that is on record of a cycle.
+    /// Returns the newest recorded document of a name in a cycle.
     fn read_json<T: DeserializeOwned>(&self, number: u32, name: &str) -> Result<Option<T>, ReplayError> {
         let Some(file) = self.files.get(&(number, name.to_owned())) else { return Ok(None) };
         let bytes = file.read(self.run)?;
         serde_json::from_slice(&bytes).map(Some).map_err(|error| self.differs(format!("{}: {error}", file.name)))
     }
 
-    /// Holds the files that a computation made again against those on record.
+    /// Compares the files of a repeated computation with the recorded ones.
     fn compare(&self, number: u32, scratch: &Path, files: &Files) -> Result<(), ReplayError> {
-        // A file of this format carries the time at which it was written.
+        // A file of this format contains the time of its writing.
         let dated = |name: &str| name.ends_with(".x3p");
         for name in files.names().iter().filter(|name| !dated(name)) {
             let path = scratch.join(name);
@@ -329,7 +330,7 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Sees that what each machine was prepared for is what is known of that cycle, and counts what lies in the run folder.
+    /// Checks that the last preparation of each machine agrees with its cycle, and counts the files in the run folder.
     fn end(mut self) -> Result<Interrupted, ReplayError> {
         for device in Device::BOTH {
             self.check_armed(device)?;
@@ -350,13 +351,15 @@ impl<'t> Replay<'t> {
         Ok(self.found)
     }
 
-    /// Takes in that a file lies in the folder of an attempt: it is not written again, and what is not on record is brought there.
+    /// Registers a file that exists in the folder of an attempt: it is not overwritten, and is recorded if it is not on
+    /// record.
     fn lies_there(&mut self, folder: &str, number: u32, attempt: u32, name: &str) {
         if name == "result.json" || name.starts_with('.') {
             return;
         }
         let kind = Computation::of(name).and_then(|kind| match kind {
-            // Where touches are chosen what was settled lies in the folders of the cycle, and what it came from in those of its batches.
+            // If touches are chosen, the settled results are in the folders of the cycle, and their inputs in those of
+            // its batches.
             Computation::Gate | Computation::Registration if self.task.adaptive.is_some() => {
                 if folder.contains("/batch-") {
                     return Some(kind);
@@ -380,7 +383,7 @@ impl<'t> Replay<'t> {
         let intent: Intent = serde_json::from_value(value).map_err(|error| self.unreadable(&error))?;
         let Number { cycle: number, batch } = Number::of(intent.cycle);
         let Some(cycle) = self.found.cycles.get(number) else { return Ok(()) };
-        // What was prepared before the plan of the next batch was laid is over.
+        // A preparation from before the plan of the next batch is over.
         if device == Device::Cmm && cycle.batch != batch {
             return Ok(());
         }

@@ -1,4 +1,4 @@
-//! Tells how the cell is: where it stands, what it waits for, and what a person does next.
+//! Snapshot of the cell: its state, what it waits for, and the next action of a person.
 
 use regrind_control::{Next, PartVerdict, Snapshot};
 
@@ -6,7 +6,7 @@ use super::Drive;
 use crate::cell::{Cell, Phase, State};
 
 impl Drive {
-    /// How the cell is, as the control socket tells it.
+    /// Returns the snapshot of the cell for the control socket.
     pub(super) fn snapshot(&self) -> Snapshot {
         let state = self.cell.state();
         let waits_for: Vec<String> = match state.phase().and_then(Phase::job) {
@@ -39,7 +39,7 @@ impl Drive {
     }
 }
 
-/// Tells what a person does next.
+/// Returns the next action of a person.
 fn next(cell: &Cell, waits_for: &[String]) -> Next {
     if let (State::Execute(_), Some(device)) = (cell.state(), cell.asks_whether_clear_of()) {
         return Next::SeeClear { device };

@@ -1,23 +1,24 @@
-//! What the points say that a CMM gives while it still measures: for people to look at. No gate has seen them, nothing is registered, and
-//! nothing is judged or recorded by them.
+//! Preliminary figures of the points that a CMM gives while it still measures, for display only. No gate has checked
+//! them, they are not registered, and nothing is judged or recorded by them.
 
 use regrind_control::SoFar;
 
 use crate::device::{Coordinates, Job, MeasuredPoint, Plan, PointStatus, Preliminary, TargetKind};
 
-/// The touches of the part that have come of a job, summed up.
+/// Sums over the touches of the part received for a job so far.
 #[derive(Debug, Default)]
 pub(super) struct Touching {
     job: Option<Job>,
     came: usize,
-    /// Deviations of what was touched of the part.
+    /// Deviations of the touched points of the part: number, sum of squares, range.
     touched: u32,
     square_sum_mm2: f64,
     range_mm: Option<[f64; 2]>,
 }
 
 impl Touching {
-    /// Takes points that are new. Those that do not follow on what came before, or are not of the plan, make all that came nothing.
+    /// Adds new points. Points that do not continue the previous ones, or do not belong to the plan, discard everything
+    /// received so far.
     pub(super) fn take(&mut self, plan: &Plan, preliminary: &Preliminary) {
         let Preliminary { job, from, points, coordinates } = preliminary;
         if *from == 0 {
@@ -48,7 +49,7 @@ impl Touching {
         *self = Self::default();
     }
 
-    /// Returns what is shown of it; nothing before the part was touched.
+    /// Returns the figures for display. Returns `None` before the part was touched.
     pub(super) fn so_far(&self) -> Option<SoFar> {
         let [least, most] = self.range_mm?;
         let rms_um = 1e3 * (self.square_sum_mm2 / f64::from(self.touched)).sqrt();
@@ -56,7 +57,8 @@ impl Touching {
     }
 }
 
-/// How far a touch lies from where the plan has it, along the normal: the part's error and its place in one.
+/// Returns the signed distance of a touch from its target along the normal: the error of the part and of its place
+/// together.
 fn deviation_mm(point: &MeasuredPoint, target_mm: &[f64; 3], normal: &[f64; 3], ball_mm: f64) -> f64 {
     (0..3).map(|k| (point.at_mm[k] - target_mm[k]) * normal[k]).sum::<f64>() - ball_mm
 }
@@ -86,7 +88,7 @@ mod tests {
         }
     }
 
-    /// Centres that stand proud of the plan by so much, and each a little aside, which is no deviation.
+    /// Centres that are higher than the plan by the given values, and each a little to the side, which is no deviation.
     fn centres(from: u32, proud_mm: &[f64]) -> Preliminary {
         let point = |(index, proud): (u32, &f64)| MeasuredPoint {
             index,
@@ -125,7 +127,7 @@ mod tests {
             touching.take(&plan(), &centres(0, &[0.5, 0.003]));
             touching.take(&plan(), &wrong);
             assert_eq!(touching.so_far(), None, "{wrong:?}");
-            // Told from the beginning it is believed again.
+            // Given from the beginning they count again.
             touching.take(&plan(), &centres(0, &[0.5, 0.003]));
             assert_eq!(touching.so_far().map(|told| told.touched), Some(1));
         }

@@ -1,8 +1,9 @@
-//! A task for each machine: it alone talks to it. Orders come in, facts go out; while nothing is asked it looks at the status.
+//! Task for each machine, which alone talks to that machine. Requests come in, facts go out. Without a request it polls
+//! the status.
 //!
-//! What is asked is answered in order. A hold, a stop or an abort does not wait for a long transfer: the drive raises the
-//! [`Interrupt`], the transfer ends between two requests, and the order is next. An abort waits for nothing else either: what the
-//! machine was being asked is given up where it is, for nothing that it could still bring would be used.
+//! Requests are answered in order. A hold, a stop or an abort does not wait for a long transfer: the drive raises the
+//! [`Interrupt`], the transfer ends between two requests, and the order is next. An abort also waits for nothing else:
+//! the request in progress is given up where it is, because its result would not be used.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -22,7 +23,7 @@ use crate::device::{
     Outcome, Pass, PassRecord, Plan, Preliminary, Reconciled, SignalValue, State, Status, Word, digest,
 };
 
-/// What a machine is asked. Answers are the events that [`crate::cell::Command`] names.
+/// Request to a machine. The answers are the events that [`crate::cell::Command`] names.
 pub(super) enum Ask {
     Connect,
     Load { cycle: u32, load: Load },
@@ -40,52 +41,52 @@ pub(super) enum Ask {
     Confirm { word: Word, answer: oneshot::Sender<Result<(), String>> },
 }
 
-/// A payload for one machine or the other.
+/// Payload for one machine or the other.
 #[derive(Clone)]
 pub(super) enum Load {
     Plan(Arc<Plan>),
     Pass(Arc<CorrectionMap>, Box<Pass>),
 }
 
-/// What a job left.
+/// Result of a job.
 pub(super) enum Fetched {
-    /// With the time that their transfer took.
+    /// Points, with the duration of their transfer.
     Points(Box<Measurement>, Duration),
     Record(Box<PassRecord>),
 }
 
-/// What a person should know of a machine now.
+/// Present information about a machine for a person.
 pub(super) struct Notes {
     pub(super) device: Device,
     pub(super) all: Vec<String>,
-    /// Those of them that were not told before.
+    /// Notes that were not reported before.
     pub(super) new: Vec<String>,
 }
 
-/// A fact, with what the journal should keep beside it.
+/// Fact, with the details that the journal stores.
 #[derive(Default)]
 pub(super) struct StationReport {
-    /// `None` where the drive makes the event itself, from what was fetched.
+    /// `None` if the drive itself creates the event from the fetched result.
     pub(super) event: Option<Event>,
     pub(super) detail: Option<serde_json::Value>,
     pub(super) fetched: Option<Fetched>,
     /// Points that a CMM gives while it still measures.
     pub(super) preliminary: Option<Preliminary>,
-    /// What a person should know of a machine, where that has changed.
+    /// Information about a machine for a person, if it has changed.
     pub(super) notes: Option<Notes>,
-    /// Files of the run folder that came with a person's word, to be brought on record.
+    /// Files of the run folder that came with a person's confirmation, to be recorded.
     pub(super) files: Vec<String>,
 }
 
-/// The drivers of both kinds, seen alike.
+/// Common interface of the drivers of both kinds of machine.
 pub(super) trait StationDriver: Send + 'static {
     type Machine: Machine;
     const DEVICE: Device;
     fn machine(&mut self) -> &mut Self::Machine;
-    /// Carries the payloads and returns the digest of their identities.
+    /// Transfers the payloads and returns the digest of their identities.
     fn load(&mut self, load: &Load, interrupt: &Interrupt) -> impl Future<Output = Result<u32, DeviceError>> + Send;
     fn fetch(&mut self, job: Job, interrupt: &Interrupt) -> impl Future<Output = Result<Fetched, DeviceError>> + Send;
-    /// Reads on in what the machine gives while the job still runs; see [`Cmm::read_ahead`].
+    /// Reads new preliminary data while the job still runs; see [`Cmm::read_ahead`].
     fn read_ahead(&mut self, _job: Job, _: &Interrupt) -> impl Future<Output = Option<Preliminary>> + Send {
         std::future::ready(None)
     }
@@ -138,7 +139,8 @@ impl<G: Grinder + 'static> StationDriver for GrinderDriver<G> {
     }
 }
 
-/// Aborts on their way to a station: the drive counts them up before it asks, the station as it takes them.
+/// Aborts on their way to a station. The drive counts each one before it sends the request; the station counts each one
+/// that it takes.
 pub(super) struct Aborts {
     ordered: watch::Receiver<u64>,
     taken: u64,
@@ -149,18 +151,18 @@ impl Aborts {
         Self { ordered, taken: 0 }
     }
 
-    /// Waits until an abort is on its way that has not been taken.
+    /// Waits until an abort is on its way that this station has not taken.
     async fn ordered(&mut self) {
         let taken = self.taken;
         if self.ordered.wait_for(|ordered| *ordered > taken).await.is_err() {
-            // Nobody is left to order one.
+            // No sender is left that could order an abort.
             std::future::pending::<()>().await;
         }
     }
 }
 
-/// The sign of life of the loop that decides. While it is not felt no machine is looked at, and so none is told that its client is
-/// alive: it holds by itself.
+/// Heartbeat of the loop that decides. If it stops, no machine is polled, so none gets the sign of life of its client:
+/// the machine holds by itself.
 #[derive(Clone)]
 pub(super) struct Pulse {
     began: Instant,
@@ -185,7 +187,7 @@ impl Pulse {
     }
 }
 
-/// A task that attends to one machine.
+/// Task for one machine.
 pub(super) struct MachineTask<B> {
     driver: B,
     job: u32,
@@ -194,14 +196,14 @@ pub(super) struct MachineTask<B> {
     /// Digest of the payloads that were loaded last.
     loaded: Option<u32>,
     armed: Option<Armed>,
-    /// The cycle of the job that runs.
+    /// Cycle of the job that runs.
     cycle: u32,
     seen: Seen,
-    /// What a person was told last.
+    /// Notes that were last reported to a person.
     notes: Vec<String>,
 }
 
-/// What the last look showed, so that only changes are told.
+/// State that the last status read showed, so that only changes are reported.
 #[derive(Default)]
 struct Seen {
     connected: bool,
@@ -211,55 +213,58 @@ struct Seen {
     told_progress: Option<Instant>,
     supplies_missing: bool,
     manual: bool,
-    /// Whether it was clear of the part, where it tells that.
+    /// True if it was clear of the part; `None` if it does not report this.
     clear: Option<bool>,
-    /// A signal of the cell file is outside its range; and since when all are within, while that is not yet believed.
+    /// True if a signal of the cell file is outside its range; and since when all have been within it, until that is
+    /// accepted.
     signal_out: bool,
     signals_good_since: Option<Instant>,
     aborting: bool,
     stopping: bool,
     clearing: bool,
-    /// The end of the running job has been told.
+    /// True if the end of the running job was reported.
     ended: bool,
-    /// A START was taken and its end has not been told.
+    /// True if a START was taken and its end has not been reported.
     running: bool,
     next_try: Option<Instant>,
     tries: u32,
-    /// When the link came back last.
+    /// Time at which the link last came back.
     back: Option<Instant>,
-    /// Since START was given, or the job was found out about, the machine was seen at it.
+    /// True if the machine was seen at the job since START was sent or the job was reconciled.
     at_job: bool,
-    /// Looks in a row that showed nothing of it.
+    /// Number of status reads in a row without the job.
     absent: u32,
-    /// Looks at which the progress of a machine that says HELD had risen since the one before.
+    /// Number of status reads with progress that rose since the one before, although the machine reports HELD.
     rises: u32,
-    /// When STOP was taken.
+    /// Time at which STOP was taken.
     stop_taken: Option<Instant>,
 }
 
-/// Between two beats of the loop that decides.
+/// Interval between two beats of the loop that decides.
 pub(super) const PULSE_EVERY: Duration = Duration::from_millis(250);
-/// A loop that has not beaten for so long hangs.
+/// Time without a beat after which the loop counts as hung.
 const HUNG_AFTER: Duration = Duration::from_secs(2);
-/// Longest time between two attempts to reach a machine that is lost.
+/// Maximum time between two attempts to reach a lost machine.
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
-/// How long signals must be within their ranges before a machine goes on by them: one at its limit does not flap.
+/// Time for which signals must be within their ranges before they count as good. Prevents flapping of a signal at its
+/// limit.
 const BELIEVED_AFTER: Duration = Duration::from_secs(1);
-/// A link that stood for so long is not the one that is lost again and again.
+/// Duration of a link after which a new loss does not belong to the same series of losses.
 const STEADY_AFTER: Duration = Duration::from_secs(10);
-/// Looks at which a machine shows nothing of its job, before that is believed.
+/// Number of status reads without the job before the job counts as vanished.
 const ABSENT_AFTER: u32 = 2;
-/// Looks at which the progress of a machine rises that says HELD, before it is taken for moving: one may still count what it has just ended.
+/// Number of rises of the progress at HELD before the machine counts as moving. It may still count what it has just
+/// ended.
 const RISES_AFTER: u32 = 3;
-/// A machine that still says EXECUTE so long after it took a STOP does not do it.
+/// Time after which a machine that took a STOP must have left EXECUTE.
 const STOPS_WITHIN: Duration = Duration::from_secs(5);
-/// Least share of a path that a machine has travelled when it calls its job complete.
+/// Minimum share of the path that a machine must have travelled when it reports its job complete.
 const COMPLETE_FROM: f64 = 0.95;
-/// Progress is told at most this often, so that the journal stays readable.
+/// Minimum interval between two reports of progress, so that the journal stays readable.
 const PROGRESS_EVERY: Duration = Duration::from_millis(250);
 
 impl<B: StationDriver> MachineTask<B> {
-    /// Takes a machine for a job, with the intent of an interrupted run where there is one, so that it can be reconciled.
+    /// Creates the task of a machine for a job. With the intent of an interrupted run, the job can be reconciled.
     pub(super) fn new(
         driver: B,
         job: u32,
@@ -272,7 +277,7 @@ impl<B: StationDriver> MachineTask<B> {
         Self { driver, job, interrupt, reports, loaded: None, armed, cycle, seen, notes }
     }
 
-    /// Takes it that the machine may be at what was prepared for it before this program began.
+    /// Restores the last preparation into the driver. The machine may still run it since before this program began.
     pub(super) fn may_be_at_work(mut self) -> Self {
         if let Some(armed) = &self.armed {
             self.driver.machine().restore(armed);
@@ -280,8 +285,8 @@ impl<B: StationDriver> MachineTask<B> {
         self
     }
 
-    /// Attends until nobody can ask any more. If that panics, which is a fault of this program, it is told as that, and the run goes on
-    /// without the machine, to which nobody speaks any more.
+    /// Serves requests until no sender is left. If the task panics, which is a fault of this program, reports that as
+    /// an event. The run then continues without the machine, to which nothing talks any more.
     pub(super) async fn attend(self, asks: mpsc::Receiver<Ask>, poll: Duration, aborts: Aborts, pulse: Pulse) {
         let (reports, name) = (self.reports.clone(), B::DEVICE);
         let Err(error) = tokio::spawn(self.attends(asks, poll, aborts, pulse)).await else { return };
@@ -290,7 +295,7 @@ impl<B: StationDriver> MachineTask<B> {
         let _ = reports.send(StationReport { event, ..StationReport::default() }).await;
     }
 
-    /// Attends until nobody can ask any more, then gives the machine back.
+    /// Serves requests until no sender is left, then releases the machine.
     async fn attends(mut self, mut asks: mpsc::Receiver<Ask>, poll: Duration, mut aborts: Aborts, pulse: Pulse) {
         let mut ticks = interval(poll);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -309,7 +314,7 @@ impl<B: StationDriver> MachineTask<B> {
                     },
                     None => break,
                 },
-                // Asked at each tick anew: a loop that has hung goes on.
+                // Checked at each tick: a loop that has hung may continue.
                 _ = ticks.tick(), if self.seen.connected => if pulse.is_felt() {
                     tokio::select! {
                         biased;
@@ -320,7 +325,7 @@ impl<B: StationDriver> MachineTask<B> {
             }
         }
         if self.seen.connected && !self.seen.lost {
-            // Nothing depends on it: a machine whose owner falls silent can be claimed by the next.
+            // Optional: a machine whose owner is silent can be claimed by the next client.
             let _ = self.driver.machine().release().await;
         }
     }
@@ -330,7 +335,7 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     async fn tell_with(&mut self, event: Event, detail: Option<serde_json::Value>) {
-        // The drive hears until it drops the last ask; after that nobody needs to know.
+        // The drive listens until it drops the last ask; after that no one needs the event.
         let _ = self.reports.send(StationReport { event: Some(event), detail, ..StationReport::default() }).await;
     }
 
@@ -361,12 +366,12 @@ impl<B: StationDriver> MachineTask<B> {
                     }
                     Err(error) => Err(error.to_string()),
                 };
-                // Who asked may have gone.
+                // The person who asked may be gone.
                 let _ = answer.send(told);
             }
         }
         if urgent {
-            // Files that are taken back stop no machine: that must be told before the run is over.
+            // Taking back files stops no machine: report this before the run is over.
             self.pass_on_notes().await;
         }
     }
@@ -375,7 +380,7 @@ impl<B: StationDriver> MachineTask<B> {
         let connected = async {
             let identity = self.driver.machine().connect().await?;
             let status = self.driver.machine().status().await?;
-            // What is at somebody else's job is not taken from him.
+            // Do not take over a machine that runs the job of another run.
             if self.is_at_another_job(&status) {
                 return Ok((identity, Err(at_work(&status))));
             }
@@ -403,7 +408,7 @@ impl<B: StationDriver> MachineTask<B> {
         at_a_job && status.job.is_none_or(|job| job.job != self.job)
     }
 
-    /// Tells what a machine was found doing; a preparation of somebody who is gone is taken back.
+    /// Returns the occupation of a machine at the connection. A preparation of a client that is gone is taken back.
     async fn found(&mut self, status: &Status) -> Occupation {
         match status.state {
             State::Idle => Occupation::Idle,
@@ -460,7 +465,7 @@ impl<B: StationDriver> MachineTask<B> {
         };
         let job = Job { job: self.job, cycle: number.seen(), digest };
         let prepared = async {
-            // One whose answer was lost stands there too, unknown to who remembers: the machine is asked.
+            // A preparation whose answer was lost is still active but unknown here, so ask the machine.
             if self.driver.machine().status().await?.state == State::Prepared {
                 self.driver.machine().stop().await?;
             }
@@ -508,14 +513,15 @@ impl<B: StationDriver> MachineTask<B> {
                 self.seen.running = false;
                 self.failed(Asked::Start, error).await;
             }
-            // Whatever else went wrong, the machine may have heard it.
+            // After any other error, the machine may have received the START.
             Err(error) => {
                 self.tell(Event::StartUnknown { device: B::DEVICE, cycle, why: error.to_string() }).await;
             }
         }
     }
 
-    /// The link was lost after the cell had asked: nothing moves by its order until the machine has been met again.
+    /// Refuses a command if the link was lost after the cell had requested it: nothing moves by this order until the
+    /// machine is connected again.
     async fn not_sent(&mut self, what: Asked) {
         let why = "the link to it is lost, and the command was not sent".to_owned();
         self.tell(Event::Refused { device: B::DEVICE, what, why }).await;
@@ -525,10 +531,10 @@ impl<B: StationDriver> MachineTask<B> {
         match self.driver.machine().hold().await {
             Ok(status) => self.note(&status).await,
             Err(error) if error.is_link() => self.lost(&error).await,
-            // Not in EXECUTE: the status tells whether it holds already, has ended, or never ran.
+            // Not in EXECUTE: the status shows if the machine holds already, has ended, or never ran.
             Err(error) => match self.driver.machine().status().await {
                 Ok(status) if status.state == State::Held => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
-                // On its way there already, by its key or a button: the next looks see it arrive.
+                // Already on its way to HELD, by its key or a button: the next status reads see it arrive.
                 Ok(status) if status.state == State::Holding => self.note(&status).await,
                 Ok(status) if status.state == State::Complete && self.seen.running => self.note(&status).await,
                 Ok(status) if !status.state.moves() => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
@@ -577,8 +583,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// A program that was started again has not met its machine: what is another one, or at another run's job, is not aborted. One that
-    /// cannot be reached now is tried by the abort itself.
+    /// Connects a machine that a restarted program has not seen yet before an abort. Refuses another device, and a
+    /// machine that runs the job of another run. A machine that cannot be reached now is left to the abort itself.
     async fn meet(&mut self) -> Result<(), String> {
         let met = async {
             self.driver.machine().connect().await?;
@@ -607,7 +613,7 @@ impl<B: StationDriver> MachineTask<B> {
 
     async fn reconcile(&mut self, cycle: u32) {
         let Some(armed) = self.armed.clone().filter(|armed| armed.job.number().cycle == cycle) else {
-            // Of what nobody here has prepared the machine cannot be asked, and nothing is concluded.
+            // The machine cannot be asked about a job that this program has not prepared, and nothing is concluded.
             let why = "this program has no preparation of this cycle to ask it for".to_owned();
             let outcome = Reconciliation::Unknown(why);
             return self.tell(Event::Reconciled { device: B::DEVICE, cycle, outcome }).await;
@@ -647,7 +653,7 @@ impl<B: StationDriver> MachineTask<B> {
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Collect, why }).await;
         };
         match self.driver.fetch(job, &self.interrupt).await {
-            // The drive gates the points and tells the cell; this only hands them over.
+            // The drive checks the points and reports to the cell; this only hands them over.
             Ok(fetched) => self.hand_over(fetched).await,
             Err(error) => match unusable(&error) {
                 Some(failure) => {
@@ -660,7 +666,7 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     async fn hand_over(&mut self, fetched: Fetched) {
-        // The drive hears as long as anybody asks.
+        // The drive listens as long as a sender of requests exists.
         let _ = self.reports.send(StationReport { fetched: Some(fetched), ..StationReport::default() }).await;
     }
 
@@ -673,7 +679,7 @@ impl<B: StationDriver> MachineTask<B> {
             }
         };
         match acknowledged.await {
-            // A result that is not there yet is not given back.
+            // A result that does not exist yet is not acknowledged.
             Ok(status) if status.state.moves() || status.state == State::Held => {
                 let (device, why) =
                     (B::DEVICE, format!("{} is still {}", self.driver.machine().name(), at_work(&status)));
@@ -688,7 +694,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Tells that the machine said no, or that it cannot be reached.
+    /// Reports that the machine refused, or that it cannot be reached.
     async fn failed(&mut self, what: Asked, error: DeviceError) {
         if error.is_link() {
             self.lost(&error).await;
@@ -718,7 +724,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Looks at the status, or tries to reach a machine that is lost.
+    /// Polls the status, or tries to reach a lost machine.
     async fn look(&mut self) {
         if self.seen.lost {
             return self.reach().await;
@@ -733,7 +739,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Has a running job's points come while nothing else is asked: an order raises the flag and comes first.
+    /// Reads points of a running job while no other request waits: an order raises the interrupt and comes first.
     async fn read_ahead(&mut self) {
         let Some(armed) = self.armed.as_ref().filter(|_| self.seen.running && !self.seen.ended) else { return };
         let preliminary = self.driver.read_ahead(armed.job, &self.interrupt).await;
@@ -742,7 +748,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Tells what is new of what a person should know.
+    /// Reports changes of the notes for a person.
     async fn pass_on_notes(&mut self) {
         let notes = self.driver.machine().notes();
         let new: Vec<String> = notes.iter().filter(|message| !self.notes.contains(message)).cloned().collect();
@@ -760,7 +766,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
         let reached = async {
             let identity = self.driver.machine().connect().await?;
-            // An abort needs no owner, and neither does seeing where it led.
+            // An abort needs no owner, and neither does the check of its effect.
             if !self.seen.aborting {
                 self.driver.machine().claim().await?;
             }
@@ -783,7 +789,7 @@ impl<B: StationDriver> MachineTask<B> {
         self.seen.next_try = Some(Instant::now() + pause.min(LONGEST_PAUSE));
     }
 
-    /// Tells what has changed.
+    /// Reports the changes since the last status.
     async fn note(&mut self, status: &Status) {
         let before = self.seen.state.replace(status.state);
         self.note_mode(status).await;
@@ -821,7 +827,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Tells when a machine that was seen at this run's job shows that it is at none, or at another one, and tells of no end.
+    /// Reports when a machine that was seen at the job of this run shows no job or another one, and no end.
     async fn note_absence(&mut self, status: &Status) {
         let Seen { running, ended, stopping, clearing, aborting, .. } = self.seen;
         if !running || ended || stopping || clearing || aborting {
@@ -841,7 +847,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Tells when what a machine shows cannot be true together: it says that it is held and gets further, or took a STOP and goes on.
+    /// Reports a contradiction in the status of a machine: it reports HELD but makes progress, or took a STOP and
+    /// continues.
     async fn note_contradiction(&mut self, before: Option<State>, status: &Status) {
         let device = B::DEVICE;
         let is_held = status.state == State::Held && before == Some(State::Held);
@@ -864,7 +871,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Doubts a pass that is called complete before the path is travelled.
+    /// Reports a pass that the grinder calls complete before the path is travelled.
     async fn doubt_early_end(&mut self, status: &Status) {
         let (Device::Grinder, Outcome::Complete, Some((done, total))) = (B::DEVICE, status.outcome, status.progress)
         else {
@@ -876,7 +883,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Tells when a person takes the machine into his hands, and when he gives it back.
+    /// Reports when a machine leaves automatic mode, and when it returns.
     async fn note_mode(&mut self, status: &Status) {
         let Some(manual) = status.automatic.map(|automatic| !automatic) else { return };
         if std::mem::replace(&mut self.seen.manual, manual) == manual {
@@ -892,7 +899,7 @@ impl<B: StationDriver> MachineTask<B> {
         self.tell(event).await;
     }
 
-    /// Tells when a machine without a job leaves its place clear of the part: somebody has moved it there.
+    /// Reports when a machine without a job is no longer clear of the part: a person has moved it.
     async fn note_clear(&mut self, status: &Status) {
         let Some(clear) = status.clear_of_part else { return };
         let before = self.seen.clear.replace(clear);
@@ -918,7 +925,7 @@ impl<B: StationDriver> MachineTask<B> {
         self.tell(event).await;
     }
 
-    /// Tells when a signal leaves its range, and when all have been within theirs for a while.
+    /// Reports when a signal leaves its range, and when all signals have been in range for a while.
     async fn note_signals(&mut self, status: &Status) {
         let flaws: Vec<String> = status.signals.iter().filter_map(SignalValue::flaw).collect();
         let (device, condition) = (B::DEVICE, Condition::Signals);
@@ -946,7 +953,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Tells that the job is over; the record of a pass is read first.
+    /// Reports that the job is over. The record of a pass is read first.
     async fn note_end(&mut self, status: &Status) {
         if self.seen.ended && !self.seen.stopping {
             return;
@@ -965,13 +972,14 @@ impl<B: StationDriver> MachineTask<B> {
         self.end(job_result(status.outcome)).await;
     }
 
-    /// Reads the record of a pass that is over and hands it over; one that cannot be read as that of this job is doubted.
+    /// Reads the record of a finished pass and hands it over. A record that does not belong to this job is reported as
+    /// doubtful.
     ///
     /// # Errors
-    /// A link that is lost, which is told.
+    /// A lost link, which has been reported.
     async fn fetch_record(&mut self) -> Result<(), ()> {
         let (Device::Grinder, Some(armed)) = (B::DEVICE, &self.armed) else { return Ok(()) };
-        // A page or two: nothing is broken off for it, and an abort gives it up.
+        // Short: one or two pages. No interrupt is needed; an abort gives the request up.
         match self.driver.fetch(armed.job, &Interrupt::new()).await {
             Ok(record) => self.hand_over(record).await,
             Err(error) if error.is_link() => {
@@ -1001,7 +1009,7 @@ impl<B: StationDriver> MachineTask<B> {
     }
 }
 
-/// Says what a machine is at.
+/// Describes the state and job of a machine.
 fn at_work(status: &Status) -> String {
     match status.job {
         Some(job) => format!("{} with {job}", status.state),
@@ -1014,15 +1022,15 @@ fn job_result(outcome: Outcome) -> JobResult {
         Outcome::Complete => JobResult::Complete,
         Outcome::Stopped => JobResult::Stopped,
         Outcome::Aborted => JobResult::Aborted,
-        // None told, failed, or one that nobody here knows.
+        // No outcome, failed, or an unknown one.
         _ => JobResult::Failed,
     }
 }
 
-/// Says what a fault means at this machine.
+/// Describes a fault for this machine.
 fn fault_words(device: Device, fault: Fault) -> String {
     match (device, fault) {
-        // A probe that meets material in the air is well; it is the part that is elsewhere.
+        // A probe that meets material where only air should be is not at fault: the part is in another place.
         (Device::Cmm, Fault::Collision) => {
             "the probe met material where only air should be: see how the part lies (turned round, in another seat, another \
              part) and whether the probe is whole, before clearing"
@@ -1032,7 +1040,7 @@ fn fault_words(device: Device, fault: Fault) -> String {
     }
 }
 
-/// A result that came and cannot be used; `None` where it did not come.
+/// Returns the reason if a result arrived but cannot be used. Returns `None` if it did not arrive.
 fn unusable(error: &DeviceError) -> Option<GateFailure> {
     match error {
         DeviceError::NotFinite { .. }
@@ -1055,7 +1063,7 @@ fn mismatch(error: &DeviceError) -> Mismatch {
     }
 }
 
-/// The intent of a START as the journal keeps it.
+/// Intent of a START, as the journal stores it.
 #[derive(Serialize, serde::Deserialize)]
 pub(super) struct Intent {
     pub(super) job: u32,
@@ -1067,7 +1075,7 @@ pub(super) struct Intent {
 }
 
 impl Intent {
-    /// Puts the preparation together again.
+    /// Restores the preparation.
     pub(super) fn armed(&self) -> Armed {
         let job = Job { job: self.job, cycle: self.cycle, digest: self.digest };
         Armed { job, start_sequence: self.start_sequence, token: self.token, boot_id: self.boot_id }

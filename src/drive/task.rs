@@ -1,4 +1,4 @@
-//! What a run is made of, and what is known of each of its cycles.
+//! Task of a run: its fixed data, and the knowledge about each of its cycles.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -23,122 +23,124 @@ use crate::surface::Nominal;
 use super::program::{ProgramError, Programs, set_in_words};
 use super::record::Files;
 
-/// What stays free for the journal and the program of a pass.
+/// Free space that is reserved for the journal and the program of a pass.
 const RESERVE_BYTES: u64 = 16 << 20;
-/// What a measured point takes in all the files of a cycle, and a node of its maps.
+/// Disk space of a measured point in all files of a cycle, and of a node of its maps.
 const POINT_BYTES: u64 = 600;
 const NODE_BYTES: u64 = 250;
 
-/// Everything that does not change during a run.
+/// Data that do not change during a run.
 #[derive(Debug)]
 pub struct Task {
-    /// What the part is called, for people.
+    /// Name of the part, for people.
     pub part: String,
-    /// The nominal surface.
+    /// Nominal surface.
     pub nominal: Arc<Nominal>,
-    /// Where it came from, for the record.
+    /// Source file of the nominal surface, for the record.
     pub nominal_file: PathBuf,
-    /// SHA-256 of what it came from: the identity of the part.
+    /// SHA-256 of the source: identity of the part.
     pub part_identity: [u8; 32],
-    /// Where the probe shall touch; none where the machine has no plan of ours.
+    /// Targets for the probe. Empty if the machine has no plan of this program.
     pub targets: Vec<measuring::Target>,
-    /// How the probe goes about it.
+    /// Parameters of the probing.
     pub probing: Probing,
-    /// The sphere on which the probe is checked.
+    /// Sphere on which the probe is checked.
     pub sphere: Option<Sphere>,
-    /// Where the fixture holds the part.
+    /// Pose of the part in the fixture.
     pub fixture_cmm_from_model: Pose,
-    /// How measured points are registered; the start and the level are set for each cycle.
+    /// Options of the registration. The start and the level are set for each cycle.
     pub registration: Options,
-    /// Whether a registration begins where the fixture holds the part.
+    /// True if a registration starts from the fixture pose.
     pub start_at_fixture: bool,
-    /// What the machine is expected to give; `None` where each result says it itself.
+    /// Expected kind of coordinates; `None` if each result states it.
     pub coordinates: Option<Coordinates>,
-    /// How a map is made.
+    /// Options of the map.
     pub map: MapOptions,
-    /// By what the share of an error that is taken back is chosen.
+    /// Rule for the gain.
     pub gain: GainRule,
-    /// What a pass adds by itself (rms), where the recipe knows it.
+    /// Error (rms) that a pass adds by itself, if the recipe states it.
     pub repeatability_mm: Option<f64>,
-    /// What an earlier run of this part found to come back in every pass.
+    /// Systematic error that an earlier run of this part found in every pass.
     pub learned: Option<Learned>,
-    /// What a run has to have in common with another to learn from it.
+    /// Setting that a run must share with another to learn from it.
     pub setting: String,
-    /// The same but for the cell: what a run of another cell has to have in common with it.
+    /// Setting without the cell: shared with a run of another cell to learn from it.
     pub kind: String,
-    /// What a correction must keep to.
+    /// Limits of a correction.
     pub limits: CorrectionLimits,
-    /// Which parameters of the machine are taken back; none where all is left to the map.
+    /// Parameters of the machine that are compensated; `None` if everything is left to the map.
     pub parameters: Option<TakenBack>,
-    /// Standard uncertainty of where the datum holds the part, in millimetres, and of how it is turned, in radians, where the recipe states it.
+    /// Standard uncertainty of the datum: of the position in mm and of the orientation in rad. `None` if the recipe
+    /// does not state it.
     pub datum: Option<[f64; 2]>,
-    /// What uncertainty of the place of a correction on the part is put up with.
+    /// Tolerated uncertainty of the place of a correction on the part.
     pub place: MapLimits,
-    /// How a pass is ground; level and identity are set for each cycle.
+    /// Parameters of a pass. Level and identity are set for each cycle.
     pub pass: Pass,
-    /// Half the largest PV that is accepted: what lies within it about zero is drawn as in tolerance.
+    /// Half of the largest accepted PV: values within it about zero are drawn as in tolerance.
     pub tolerance_mm: Option<f64>,
-    /// How programs are made, or why there are none.
+    /// Programs, or the reason why there are none.
     pub programs: Result<Programs, PathError>,
-    /// What the tracks of a pass leave between them; unknown where no path can be laid.
+    /// Scallops between the tracks of a pass; `None` if no path can be computed.
     pub scallops: Option<Scallops>,
-    /// Least share of the targets that must be touched.
+    /// Minimum share of the targets that must be touched.
     pub least_found: f64,
-    /// Least and largest temperature of a measurement that is used, where the recipe has a window.
+    /// Minimum and maximum temperature of a usable measurement, in °C, if the recipe has a window.
     pub temperature_c: Option<[f64; 2]>,
-    /// How part and scales grow with their temperature, where the recipe tells it of the part.
+    /// Thermal expansion of part and scales, if the recipe states it for the part.
     pub expansion: Option<Expansion>,
-    /// What the measuring machine does to all points together, as its cell file states it.
+    /// Common error of the measuring machine for all points, as its cell file states it.
     pub machine: MachineUncertainty,
-    /// What is accepted, as the plan of the cell has it.
+    /// Accepted tolerance, as in the plan of the cell.
     pub tolerance: Tolerance,
-    /// How touches are chosen; none where all targets are touched.
+    /// Options of adaptive touches; `None` if all targets are touched.
     pub adaptive: Option<Adaptive>,
-    /// Whether the cell is simulated; everything stored is marked so.
+    /// True if the cell is simulated; all stored data are marked.
     pub simulation: bool,
-    /// Whether people only play the machines: the plan itself may come back as what was measured.
+    /// True if people only play the machines: the plan itself may be returned as the measurement.
     pub rehearsal: bool,
 }
 
-/// Which parameters of the machine are taken back.
+/// Parameters of the machine that are compensated.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TakenBack {
-    /// The tolerance of each that is, in its unit, in the order of [`ParameterKind::ALL`].
+    /// Tolerance of each compensated parameter, in its unit, in the order of [`ParameterKind::ALL`].
     pub tolerances: [Option<f64>; ParameterKind::COUNT],
-    /// How another radius of the wheel comes out on this grinder.
+    /// Effect of another wheel radius on this grinder.
     pub wheel_term: WheelTerm,
-    /// The surface under the nodes of a correction.
+    /// Surface under the nodes of a correction.
     pub nodes: Vec<Contact>,
 }
 
-/// What a measurement goes by whose touches are chosen.
+/// Options of a measurement with adaptive touches.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Adaptive {
-    /// What is accepted, as the plan of the cell has it.
+    /// Accepted tolerance, as in the plan of the cell.
     pub tolerance: Tolerance,
-    /// The probability with which a part that is not in tolerance may be accepted.
+    /// Probability with which a part that is out of tolerance may be accepted.
     pub accepted_risk: f64,
-    /// The most passes of the grinder.
+    /// Maximum number of passes of the grinder.
     pub most_cycles: u32,
 }
 
 impl Adaptive {
-    /// Share of the first touches that is left where one of them finds nothing.
+    /// Share of the first touches that remains if one of them finds nothing.
     pub const ONE_MAY_MISS: f64 = 1.0 - 1.0 / FIRST_BATCH as f64;
-    /// Looks that are taken at a measurement, most often: each may err with its share of the accepted risk.
+    /// Maximum number of evaluations of a measurement. Each may err with its share of the accepted risk.
     const LOOKS: f64 = 5.0;
-    /// Share of the tolerance of the rms to which a form has to be known to be corrected: beside what a pass adds that is next to nothing.
+    /// Maximum uncertainty of the form, as a share of the rms tolerance, for a correction. It is negligible compared
+    /// with what a pass adds.
     const KNOWN: f64 = 0.17;
-    /// An rms that is as hard to keep as a peak to valley of 1.
+    /// Value of the rms that is as hard to achieve as a peak to valley of 1.
     const RMS_OF_PV: f64 = 0.2;
 
-    /// The probability with which one look may err: a share of the accepted risk, and no more than who judges may, so that what a look takes for within
-    /// is accepted.
+    /// Returns the probability with which one evaluation may err: a share of the accepted risk. It is at most that of
+    /// the final judgement, so that a part that an evaluation finds in tolerance is accepted.
     pub fn look_risk(&self) -> f64 {
         (self.accepted_risk / Self::LOOKS).min(1.0 - self.tolerance.probability)
     }
 
-    /// What a measurement after a pass is to tell.
+    /// Returns the criteria for a measurement after a pass.
     pub fn purpose(&self, may_grind: bool) -> StoppingCriteria {
         let Tolerance { pv_mm, rms_mm, pv_of, .. } = self.tolerance;
         let (pv_mm, pv_most_points_mm) = match pv_of {
@@ -150,7 +152,7 @@ impl Adaptive {
     }
 }
 
-/// How the probe goes about it.
+/// Parameters of the probing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[allow(missing_docs)]
 pub struct Probing {
@@ -161,7 +163,7 @@ pub struct Probing {
     pub safe_height_mm: f64,
 }
 
-/// The reference sphere, in the CMM frame.
+/// Reference sphere, in the CMM frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[allow(missing_docs)]
 pub struct Sphere {
@@ -170,37 +172,37 @@ pub struct Sphere {
     pub points: usize,
 }
 
-/// What is known of one cycle.
+/// Knowledge about one cycle.
 #[derive(Clone, Debug)]
 pub(super) struct Cycle {
     pub(super) correction: Arc<Correction>,
     pub(super) plan: Option<Arc<Plan>>,
-    /// Which batch of touches the plan is of, and which targets it has, where they are chosen.
+    /// Batch of touches of the plan, and its targets, if touches are chosen.
     pub(super) batch: u32,
     pub(super) asked: Arc<Vec<usize>>,
-    /// The targets of the batch that comes next.
+    /// Targets of the next batch.
     pub(super) next: Option<Arc<Vec<usize>>>,
-    /// What is to be touched again, where all targets are touched at once.
+    /// Touches to repeat, if all targets are touched at once.
     pub(super) again: Option<Arc<Again>>,
     pub(super) points: Option<Arc<Points>>,
     pub(super) registration: Option<Arc<Registration>>,
     pub(super) form: Option<Arc<Form>>,
-    /// What its points alone tell of the field of its error; none where they show none.
+    /// Hyperparameters of the field of its error from its points alone. `None` if they show no field.
     pub(super) field: Option<Hyperparameters>,
     pub(super) error: Option<Arc<ErrorMap>>,
-    /// What is known of the grinder with this cycle taken in.
+    /// State of the learning with this cycle included.
     pub(super) known: Option<Arc<LearningState>>,
-    /// What parameters of the machine make of the error.
+    /// Parameters of the machine that explain the error.
     pub(super) parameters: Option<Arc<Parameters>>,
-    /// What of it is taken back by telling them to the next pass.
+    /// Parameter corrections for the next pass.
     pub(super) set: Option<Arc<Set>>,
     pub(super) figures: Option<Figures>,
-    /// How often it was judged; a measurement that a gate refused never was, and tells nothing of the grinder.
+    /// Number of judgements. 0 for a measurement that a gate refused, which carries no information about the grinder.
     pub(super) judgements: u32,
 }
 
 impl Cycle {
-    /// A cycle of which nothing is known but how its pass is corrected.
+    /// Returns a cycle in which only the correction of its pass is known.
     pub(super) fn new(correction: Correction) -> Self {
         Self {
             correction: Arc::new(correction),
@@ -226,7 +228,7 @@ impl Cycle {
         self.judgements > 0
     }
 
-    /// Takes what a computation found.
+    /// Stores the result of a computation.
     pub(super) fn take(&mut self, product: Product) {
         match product {
             Product::Points(points) => self.points = Some(Arc::new(points)),
@@ -249,69 +251,70 @@ impl Cycle {
     }
 }
 
-/// What a computation leaves for those that follow, besides its event and its files.
+/// Result of a computation for the following ones, in addition to its event and its files.
 pub(super) enum Product {
     Nothing,
     Points(Points),
     Registered(Box<Registered>),
-    /// The correction of the next cycle.
+    /// Correction of the next cycle.
     Correction(Correction),
 }
 
-/// What a registration gives besides its event.
+/// Result of a registration, in addition to its event.
 pub(super) struct Registered {
     pub(super) registration: Registration,
-    /// What the model of the error says of it; none where it can say nothing.
+    /// Form from the model of the error; `None` if the model fails.
     pub(super) form: Option<Form>,
-    /// What the points alone tell of the field of the error.
+    /// Hyperparameters of the error field from the points alone.
     pub(super) field: Option<Hyperparameters>,
     pub(super) error: Option<ErrorMap>,
     pub(super) known: Option<LearningState>,
     pub(super) parameters: Option<Parameters>,
     pub(super) set: Option<Set>,
     pub(super) figures: Figures,
-    /// The targets to touch next; none where enough is known.
+    /// Next targets to touch; `None` if enough is known.
     pub(super) next: Option<Vec<usize>>,
-    /// What can be touched again.
+    /// Touches that can be repeated.
     pub(super) again: Option<Again>,
 }
 
-/// Touches that no neighbour agrees with, to be made again with a few around each.
+/// Outliers to be touched again, with a few targets around each.
 #[derive(Clone, Debug)]
 pub(super) struct Again {
-    /// The points whose touches are made again, by their numbers.
+    /// Numbers of the points to touch again.
     pub(super) points: Vec<usize>,
-    /// Where: a target for each of these points, and then those around.
+    /// Targets: one for each of these points, then those around them.
     pub(super) targets: Vec<measuring::Target>,
 }
 
-/// The points of a measurement that may be used.
+/// Usable points of a measurement.
 #[derive(Clone, Debug)]
 pub(super) struct Points {
     pub(super) part: Vec<Point>,
     pub(super) sphere: Vec<Point>,
-    /// Radius that the probe really has, where a sphere was touched.
+    /// True radius of the probe, if a sphere was touched.
     pub(super) radius_mm: Option<f64>,
-    /// Centres of the probe, or points of contact.
+    /// Kind of coordinates: centres of the probe, or contact points.
     pub(super) coordinates: Coordinates,
-    /// Standard uncertainty of that; 0 where the radius is the recipe's, which states none.
+    /// Standard uncertainty of the radius; 0 if it is the radius of the recipe, which states none.
     pub(super) radius_sigma_mm: f64,
-    /// How far the probe scatters by what it found on the sphere, and to what share of it that is known; 0 where none was touched.
+    /// Standard deviation of the probe's noise from the sphere, and the relative uncertainty of that. 0 if no sphere
+    /// was touched.
     pub(super) probe_scatter_mm: [f64; 2],
-    /// Temperature of the part in degrees Celsius, where the machine told it.
+    /// Temperature of the part in °C, if the machine reported it.
     pub(super) temperature_c: Option<f64>,
-    /// Which targets were tried, batch by batch, and which each point of the part is of; empty where all are touched at once.
+    /// Targets tried, batch by batch, and the target of each point of the part. Empty if all are touched at once.
     pub(super) tried: Vec<Vec<usize>>,
     pub(super) of: Vec<usize>,
-    /// How often places were touched again that no neighbour agreed with.
+    /// Number of rounds in which outliers were touched again.
     pub(super) rounds: u32,
 }
 
 impl Task {
-    /// Begins with what an earlier part told of the grinder: the first pass is ground with its correction.
+    /// Starts from what an earlier part learned about the grinder: the first pass is ground with its correction.
     ///
     /// # Errors
-    /// A first correction beyond the limits of this run; the task is left as it was.
+    /// A first correction beyond the limits of this run; the task is unchanged.
     pub fn begin_with(&mut self, learned: Learned) -> Result<(), NextPassError> {
         let before = self.learned.replace(learned);
         let within = self.first_correction().removed_mm(&self.limits).map_err(|error| match error {
@@ -326,13 +329,14 @@ impl Task {
         within.map(|_| ())
     }
 
-    /// Makes what this task can begin with of what other cells found, as far as machines are alike; `None` where they tell nothing of it.
+    /// Builds the initial state of this task from the results of other cells, as far as the machines are alike. Returns
+    /// `None` if they contribute nothing.
     pub fn from_others(&self, others: &[(CellRun, Learned)], alike: &Alike) -> Option<Learned> {
         let of_this = (self.simulation, self.setting.clone());
         Learned::from_others(others, alike, of_this, (&self.fresh(), self.uncorrected()))
     }
 
-    /// Writes correction and program of a first pass that begins with what was learned; returns the names of the files.
+    /// Writes correction and program of a first pass that starts from a learned state; returns the names of the files.
     ///
     /// # Errors
     /// Those of [`Task::first_path`], and files that cannot be written.
@@ -345,7 +349,7 @@ impl Task {
         Ok(files.made())
     }
 
-    /// Returns the correction of the first pass: none, or what an earlier part left.
+    /// Returns the correction of the first pass: none, or that of an earlier part.
     pub fn first_correction(&self) -> Correction {
         let none = self.uncorrected();
         match &self.learned {
@@ -359,16 +363,17 @@ impl Task {
         Correction::none(grid, self.limits.allowance_mm)
     }
 
-    /// Returns how much room a cycle takes on the disk, as far as it can be told beforehand, and the journal beside it.
+    /// Returns the estimated disk space of a cycle, including the journal.
     pub fn cycle_bytes(&self) -> u64 {
         let (points, nodes) = (self.targets.len() as u64, self.uncorrected().grid.len() as u64);
         RESERVE_BYTES + POINT_BYTES * points + NODE_BYTES * nodes
     }
 
-    /// Lays the path of the first pass; `None` where only the grinder's controller can, and `programs` says why.
+    /// Computes the path of the first pass. Returns `None` if only the controller of the grinder can; `programs` gives
+    /// the reason.
     ///
     /// # Errors
-    /// A surface that the wheel cannot grind, and limits of the grinder that the path goes beyond.
+    /// A surface that the wheel cannot grind, and limits of the grinder that the path exceeds.
     pub fn first_path(&self) -> Result<Option<(ToolPath, Summary)>, PathError> {
         match &self.programs {
             Ok(programs) => programs.path(&self.first_correction()).map(Some),
@@ -377,12 +382,12 @@ impl Task {
         }
     }
 
-    /// Returns the rms of the scallops, as far as they are known.
+    /// Returns the rms of the scallops, as far as it is known; 0 if not.
     pub(super) fn scallops_rms_mm(&self) -> f64 {
         self.scallops.map_or(0.0, |scallops| scallops.rms_mm)
     }
 
-    /// What is known of the grinder before the first pass.
+    /// Returns the state of the learning before the first pass.
     pub(super) fn beginning(&self) -> LearningState {
         self.learned.as_ref().map_or_else(|| self.fresh(), |learned| learned.known.for_next_part())
     }
@@ -393,10 +398,10 @@ impl Task {
         LearningState::new(self.gain, &self.map, size_mm, self.repeatability_mm)
     }
 
-    /// Registers points to the surface offset by a radius, and returns the options that it was done with.
+    /// Registers points to the surface offset by a radius. Returns the registration and the options used.
     ///
-    /// A search leaves the part anywhere along a direction that the surface cannot see, and a correction would be ground in there. Only
-    /// the fixture knows better, so that is begun at then.
+    /// A search may leave the part anywhere along a direction that the surface does not determine, and a correction
+    /// would be ground at that place. If there is such a direction, starts again from the fixture pose.
     ///
     /// # Errors
     /// Those of [`register`].
@@ -408,7 +413,7 @@ impl Task {
         self.register_from(points, probe_radius_mm, self.start_at_fixture)
     }
 
-    /// Does the same, from where the fixture holds the part if that is wanted.
+    /// Registers in the same way, and starts from the fixture pose if `start_at_fixture` is true.
     ///
     /// # Errors
     /// Those of [`register`].
@@ -420,7 +425,7 @@ impl Task {
     ) -> Result<(Registration, Options), RegistrationError> {
         let at_fixture = Start::Pose(self.fixture_cmm_from_model);
         let start = if start_at_fixture { at_fixture } else { Start::Search };
-        // Without a ball and at the nominal surface, or below it by the last in-feed, there is no offset: the points lie on the surface.
+        // Contact points, or a level below the nominal surface: there is no offset, so the points lie on the surface.
         let method = if probe_radius_mm == 0.0 { Method::Contact } else { self.registration.method };
         let options = Options { probe_radius_mm, method, start, ..self.registration };
         let found = register(&self.nominal, points, &options)?;
@@ -431,7 +436,8 @@ impl Task {
         Ok((register(&self.nominal, points, &options)?, options))
     }
 
-    /// Standard uncertainties of where the fixture holds the part, where it holds it at all; 0 where nobody states them.
+    /// Returns the standard uncertainties of the pose in the fixture, if it locks any direction; 0 for a direction
+    /// whose uncertainty is not stated. Order: x, y, z in mm, rx, ry, rz in rad.
     pub fn held(&self) -> Option<[f64; 6]> {
         let [shift_mm, turn_rad] = self.datum.unwrap_or_default();
         let of = |k: usize| if k < 3 { shift_mm } else { turn_rad };
@@ -439,7 +445,7 @@ impl Task {
         locked.contains(&true).then(|| std::array::from_fn(|k| if locked[k] { of(k) } else { 0.0 }))
     }
 
-    /// What is asked of the separation of parameters, for a pass that was told these.
+    /// Returns the options for the separation of parameters, for a pass with these parameter corrections.
     pub fn parameter_options(&self, told: Option<&Set>) -> ParameterOptions {
         ParameterOptions {
             free_motions: self.registration.locked.map(|locked| !locked),
@@ -450,12 +456,12 @@ impl Task {
         }
     }
 
-    /// Returns the radius of the wheel that a pass is told: that of the recipe, or what measurements made of it.
+    /// Returns the radius of the wheel for a pass: that of the recipe, or corrected by measurements.
     pub fn wheel_radius_mm(&self, told: Option<&Set>) -> f64 {
         self.pass.wheel_radius_mm + told.map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
 
-    /// Returns the identity of the map that a pass is given.
+    /// Returns the identity of the map of a pass.
     pub fn map_identity(&self, correction: &Correction) -> [u8; 32] {
         self.payloads(correction).0.identity()
     }
@@ -472,22 +478,24 @@ impl Task {
         (map, Pass { wheel_radius_mm, ..pass })
     }
 
-    /// Lays the plan: the reference sphere first, then the part where it was found last, at the level it was ground to.
+    /// Creates the plan: the reference sphere first, then the part at the last measured pose and at the level to which
+    /// it was ground.
     ///
-    /// Where the part may have been seated anew, a few targets as far apart as the part has them come first, and slowly: what lies
-    /// otherwise than expected is met at them.
+    /// If the part may have been clamped again, a few targets that are as far apart as possible come first, at low
+    /// speed. They reveal a part in another place than expected.
     pub fn plan(&self, level_mm: f64, cmm_from_model: &Pose, seated_anew: bool) -> Plan {
         let first = if seated_anew { farthest_points(&self.places(), CAREFUL_TARGETS) } else { Vec::new() };
         let rest = (0..self.targets.len()).filter(|k| !first.contains(k)).collect();
         self.plan_of(level_mm, cmm_from_model, (first, rest), true)
     }
 
-    /// The targets as the model of the error takes them.
+    /// Returns the targets in the form that the model of the error needs.
     pub(super) fn places(&self) -> Vec<(Point, Vector)> {
         self.targets.iter().map(|target| (target.point, target.normal)).collect()
     }
 
-    /// Lays a plan of some targets, the first of them slowly; the reference sphere, where it is wanted, between them.
+    /// Creates a plan of some targets, the first group at low speed. The reference sphere, if wanted, comes between the
+    /// groups.
     pub(super) fn plan_of(
         &self,
         level_mm: f64,
@@ -499,7 +507,7 @@ impl Task {
         self.plan_at(level_mm, cmm_from_model, (first, rest), with_sphere)
     }
 
-    /// Does the same for targets wherever they are.
+    /// Creates a plan in the same way for targets at any place.
     pub(super) fn plan_at(
         &self,
         level_mm: f64,
@@ -529,7 +537,7 @@ impl Task {
         Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful }
     }
 
-    /// Writes the correction of a pass beside the one that it replaces.
+    /// Writes the correction of a pass, with the identity of the one that it replaces.
     pub(super) fn save_correction(
         &self,
         files: &mut Files,
@@ -542,11 +550,12 @@ impl Task {
         write_correction(&files.place("correction.csv"), correction, (&identities, &set), self.simulation)
     }
 
-    /// Writes the program of the next pass, if there is one, and returns why not all of it is there: a pass without it can be ground all the
-    /// same, as the grinder gets the map.
+    /// Writes the program of the next pass, if there is one. Returns the reason if a part of it is missing. A pass can
+    /// be ground without it, because the grinder gets the map.
     ///
     /// # Errors
-    /// A surface that the wheel cannot grind, limits of the grinder that the path goes beyond, files that cannot be written.
+    /// A surface that the wheel cannot grind, limits of the grinder that the path exceeds, files that cannot be
+    /// written.
     pub(super) fn save_program(
         &self,
         files: &mut Files,
@@ -560,7 +569,7 @@ impl Task {
     }
 }
 
-/// The grid of the corrections of a part with these least and most x and y.
+/// Returns the grid of the corrections of a part with these minimum and maximum x and y.
 pub(crate) fn correction_grid([x_mm, y_mm]: [[f64; 2]; 2], spacing_mm: f64) -> Grid {
     let corners = [[x_mm[0], y_mm[0]], [x_mm[1], y_mm[1]]];
     Grid::over(corners.into_iter(), spacing_mm).unwrap_or(Grid {
@@ -571,17 +580,17 @@ pub(crate) fn correction_grid([x_mm, y_mm]: [[f64; 2]; 2], spacing_mm: f64) -> G
     })
 }
 
-/// With so many targets a plan begins where the part may have been seated anew.
+/// Number of targets with which a plan begins if the part may have been clamped again.
 const CAREFUL_TARGETS: usize = 9;
-/// At this share of the recipe's speed.
+/// Share of the recipe's speed for these targets.
 const CAREFUL_SHARE: f64 = 0.2;
 
-/// The points that took part in a registration.
+/// Returns the points used in a registration.
 pub(super) fn used(found: &Registration) -> impl Iterator<Item = &Deviation> {
     found.deviations.iter().filter(|d| d.status == PointStatus::Used)
 }
 
-/// What they deviate, over the plane of the model frame.
+/// Returns their deviations at x and y of the model frame.
 pub(super) fn readings(found: &Registration) -> Vec<Sample> {
     used(found).map(|d| Sample { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect()
 }

@@ -1,4 +1,4 @@
-//! A measurement whose touches are chosen: what is known after a batch, and which targets are next.
+//! Adaptive measurement, in which the touches are chosen: evaluation after a batch, and choice of the next targets.
 
 use super::task::{Adaptive, Again, Cycle, Points, Task};
 use crate::compensation::{ErrorMap, told_map};
@@ -11,18 +11,19 @@ use crate::model::{
 use crate::registration::{Deviation, PointStatus, Registration};
 use crate::surface::{OffsetSurface, Place, Side};
 
-// Behind the most batches comes one of all that is left, and a machine must not take it for another.
+// After the maximum number of batches follows one with all remaining targets. The batch numbers must be unique.
 const _: () = assert!(MAX_BATCHES < Number::BATCHES - 1);
 
-/// What a look told.
+/// Result of an evaluation.
 pub(super) struct Looked {
-    /// The form over the whole pattern; the reason where there is none.
+    /// Form over the whole pattern, or the reason why there is none.
     pub(super) form: Result<Form, String>,
-    /// The targets that are next, and why; none where enough is known.
+    /// Next targets with the reason, or `None` if enough is known.
     pub(super) next: Option<(Vec<usize>, &'static str)>,
 }
 
-/// Looks at what was touched so far. After the first batch, which the gates look at, so many more are asked for that a look can say something.
+/// Evaluates the touches so far. After the first batch, which the gates check, asks for enough further targets that an
+/// evaluation can decide.
 pub(super) fn look(
     task: &Task,
     adaptive: &Adaptive,
@@ -49,7 +50,7 @@ pub(super) fn look(
             let next = (!look.next.is_empty()).then(|| (look.next, in_words(look.reason)));
             Looked { form: Ok(look.form), next }
         }
-        // What no model can be made of is touched everywhere.
+        // If no model can be fitted, touch every target.
         Err(error) => {
             let rest: Vec<usize> = open((0..places.len()).collect());
             let next = (!rest.is_empty()).then_some((rest, "no model can be made of what was found"));
@@ -58,23 +59,24 @@ pub(super) fn look(
     }
 }
 
-/// Returns the touches that no neighbour agrees with, and a few around each, to be made again; none where the machine has no plan of ours, where
-/// there are none, and where they are too many to be touches gone wrong.
+/// Returns the outliers and a few targets around each, to be touched again. Returns `None` if the machine has no plan
+/// of this program, if there are no outliers, or if they are too many to be bad touches.
 ///
-/// Those around lie on the way to the nearest other points that were touched: wherever two of them are, the probe can be between.
+/// The targets around lie on the way to the nearest other touched points: if the probe can touch two points, it can
+/// also reach the places between them.
 pub(super) fn again(task: &Task, found: &Registration, points: &Points) -> Option<Again> {
     const MOST: usize = 20;
     const AROUND: usize = 4;
-    /// On the way to the neighbour.
+    /// Share of the way to the neighbour.
     const SHARE: f64 = 0.4;
-    /// So near the direction of another one a neighbour is on the same way (as a cosine).
+    /// Cosine of the angle between two directions, above which a neighbour is in the same direction as another one.
     const SAME_WAY: f64 = 0.7;
     let alone: Vec<usize> = found.left_out().map(|(k, _)| k).collect();
     if task.targets.is_empty() || alone.is_empty() || alone.len() > MOST || points.rounds + 2 >= Number::BATCHES {
         return None;
     }
     let on_part: Vec<&Deviation> = found.deviations.iter().filter(|d| d.status != PointStatus::OffPart).collect();
-    // The nominal contact point: how far the touch was off is no place on the part.
+    // Nominal contact point: the deviation of the touch is not a place on the part.
     let foot = |d: &Deviation| d.point - d.normal * d.deviation_mm;
     let mut targets: Vec<Target> = Vec::new();
     let mut around: Vec<Target> = Vec::new();
@@ -99,7 +101,7 @@ pub(super) fn again(task: &Task, found: &Registration, points: &Points) -> Optio
     Some(Again { points: alone, targets })
 }
 
-/// Lays a target onto the nominal surface, along its normal.
+/// Projects a target onto the nominal surface, along its normal.
 fn on_nominal(task: &Task, near: &Target) -> Target {
     match OffsetSurface::new(&task.nominal, 0.0, Side::Normal) {
         Ok(surface) => {
@@ -127,7 +129,7 @@ fn in_words(why: Reason) -> &'static str {
     }
 }
 
-/// Lays the form on the grid of the error map.
+/// Interpolates the form on the grid of the error map.
 pub(super) fn map(task: &Task, form: &Form) -> Option<ErrorMap> {
     let of = |p: &model::FormPoint| (Sample { at_mm: p.at_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
     let told: Vec<_> = form.points.iter().map(of).collect();

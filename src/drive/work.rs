@@ -1,7 +1,7 @@
-//! What is computed between a measurement and the next pass: plan, gates, registration, map, correction.
+//! Computations between a measurement and the next pass: plan, gates, registration, map, correction.
 //!
-//! Everything here blocks and is called off the asynchronous threads; what it needs is shared, what it returns is the event that
-//! the cell gets and the files for the run folder.
+//! All functions here block and run off the asynchronous threads. They share their inputs. They return the event for
+//! the cell and write the files of the run folder.
 
 use std::borrow::Cow;
 use std::collections::HashSet;
@@ -31,7 +31,7 @@ use super::record::{Files, Unfinished, unfinished};
 use super::task::{Again, Cycle, Points, Product, Registered, Task, readings, used};
 use super::touches;
 
-/// Looks whether the measurement of a cycle may be used, and writes its points.
+/// Checks if the measurement of a cycle can be used, and writes its points.
 pub(super) fn gate_cycle(
     task: &Task,
     files: &mut Files,
@@ -89,9 +89,10 @@ pub(super) fn gate_cycle(
     (Event::Collected { cycle: number, targets: planned.max(found), found, gate }, product)
 }
 
-/// Takes touches that were made again in place of what they were, and those around beside them; returns how many were found.
+/// Replaces the touches that were repeated and adds those around them. Returns the points and the number of touches
+/// found.
 ///
-/// What finds nothing leaves what was there: nothing but a touch replaces a touch.
+/// A miss leaves the old touch in place: only a touch replaces a touch.
 fn touched_again(again: &Again, points: &Points, measurement: &Measurement) -> (Points, u32) {
     let mut all = points.clone();
     all.rounds += 1;
@@ -106,7 +107,8 @@ fn touched_again(again: &Again, points: &Points, measurement: &Measurement) -> (
     (all, found)
 }
 
-/// Returns what was touched of the part and of the reference sphere. A machine without a plan of ours gives what the operator took.
+/// Returns the touched points of the part and of the reference sphere. A machine without a plan of this program gives
+/// the points that the operator took.
 fn touched(plan: &Plan, planned: u32, measurement: &Measurement) -> [Vec<Point>; 2] {
     let taken = measurement.points.iter().filter(|p| p.status == PointStatus::Touched).map(|p| p.at_mm.into());
     let of = |kind: TargetKind| -> Vec<Point> {
@@ -131,7 +133,7 @@ fn gate(
     }
     let ball = radius(task, &sphere)?;
     let (found, share) = (part.len(), part.len() as f64 / f64::from(planned.max(1)));
-    // Of a few touches one may miss.
+    // In a small batch one touch may miss.
     let spared = if tried.is_empty() { 0.0 } else { 1.0 / f64::from(planned.max(1)) };
     if planned > 0 && share + spared < task.least_found {
         let limit = 100.0 * task.least_found;
@@ -156,25 +158,26 @@ fn gate(
     })
 }
 
-/// How far a probe scatters by what it found on a sphere, of which the fit took four numbers, and to what share of it that is known.
+/// Returns the standard deviation of the probe's noise from the residuals on a sphere, and its relative uncertainty.
+/// The fit uses four degrees of freedom.
 fn scatter(rms_mm: f64, points: usize) -> [f64; 2] {
     const FITTED: f64 = 4.0;
     let free = (points as f64 - FITTED).max(1.0);
     [rms_mm * (points as f64 / free).sqrt(), 1.0 / (2.0 * free).sqrt()]
 }
 
-/// Which targets were tried and which were found, where they are chosen batch by batch.
+/// Targets that were tried and targets that were found, if they are chosen batch by batch.
 #[derive(Default, Serialize, Deserialize)]
 pub(super) struct Touches {
     simulation: bool,
-    /// The targets of each batch, by their places in the pattern.
+    /// Targets of each batch, by their positions in the pattern.
     tried: Vec<Vec<usize>>,
-    /// The target of each point that was found.
+    /// Target of each point that was found.
     of: Vec<usize>,
 }
 
 impl Touches {
-    /// Adds a batch to what was touched before.
+    /// Adds a batch to the touches so far.
     fn and(so_far: Option<&Points>, asked: &[usize], plan: &Plan, measurement: &Measurement) -> Self {
         let (mut tried, mut of) = so_far.map(|points| (points.tried.clone(), points.of.clone())).unwrap_or_default();
         if !asked.is_empty() {
@@ -187,7 +190,7 @@ impl Touches {
     }
 }
 
-/// Returns the points of a measurement that a gate has let through before, from its files.
+/// Returns the points of a measurement that passed the gate earlier, from its files.
 pub(super) fn recorded_points(
     task: &Task,
     part: Vec<Point>,
@@ -199,10 +202,10 @@ pub(super) fn recorded_points(
     Ok(Points { rounds, ..points })
 }
 
-/// Share of its stated radius by which a qualified probe may differ: more is another stylus.
+/// Maximum relative difference of a qualified probe's radius from the stated one. A larger one means another stylus.
 const PROBE_SHARE: f64 = 0.01;
 
-/// A result that belongs to another plan, or whose numbers cannot be.
+/// Returns why a result is foreign or broken: another plan, or values that are impossible.
 fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFailure> {
     if measurement.plan_identity != plan.identity() {
         return Some(GateFailure::Foreign("the machine names another plan than the one it was given".into()));
@@ -241,14 +244,14 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
     }
 }
 
-/// Fewer touches than these may be alike by chance, where a machine counts in coarse steps.
+/// Minimum number of touches for the comparison: fewer may be equal by chance, if a machine reports coarse steps.
 const ALIKE_BY_CHANCE: usize = 8;
 
-/// The result of an earlier measurement, given once more: no probe finds every place again to the last bit.
+/// Returns a failure if a machine has given its earlier result again. No probe repeats every place to the last bit.
 fn given_again(task: &Task, earlier: Option<&(u32, Arc<Points>)>, measurement: &Measurement) -> Option<GateFailure> {
     let (number, points) = earlier.filter(|_| !task.rehearsal)?;
     let touched = || measurement.points.iter().filter(|point| point.status == PointStatus::Touched);
-    // In whatever order the plan had them, and with those of the reference sphere among them.
+    // Ignore the order of the plan and the points of the reference sphere.
     let bits = |at_mm: [f64; 3]| at_mm.map(f64::to_bits);
     let old: HashSet<_> = points.part.iter().map(|point| bits([point.x, point.y, point.z])).collect();
     let is_same = touched().filter(|point| old.contains(&bits(point.at_mm))).count() >= old.len();
@@ -260,7 +263,7 @@ fn given_again(task: &Task, earlier: Option<&(u32, Arc<Points>)>, measurement: &
     })
 }
 
-/// A temperature outside the recipe's window, or one that is not told where there is a window.
+/// Returns a failure if the temperature is outside the window of the recipe, or is missing when there is a window.
 fn out_of_window(task: &Task, measurement: &Measurement) -> Option<GateFailure> {
     if task.expansion.is_some() && measurement.temperature_c.is_none() {
         let message = "the measurement does not say its temperature, by which the expansion of the part is taken off (part.expansion_um_m_k)";
@@ -275,7 +278,8 @@ fn out_of_window(task: &Task, measurement: &Measurement) -> Option<GateFailure> 
     }
 }
 
-/// Finds the radius of the probe, its standard uncertainty and how far the points lie from the reference sphere: it tells contact points and inches from centres in millimetres.
+/// Fits the probe radius on the reference sphere. Returns the radius, its standard uncertainty and the rms residual of
+/// the points. Detects contact points and inches in place of centres in millimetres.
 fn radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 3]>, GateFailure> {
     let Some(sphere) = task.sphere else { return Ok(None) };
     let fit = fit_sphere(points).map_err(|error| GateFailure::Broken(error.to_string()))?;
@@ -290,7 +294,7 @@ fn radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 3]>, GateFailure
     Ok(Some([found, fit.radius_sigma_mm, fit.rms_mm]))
 }
 
-/// Registers the points of a cycle and writes what was found; `before` is the last measurement of an earlier pass that was judged.
+/// Registers the points of a cycle and writes the result. `before` is the last judged measurement of an earlier pass.
 pub(super) fn register_cycle(
     task: &Task,
     files: &mut Files,
@@ -317,7 +321,7 @@ fn registered(
 ) -> Result<Registered, Unfinished<String>> {
     let none = || Unfinished::For("there are no points of this cycle".to_owned());
     let points = cycle.points.as_ref().ok_or_else(none)?;
-    // The surface wanted by this pass stands above the nominal one by its level, and the ball rolls on that.
+    // The target surface of this pass is above the nominal one by its level, and the ball rolls on it.
     let radius_mm = points.radius_mm.unwrap_or(task.probing.probe_radius_mm);
     let ball_mm = if points.coordinates == Coordinates::Contacts { 0.0 } else { radius_mm };
     let grown = task.expansion.as_ref().zip(points.temperature_c);
@@ -329,7 +333,7 @@ fn registered(
         None => (ball_mm, Cow::Borrowed(&points.part), 0.0),
     };
     let probe_radius_mm = (ball_mm + cycle.correction.level_mm).max(0.0);
-    // The first few touches say whether it is the right part, where it should be; anything more would be guessed from them.
+    // The first few touches show only if the right part is in the right place. A search on them would be a guess.
     let at_fixture = task.start_at_fixture || points.tried.len() == 1;
     let (mut found, options) = task.register_from(&part, probe_radius_mm, at_fixture).map_err(unfinished)?;
     if let Some(why) = found.no_verdict() {
@@ -364,7 +368,7 @@ fn registered(
         }
         save_form(&files.folder(), form, &found, Some(task.simulation)).map_err(unfinished)?;
     }
-    // Where touches were chosen the form between them is told, and where they were not it is what was found.
+    // If touches were chosen, the map is the estimated form between them. Otherwise it is the filtered deviations.
     let error = match &form {
         Ok(form) if looked_at => touches::map(task, form),
         Err(_) if looked_at => None,
@@ -373,10 +377,11 @@ fn registered(
     maps::save_figures(task, files, error.as_ref(), &found, form.as_ref().ok()).map_err(unfinished)?;
     let contacts = maps::contacts(&found);
     let told = maps::parameters(task, files, cycle, &contacts).map_err(unfinished)?;
-    // Every measurement leaves its map, whatever becomes of the correction.
+    // Every measurement leaves its map, whatever happens to the correction.
     error.as_ref().map_or(Ok(()), |map| maps::save(task, files, (number, cycle), map, &found))?;
     let answer = error.as_ref().and_then(|error| answer(before?, cycle, &found, error));
-    // What the first pass of a run leaves tells the machine's parameters; what a later one leaves beside is wear and drift, and goes by the learning.
+    // Only the first pass of a run reveals parameters of the machine. Later changes are wear and drift, which the
+    // learning covers.
     let parameters = told.filter(|_| before.is_none());
     let offered: Vec<String> = parameters.iter().flat_map(offered).collect();
     let set = match &parameters {
@@ -401,7 +406,7 @@ fn registered(
     figures.touch_on =
         next.as_ref().map(|(next, why)| Box::new(TouchOn { targets: next.len() as u32, why: (*why).to_owned() }));
     if next.is_some() && form.is_err() {
-        // The first few touches have six motions taken off: what is left says nothing of a form, however it is called.
+        // The first few touches have six motions fitted: their residuals say nothing about the form.
         figures.form = None;
     }
     let next = next.map(|(next, _)| next);
@@ -409,7 +414,7 @@ fn registered(
     if let Some(left_out) = figures.left_out.as_mut() {
         left_out.again = again.is_some();
     }
-    // Before anybody is called the machine looks whether it was the touch.
+    // Before a person is called, the machine checks the touches by repeating them.
     let again = again.filter(|_| task.tolerance.left_out_decides(&figures));
     if let Some(again) = again.as_ref().filter(|_| points.rounds == 0) {
         let targets = again.targets.len() as u32;
@@ -420,13 +425,13 @@ fn registered(
     Ok(Registered { registration: found, form: form.ok(), field, error, known, parameters, set, figures, next, again })
 }
 
-/// What is said of the parameters that are clear.
+/// Returns the messages for the offered parameters.
 fn offered(told: &compensation::Parameters) -> impl Iterator<Item = String> {
     told.found.iter().filter(|p| p.offered).map(|p| p.message.clone())
 }
 
-/// What is expected of the field of the error of a cycle: what earlier parts taught of passes of its kind, or else the pass before it in this run, if it was
-/// of the same kind.
+/// Returns the prior for the error field of a cycle: from earlier parts for passes of its kind, or else from the
+/// previous pass of this run if it is of the same kind.
 fn priors(task: &Task, cycle: &Cycle, before: Option<&Cycle>) -> Option<Prior> {
     let is_corrected = !cycle.correction.is_none();
     let taught = task.learned.as_ref().and_then(|learned| learned.fields.fit(is_corrected));
@@ -435,7 +440,7 @@ fn priors(task: &Task, cycle: &Cycle, before: Option<&Cycle>) -> Option<Prior> {
     taught.or_else(of_this_part).map(|lesson| lesson.priors())
 }
 
-/// Takes a measured pass into what is known of the grinder.
+/// Updates the state of the learning with a measured pass.
 fn learned_from(
     task: &Task,
     cycle: &Cycle,
@@ -475,13 +480,13 @@ fn figures(
     let verdict = &found.verdict;
     let moved = task.fixture_cmm_from_model.inverse() * found.cmm_from_model;
     let outliers = found.deviations.iter().filter(|d| d.status == Fate::Outlier).count() as u32;
-    // What the filter takes out is what a point scatters by: noise of the probe and the finest texture.
+    // The filter removes the noise of a point: noise of the probe and the finest texture.
     let filtered_mm = error.map_or(verdict.residual_sigma_mm, |map| map.point_sigma_mm);
     let scatter_mm = form.map_or(filtered_mm, |form| form.hyperparameters.noise_sigma_mm);
     let pv_robust_mm = pv_of_most(used(found).map(|d| d.deviation_mm));
-    // Of two extreme points, each uncertain by the scatter; k = 2.
+    // Difference of two extreme points, each with this noise; k = 2.
     let pv_expanded_mm = 2.0 * 2f64.sqrt() * scatter_mm;
-    // No peak is below its valley.
+    // The peak to valley is not negative.
     let pv_about = |mm| {
         let of = Interval::about(mm, pv_expanded_mm);
         Interval { low_mm: of.low_mm.max(0.0), ..of }
@@ -493,7 +498,8 @@ fn figures(
         scatter_mm,
     };
     let told = form.map_or(by_points, |form| form_figures(&form.figures, scatter_mm));
-    // What is expected is told of the same figure: what the filter leaves has the scatter of the probe in it, and the part has not.
+    // The forecast must be of the same figure: the filtered map still contains the noise of the probe, and the part
+    // does not.
     let bare = |mm: f64| without(scatter_mm, mm);
     Figures {
         pv_mm: verdict.pv_mm,
@@ -524,7 +530,8 @@ fn figures(
     }
 }
 
-/// Counts what nobody states of what the uncertainty is made of; where nothing is held its place is no contribution.
+/// Returns the number of contributions to the uncertainty without a stated value, and the number of all. Without a
+/// locked direction the datum is no contribution.
 fn unstated(task: &Task, form: &Form) -> Option<[u32; 2]> {
     let counts = |share: &&model::BudgetEntry| {
         share.is_stated || share.source != model::UncertaintySource::Datum || task.held().is_some()
@@ -534,12 +541,12 @@ fn unstated(task: &Task, form: &Form) -> Option<[u32; 2]> {
     (!all.is_empty()).then_some([some as u32, all.len() as u32])
 }
 
-/// What is left of an rms when that of something independent is taken off.
+/// Returns the rms after an independent contribution is removed in quadrature.
 fn without(scatter_mm: f64, rms_mm: f64) -> f64 {
     (rms_mm * rms_mm - scatter_mm * scatter_mm).max(0.0).sqrt()
 }
 
-// What the one tells is what the other records.
+// The model and the record must use the same probabilities.
 const _: () = {
     let mut k = 0;
     while k < Interval::COUNT {
@@ -548,7 +555,7 @@ const _: () = {
     }
 };
 
-/// What the model tells, in the words of the cell.
+/// Converts the figures of the model into those of the cell.
 fn form_figures(of: &model::FormFigures, scatter_mm: f64) -> FormFigures {
     let interval = |of: model::Interval| {
         let model::Interval { median_mm, low_mm, high_mm, quantiles_mm, .. } = of;
@@ -557,8 +564,8 @@ fn form_figures(of: &model::FormFigures, scatter_mm: f64) -> FormFigures {
     FormFigures { pv: interval(of.pv), pv_robust: interval(of.pv_most_points), rms: interval(of.rms), scatter_mm }
 }
 
-/// The root mean square without the scatter s of n points, of which the registration took p: F^2 = RMS^2 - s^2 (1 - p/n), which is uncertain by
-/// u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n; k = 2.
+/// Returns the root mean square without the noise s of n points, of which the registration used p degrees of freedom:
+/// F^2 = RMS^2 - s^2 (1 - p/n). Its uncertainty is u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n; k = 2.
 fn rms_without(scatter_mm: f64, verdict: &Verdict) -> Interval {
     const MOTIONS: f64 = 6.0;
     let n = (verdict.used as f64).max(MOTIONS + 1.0);
@@ -591,7 +598,7 @@ fn in_words_of_the_cell(sense: Sense) -> Response {
     }
 }
 
-/// Makes the correction of the next pass and writes it.
+/// Computes the correction of the next pass and writes it.
 pub(super) fn compensate_cycle(task: &Task, files: &mut Files, number: u32, cycle: &Cycle) -> (Event, Product) {
     match compensated(task, files, cycle) {
         Ok((summary, next)) => (Event::Compensated { cycle: number, summary }, Product::Correction(next)),
@@ -608,7 +615,7 @@ fn compensated(
     let failed = |why: &dyn std::fmt::Display| Unfinished::For(CompensationRefusal::Failed(why.to_string()));
     let found =
         cycle.registration.as_ref().ok_or_else(|| failed(&"the measurement of this cycle is not registered"))?;
-    // Where the part may slide in its own surface, nobody knows where on the part a map would be ground in.
+    // If the part may slide within its own surface, the place of the map on the part is unknown.
     let covariance = cycle.form.as_ref().map_or(&found.verdict.covariance, |form| &form.frame_covariance);
     if let Some(why) = weak_for_compensation(found, covariance, &task.place) {
         return Err(Unfinished::For(CompensationRefusal::WeakDirections(vec![why])));
@@ -626,7 +633,7 @@ fn compensated(
             NextPassError::BudgetSpent { .. } => Unfinished::For(CompensationRefusal::BudgetSpent(error.to_string())),
             error => failed(&error),
         })?;
-    // A pass that cannot be ground leaves no correction that somebody might take for one.
+    // A pass that cannot be ground must leave no correction that could be mistaken for one.
     let warning = task.save_program(files, &step.correction).map_err(|error| match unfinished(error) {
         Unfinished::For(why) => failed(&format_args!("the next pass cannot be ground: {why}")),
         Unfinished::NotSaved(why) => Unfinished::NotSaved(why),
@@ -657,7 +664,8 @@ fn compensated(
     Ok((summary, step.correction))
 }
 
-/// What was told of the parameters that the recipe has taken back; nothing after the first pass, when they stand.
+/// Returns the estimates of the parameters that the recipe compensates. Empty after the first pass, when they no longer
+/// change.
 pub(super) fn parameters_told(task: &Task, cycle: &Cycle) -> Vec<ParameterTold> {
     let Some(taken) = &task.parameters else { return Vec::new() };
     let told = cycle.parameters.iter().flat_map(|told| told.found.iter().enumerate());
@@ -681,7 +689,7 @@ fn rms(values: &[f64]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / values.len().max(1) as f64).sqrt()
 }
 
-/// What a person is to agree to before the next pass: parameters that are further off than the recipe's tolerance of them.
+/// Returns the questions to a person before the next pass: parameters with an error beyond the tolerance of the recipe.
 fn asks(cycle: &Cycle) -> Vec<String> {
     let beyond = cycle.parameters.iter().flat_map(|told| &told.found).filter(|p| p.beyond);
     let question = |p: &compensation::Parameter| {
@@ -698,7 +706,8 @@ fn asks(cycle: &Cycle) -> Vec<String> {
     beyond.map(question).collect()
 }
 
-/// What the next part of this kind can begin with; none where this run did not get so far.
+/// Returns the initial state for the next part of this kind. Returns `None` if this run did not get that far, or the
+/// part responded wrongly.
 pub(super) fn learned(task: &Task, run: String, (cycle, fields): (&Cycle, PartPriors)) -> Option<Learned> {
     let known = cycle.known.as_deref()?;
     let wrong = [Response::SignFlipped, Response::Mirrored, Response::NoEffect, Response::Doubled];
@@ -714,27 +723,27 @@ pub(super) fn learned(task: &Task, run: String, (cycle, fields): (&Cycle, PartPr
     )
 }
 
-/// Where they stand.
+/// Files of the conditions, the touches and the repeated touches of a measurement.
 pub(super) const CONDITIONS_FILE: &str = "measured.json";
 pub(super) const TOUCHES_FILE: &str = "touches.json";
 pub(super) const TOUCHED_AGAIN_FILE: &str = "touched_again.json";
 
-/// How often places of a measurement were touched again that no neighbour agreed with.
+/// Number of rounds in which outliers of a measurement were touched again.
 #[derive(Serialize, Deserialize)]
 pub(super) struct TouchedAgain {
     simulation: bool,
     pub(super) rounds: u32,
 }
 
-/// What a measurement was made in, as far as the registration goes by it.
+/// Conditions of a measurement, as far as the registration uses them.
 #[derive(Serialize, Deserialize)]
 pub(super) struct Conditions {
     simulation: bool,
-    /// Of the part, in degrees Celsius.
+    /// Temperature of the part, in °C.
     pub(super) temperature_c: f64,
 }
 
-/// Writes the points of a measurement, in the CMM frame, and what they were measured in.
+/// Writes the points of a measurement, in the CMM frame, and its conditions.
 fn save_points(task: &Task, files: &mut Files, points: &Points) -> Result<(), FormatError> {
     if let Some(temperature_c) = points.temperature_c.filter(|_| task.expansion.is_some()) {
         let conditions = Conditions { simulation: task.simulation, temperature_c };
