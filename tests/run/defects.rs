@@ -113,13 +113,23 @@ fn best_fitted(ran: &Ran, seen: &Snapshot) -> DVector<f64> {
     found - motions * by
 }
 
+/// Whether a target has another one that satisfies a condition within 1.5 local distances of the targets.
+fn has_neighbour(places_mm: &[[f64; 2]], k: usize, is: &dyn Fn(&usize) -> bool) -> bool {
+    let away = |other: usize| (places_mm[other][0] - places_mm[k][0]).hypot(places_mm[other][1] - places_mm[k][1]);
+    let others: Vec<usize> = (0..places_mm.len()).filter(|&other| other != k).collect();
+    let nearest_mm = others.iter().map(|&other| away(other)).fold(f64::INFINITY, f64::min);
+    others.iter().any(|other| is(other) && away(*other) <= 1.5 * nearest_mm)
+}
+
 fn told(case: Case) -> Told {
     let (defect, ran) = case.ran();
     let mut faults = String::new();
     let mut truth_um = [f64::NAN; 2];
     for seen in &ran.snapshots {
         let folder = ran.folder.join(format!("cycle-{}", seen.cycle));
-        let used: Vec<bool> = table(&folder.join("deviations.csv")).iter().map(|row| row[7] == 1.0).collect();
+        let rows = table(&folder.join("deviations.csv"));
+        let used: Vec<bool> = rows.iter().map(|row| row[7] == 1.0).collect();
+        let deviations_mm: Vec<f64> = rows.iter().map(|row| row[6]).collect();
         let best_mm = best_fitted(&ran, seen);
         let rms_mm = (best_mm.norm_squared() / best_mm.len() as f64).sqrt();
         truth_um = [1e3 * (best_mm.max() - best_mm.min()), 1e3 * rms_mm];
@@ -127,9 +137,17 @@ fn told(case: Case) -> Told {
             continue;
         }
         let height_mm = 1e-3 * defect.height_um;
+        // Two neighbours agree. A target that no other one near it agrees with is touched again, and is no form until then.
+        let is_on = |k: &usize| {
+            let at_mm = defect.height_mm(seen.places_mm[*k]);
+            at_mm / height_mm >= 0.5 && 1e3 * at_mm.abs() >= 6.0 * SCATTER_UM
+        };
         let on: Vec<usize> =
-            (0..used.len()).filter(|&k| defect.height_mm(seen.places_mm[k]) / height_mm >= 0.5).collect();
-        if on.len() < 2 || defect.height_um.abs() < 6.0 * SCATTER_UM {
+            (0..used.len()).filter(|k| is_on(k) && has_neighbour(&seen.places_mm, *k, &is_on)).collect();
+        if on.iter().any(|&k| !used[k]) {
+            write!(faults, " left out beside a target that agrees;").unwrap();
+        }
+        if on.len() < 2 {
             continue;
         }
         let tallest = |a: &&usize, b: &&usize| {
@@ -138,7 +156,8 @@ fn told(case: Case) -> Told {
         };
         let k = *on.iter().max_by(tallest).unwrap();
         let own_mm = defect.height_mm(seen.places_mm[k]);
-        let beside_mm = best_mm[k] - own_mm;
+        // The map has the height of the whole part, which the best fit takes off.
+        let beside_mm = deviations_mm[k] - own_mm;
         // At the four nodes about that target.
         let mut map = table(&folder.join("error_map.csv"));
         let away = |row: &[f64]| (row[0] - seen.places_mm[k][0]).hypot(row[1] - seen.places_mm[k][1]);
@@ -150,8 +169,10 @@ fn told(case: Case) -> Told {
         let result: serde_json::Value =
             serde_json::from_slice(&std::fs::read(folder.join("result.json")).unwrap()).unwrap();
         let high_um = 1e3 * result["figures"]["form"]["pv"]["high_mm"].as_f64().unwrap();
-        if high_um < 0.9 * truth_um[0] && used.iter().all(|used| *used) {
-            write!(faults, " PV up to {high_um:.2} of {:.2} um;", truth_um[0]).unwrap();
+        let touched = (0..used.len()).filter(|&k| used[k]).map(|k| 1e3 * deviations_mm[k]);
+        let touched_um = touched.clone().fold(f64::NEG_INFINITY, f64::max) - touched.fold(f64::INFINITY, f64::min);
+        if high_um < 0.9 * touched_um {
+            write!(faults, " PV up to {high_um:.2} where {touched_um:.2} um were touched;").unwrap();
         }
     }
     let limits_um = ran.tolerance_mm.map(|mm| 1e3 * mm);
@@ -168,8 +189,12 @@ fn told(case: Case) -> Told {
 #[test]
 fn no_part_is_accepted_that_is_beyond_its_limits_where_it_was_touched() {
     let count = 8 * seeds(1);
+    let one: Option<u64> = std::env::var("REGRIND_CASE").ok().map(|of| of.parse().expect("the number of a case"));
     // Where few are drawn each recipe has one part, the whole pattern and chosen touches by turns.
-    let drawn: Vec<u64> = (0..count).filter(|number| all() || (number / 2 + number) % 2 == 0).collect();
+    let drawn: Vec<u64> = match one {
+        Some(one) => vec![one],
+        None => (0..count).filter(|number| all() || (number / 2 + number) % 2 == 0).collect(),
+    };
     let next = AtomicU64::new(0);
     let take = || {
         let mut done = Vec::new();
@@ -194,5 +219,5 @@ fn no_part_is_accepted_that_is_beyond_its_limits_where_it_was_touched() {
     let wrong: Vec<_> = parts.iter().filter(|part| !part.faults.is_empty()).collect();
     assert!(wrong.is_empty(), "{} of {}", wrong.len(), parts.len());
     // No defect of 3 um brings a part beyond 7 um by itself.
-    assert!(parts.iter().any(|part| part.accepted), "no part was accepted");
+    assert!(one.is_some() || parts.iter().any(|part| part.accepted), "no part was accepted");
 }
