@@ -1,17 +1,18 @@
-//! The measuring machine: it has the part in a place of its own, and touches the real surface exactly.
+//! Measuring machine: the part has a placement of its own in it, and the ball touches the real surface exactly.
 //!
-//! A target names a point and a normal in the machine's frame, where the client believes the part to be. The ball comes down
-//! that line and stops where it touches the part as it really lies and is: misplaced, a little shifted at every loading,
-//! grown by its temperature, ground as it was ground, with a ball whose true radius is the stated one plus an error.
-//! What is reported is the centre of the ball at that moment, with
+//! A target gives a point and a normal in the machine's frame, where the client assumes the part to be. The ball moves
+//! down that line, and stops where it touches the part with its real position and surface: misplaced, shifted a little
+//! at every loading, expanded by its temperature, and with its ground form. The true radius of the ball is the stated
+//! radius plus an error. The machine reports the centre of the ball at that moment, with
 //!
 //! * noise: Gaussian, independent on each axis of the machine,
-//! * outliers: a share of the points moved by up to the given size in any direction (dust, a false trigger), said to be good,
+//! * outliers: a share of the points, moved by up to the given size in any direction (dust, a false trigger) and
+//!   reported as good,
 //! * points not found: a share of the touches that the probe head misses.
 //!
-//! A ball that touches before the search begins backs off and reports "not reached"; after too many of these the machine
-//! stops with fault 2, for then the part lies quite otherwise than the plan says. The part's rim is not modelled: beyond the aperture nothing is
-//! found. A target beyond the travel is refused before anything moves.
+//! A ball that touches before the search begins backs off, and the machine reports "not reached". After too many of
+//! these, the machine stops with fault 2, because the part is then far from its planned position. The part's rim is not
+//! modelled: beyond the aperture, nothing is found. A target beyond the travel is refused before anything moves.
 
 use std::sync::{Arc, Mutex};
 
@@ -30,12 +31,12 @@ use crate::{Rng, Vec3};
 pub const COUNT_MM: f64 = 1e-6;
 
 impl CmmSpec {
-    /// Returns the size of the part over its size on the drawing.
+    /// Returns the ratio of the part's size to its size on the drawing.
     fn growth(&self) -> f64 {
         1.0 + self.cte_per_k * (self.part_temperature_c - REFERENCE_C)
     }
 
-    /// Refuses a plan that leads the probe beyond its travel.
+    /// Refuses a plan that moves the probe beyond its travel.
     fn reaches(&self, plan: &Plan) -> Result<(), Refusal> {
         let highest = plan.targets.iter().map(|t| t.point_mm[2]).fold(f64::NEG_INFINITY, f64::max);
         let travel_mm = highest + plan.safe_height_mm;
@@ -60,7 +61,7 @@ impl CmmSpec {
     }
 }
 
-/// Returns the way of the centre of a ball of the given radius to a target; the machine steers by the stated radius.
+/// Returns the way of the centre of a ball with the given radius to a target; the machine steers by the stated radius.
 fn way(target: &Target, plan: &Plan, radius_mm: f64) -> Approach {
     Approach {
         point_mm: target.point_mm,
@@ -71,21 +72,21 @@ fn way(target: &Target, plan: &Plan, radius_mm: f64) -> Approach {
     }
 }
 
-/// Returns a direction in the part's frame.
+/// Rotates a direction from the machine's frame to the part's frame.
 fn turned_back(placement: &Placement, v: Vec3) -> Vec3 {
     std::array::from_fn(|i| (0..3).map(|k| placement.rotation[k][i] * v[k]).sum())
 }
 
-/// A measurement, made ready or going on.
+/// Prepared or running measurement.
 struct Run {
     plan: Plan,
     placement: Placement,
     records: Vec<PointRecord>,
-    /// Unexpected touches so far.
+    /// Number of unexpected touches so far.
     unexpected: u32,
     fault: u16,
     elapsed_s: f64,
-    /// When each target has been touched.
+    /// Time at which each target has been touched, in s.
     due_s: Vec<f64>,
     noise: Rng,
     outliers: Rng,
@@ -121,7 +122,8 @@ impl Run {
         self.not_found = draw(Source::NotFound);
     }
 
-    /// Returns when each target has been touched: those at the beginning take longer where the plan says so, and between two lies the travel.
+    /// Returns the time at which each target has been touched, travel included. The first targets take longer if the
+    /// plan requires it.
     fn due_s(plan: &Plan, spec: &CmmSpec) -> Vec<f64> {
         let (slowly, speed_mm_s) = plan.careful;
         let each_s = |k: usize| {
@@ -144,7 +146,7 @@ impl Run {
         self.records.len() == self.plan.targets.len()
     }
 
-    /// Returns what the machine says of the records that there are.
+    /// Returns the result with the present records, as the machine reports it.
     fn told(&self, state: &State) -> Outcome {
         let (spec, faults) = (&state.spec.cmm, &state.spec.faults);
         let scale = spec.scaled_points.then_some(COUNT_MM);
@@ -184,7 +186,7 @@ impl Run {
         }
     }
 
-    /// Returns the contact in the machine's frame.
+    /// Computes the contact in the machine's frame.
     fn contact(&self, state: &State, target: &Target) -> Contact {
         let spec = &state.spec.cmm;
         let in_machine = way(target, &self.plan, self.plan.probe_radius_mm + 1e-3 * spec.probe_radius_error_um);
@@ -194,7 +196,8 @@ impl Run {
         if state.spec.faults.no_part {
             return Contact::Missed;
         }
-        // The grown part touched by the ball is the part of the drawing touched by a ball as much smaller.
+        // Contact of the expanded part with the ball equals contact of the part at drawing size with a ball reduced by
+        // the same ratio.
         let growth = spec.growth();
         let shifted = std::array::from_fn(|i| in_machine.point_mm[i] - self.placement.translation_mm[i]);
         let in_part = Approach {
@@ -212,7 +215,7 @@ impl Run {
         }
     }
 
-    /// Draws noise and outlier of a touch; the same numbers whether or not it is used.
+    /// Draws noise and outlier of a touch; it draws the same numbers whether or not they are used.
     fn disturbance(&mut self, spec: &CmmSpec) -> Vec3 {
         let normal = |rng: &mut Rng| -> f64 { StandardNormal.sample(rng) };
         let noise: Vec3 = std::array::from_fn(|_| 1e-3 * spec.noise_um * normal(&mut self.noise));
@@ -231,7 +234,7 @@ fn untouched(target: &Target, status: Status) -> PointRecord {
     PointRecord { index: target.index, status, quality: 100, position_mm: [0.0; 3] }
 }
 
-/// Returns what this machine says of a centre.
+/// Returns the position that this machine, with its faults, reports for a centre.
 fn reported(faults: &Faults, target: &Target, stated_radius_mm: f64, centre_mm: Vec3) -> Vec3 {
     let back = if faults.returns_contact_points { stated_radius_mm } else { 0.0 };
     let unit = if faults.inches { 25.4 } else { 1.0 };
@@ -239,7 +242,7 @@ fn reported(faults: &Faults, target: &Target, stated_radius_mm: f64, centre_mm: 
     std::array::from_fn(|i| sign[i] * (centre_mm[i] - back * target.normal[i]) / unit)
 }
 
-/// The measuring machine of a world.
+/// Measuring machine of a world.
 pub struct Cmm {
     world: Arc<Mutex<State>>,
     ready: Option<Run>,
@@ -252,18 +255,18 @@ impl Cmm {
     }
 }
 
-/// What a touch that the probe is led to comes to.
+/// Result of a touch.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Touch {
-    /// Where the ball's centre was.
+    /// The ball touched; its centre.
     Centre(Vec3),
-    /// Nothing was there.
+    /// The ball met nothing.
     Missed,
-    /// Something was there before the search began, or the part is not.
+    /// The ball touched before the search began, or the part is not there.
     Unexpected,
 }
 
-/// The probe of the measuring machine, led touch by touch by a server that knows no plan.
+/// Probe of the measuring machine, controlled touch by touch by a server that has no plan.
 pub struct Led {
     world: Arc<Mutex<State>>,
     run: Option<Run>,
@@ -274,24 +277,24 @@ impl Led {
         Self { world, run: None }
     }
 
-    /// The least and the largest corner of the travel.
+    /// Returns the lower and the upper corner of the travel, in mm.
     pub fn volume_mm(&self) -> [Vec3; 2] {
         let spec = &locked(&self.world).spec.cmm;
         [spec.travel_least_mm, spec.travel_most_mm]
     }
 
-    /// The speed of travel.
+    /// Returns the speed of travel, in mm/s.
     pub fn travel_mm_s(&self) -> f64 {
         locked(&self.world).spec.cmm.travel_mm_s
     }
 
-    /// How long a touch takes.
+    /// Returns the duration of a touch, in s.
     pub fn seconds_per_point(&self) -> f64 {
         locked(&self.world).spec.cmm.seconds_per_point
     }
 
-    /// Touches at a point along its normal, with radius, approach and search. The first touch after the part was away is another
-    /// measurement.
+    /// Touches at a point along its normal, with radius, approach and search. The first touch after the part was away
+    /// begins a new measurement.
     pub fn touch(
         &mut self,
         point_mm: Vec3,
@@ -332,13 +335,13 @@ impl Led {
         }
     }
 
-    /// The probe is clear of the part, and others may have it.
+    /// Moves the probe clear of the part, so that the other machine can take the part.
     pub fn let_go(&mut self) {
         locked(&self.world).release(Kind::Cmm);
     }
 }
 
-/// Whether a point is one of the reference sphere: what the probe meets there is that.
+/// Returns the feature of a point: the reference sphere, if the point is on it, otherwise the part.
 fn feature(spec: &CmmSpec, point_mm: Vec3) -> Feature {
     let away_mm = (0..3).map(|k| (point_mm[k] - spec.sphere_centre_mm[k]).powi(2)).sum::<f64>().sqrt();
     if (away_mm - spec.sphere_radius_mm).abs() < 0.5 * spec.sphere_radius_mm {
@@ -401,7 +404,7 @@ impl Body for Cmm {
     fn advance(&mut self, seconds: f64) -> Progress {
         let mut state = locked(&self.world);
         let Some(run) = self.running.as_mut() else {
-            // Nothing was begun: something else has the part.
+            // Nothing was begun: the other machine has the part.
             return Progress { done: 0, total: 0, finished: false, fault: 1 };
         };
         if seconds > 0.0 && seconds.is_finite() {
@@ -464,7 +467,7 @@ impl Body for Cmm {
 }
 
 impl Drop for Cmm {
-    /// A machine that is taken away keeps nothing.
+    /// Releases the part.
     fn drop(&mut self) {
         locked(&self.world).release(Kind::Cmm);
     }

@@ -1,10 +1,11 @@
-//! States, commands and answers of docs/modbus.md of its own, for an error in one must not stand at both ends of the wire.
+//! States, commands and answers of docs/modbus.md, implemented independently: an error must not be the same at both
+//! ends of the wire.
 
 use serde::Serialize;
 
 use crate::words::{Image, WordOrder, bytes_of, crc16};
 
-/// The states of docs/modbus.md.
+/// States of docs/modbus.md.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 #[allow(missing_docs)]
@@ -22,7 +23,7 @@ pub enum State {
 }
 
 impl State {
-    /// Every state, in the order of their numbers.
+    /// All states, in the order of their numbers.
     pub const ALL: [Self; 10] = [
         Self::Idle,
         Self::Prepared,
@@ -37,7 +38,7 @@ impl State {
     ];
 }
 
-/// The commands of docs/modbus.md.
+/// Commands of docs/modbus.md.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 #[allow(missing_docs)]
 pub enum Command {
@@ -54,7 +55,7 @@ pub enum Command {
 }
 
 impl Command {
-    /// Every command, in the order of their numbers.
+    /// All commands, in the order of their numbers.
     pub const ALL: [Self; 10] = [
         Self::Claim,
         Self::Prepare,
@@ -68,12 +69,12 @@ impl Command {
         Self::Release,
     ];
 
-    /// Returns the command of a number.
+    /// Returns the command with a number.
     pub fn of(number: u16) -> Option<Self> {
         Self::ALL.get(usize::from(number).checked_sub(1)?).copied()
     }
 
-    /// Says whether a machine in this state may do it.
+    /// Returns true if a machine in this state may carry out the command.
     pub fn is_allowed_in(self, state: State) -> bool {
         match self {
             Self::Claim | Self::Abort => true,
@@ -89,7 +90,7 @@ impl Command {
     }
 }
 
-/// The answers of docs/modbus.md.
+/// Answers of docs/modbus.md.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 #[allow(missing_docs)]
@@ -109,7 +110,7 @@ pub enum Answer {
     Argument = 11,
 }
 
-/// A command as it stands in its 20 registers.
+/// Command block of 20 registers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Frame {
     /// Sequence number; 0 is never used.
@@ -118,15 +119,15 @@ pub struct Frame {
     pub command: u16,
     /// Cycle of the job.
     pub cycle: u16,
-    /// Who commands.
+    /// Id of the client that commands.
     pub owner: u32,
-    /// How often that one has started.
+    /// Number of starts of that client.
     pub epoch: u32,
-    /// The part's run.
+    /// Run of the part.
     pub job: u32,
-    /// CRC-32 of the identities of the payloads it is about.
+    /// CRC-32 of the identities of the payloads that the command refers to.
     pub digest: u32,
-    /// The token that PREPARE gave.
+    /// Token from PREPARE.
     pub token: u32,
     /// The `done` number, for ACKNOWLEDGE.
     pub argument: u32,
@@ -169,17 +170,17 @@ impl Frame {
     }
 }
 
-/// Whether the machine's own panel has the command.
+/// Operating mode, set at the machine's panel.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Mode {
     /// The client may command.
     #[default]
     Automatic = 1,
-    /// A person at the panel has the machine.
+    /// A person at the panel controls the machine.
     Manual = 2,
 }
 
-/// Bits of the status block's interlocks.
+/// Bits of the interlocks in the status block.
 pub mod interlock {
     /// The guards are closed.
     pub const GUARDS: u16 = 1;
@@ -187,10 +188,10 @@ pub mod interlock {
     pub const CLEAR: u16 = 2;
     /// The part is clamped.
     pub const CLAMPED: u16 = 4;
-    /// Air and coolant are there.
+    /// Air and coolant are available.
     pub const SUPPLIES: u16 = 8;
     /// All of them.
     pub const ALL: u16 = 15;
-    /// What must stay good while the machine moves.
+    /// Interlocks that must stay closed while the machine moves.
     pub const MOVING: u16 = GUARDS | CLAMPED | SUPPLIES;
 }

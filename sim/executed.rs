@@ -1,20 +1,24 @@
-//! The grinder once more: what the wheel leaves along the path that a controller outside really executes, servo cycle by servo cycle.
+//! Grinder with an external controller: the surface that the wheel leaves along the path that the controller really
+//! executes, servo cycle by servo cycle.
 //!
-//! The pass is no list of registers here, and no map comes with it: all that is known is where the controller had the wheel's centre. From
-//! each place c of it, in the frame of the part, follow the foot on the nominal surface and the height of what a stiff machine would leave there,
+//! There are no pass registers and no map here. Only the executed positions of the wheel's centre are known. Each
+//! position c, in the frame of the part, gives its projection (foot) on the nominal surface, and the height that a
+//! stiff machine would leave there,
 //!
 //! ```text
 //!  h = (c' - foot) . n - R        R the true radius of the wheel
 //!  c' = c + (R - stated) z - lag  touched off at its lowest place; the axes lag behind along the path
 //! ```
 //!
-//! and with that come the systematic errors, wear, growth, and what is drawn afresh, as in [`crate::process`].
+//! plus the systematic errors, wear, growth, and the random error of the pass, as in [`crate::process`].
 //!
-//! **Tracks.** The wheel is on a track from when it comes near the part until it lifts off, or turns back in x. A track grinds the strip half
-//! way to its neighbours, as deep as at its own y: the ridges between are the [`Grooves`] of the part. So it waits for the next one, or for
-//! [`Wheel::settle`]. Beyond the outermost the wheel leaves what its own curve does. Tracks must run along x.
+//! **Tracks.** A track begins when the wheel comes near the part, and ends when it lifts off or turns back in x. A
+//! track grinds the strip half way to its neighbours, with the depth at its own y: the ridges between are the
+//! [`Grooves`] of the part. A track is therefore ground only when the next one or [`Wheel::settle`] comes. Beyond the
+//! outermost track, the wheel leaves its own curve. Tracks must run along x.
 //!
-//! **Passes.** Everything from when the wheel comes to the part until the part is taken away is one pass: the wheel is dressed before.
+//! **Passes.** A pass lasts from when the wheel comes to the part until the part is taken away; the wheel is dressed
+//! before.
 
 use std::sync::{Arc, Mutex};
 
@@ -26,47 +30,47 @@ use crate::shape::foot;
 use crate::spec::{SpecError, WorldSpec};
 use crate::truth::{Source, State, Sweep, locked, stream};
 
-/// The wheel is at the part where it is no higher over it.
+/// Maximum height over the part at which the wheel is at the part, in mm.
 const NEAR_MM: f64 = 1.0;
-/// No pass goes so deep at once: whoever is there has run into the part.
+/// Depth beyond which the wheel has run into the part, in mm: no pass cuts so deep at once.
 const TOO_DEEP_MM: f64 = 2.0;
-/// How far a strip reaches beyond a border that is nobody else's, as a share of its half width.
+/// Extension of a strip beyond a border without a neighbour, as a share of its half width.
 const ON_BORDER: f64 = 0.05;
-/// How far beyond its outermost track the wheel grinds.
+/// Width that the wheel grinds beyond its outermost track, in mm.
 const BESIDE_MM: f64 = 1.5;
 
-/// Where the wheel is over the part.
+/// Projection of the wheel's centre onto the part.
 #[derive(Clone, Copy, Debug)]
 struct Foot {
     at_mm: [f64; 2],
-    /// What it would leave over the nominal surface.
+    /// Height that the wheel would leave over the nominal surface, in mm.
     height_mm: f64,
     seconds: f64,
 }
 
-/// A way over the part.
+/// Track over the part.
 struct Track {
     feet: Vec<Foot>,
     y_mm: f64,
 }
 
-/// What is fixed from the beginning of a pass.
+/// Values that are fixed from the beginning of a pass.
 struct Pass {
-    /// Systematic error and what was drawn, a value for every node.
+    /// Systematic and random error at every node, in mm.
     fixed_mm: Vec<f64>,
-    /// How the grooves bend, if there are any.
+    /// Curvature of the grooves, if there are any.
     bend: Option<HeightGrid>,
     began_s: f64,
     heat_at_begin: f64,
-    /// Nodes on the part, and how many the wheel has come over.
+    /// Number of nodes on the part, and of nodes that the wheel has passed.
     nodes: f64,
     visits: u64,
     in_air: u64,
-    /// y of its first track.
+    /// y of the first track, in mm.
     first_mm: Option<f64>,
 }
 
-/// The wheel of a grinder whose controller is none of this world.
+/// Wheel of a grinder with an external controller.
 pub struct Wheel {
     world: Arc<Mutex<State>>,
     stated_radius_mm: f64,
@@ -74,12 +78,12 @@ pub struct Wheel {
     guess_mm: [f64; 2],
     pass: Option<Pass>,
     feet: Vec<Foot>,
-    /// The track that waits for the next one.
+    /// Track that waits for the next one.
     waiting: Option<Track>,
-    /// Half the distance of tracks, once there were two, and to which side they follow each other.
+    /// Half the spacing of the tracks, once there are two, and the side on which they follow each other.
     half_mm: Option<f64>,
     side: f64,
-    /// How far the strips have come.
+    /// y up to which the strips have come, in mm.
     reached_mm: Option<f64>,
 }
 
@@ -93,7 +97,7 @@ impl Wheel {
         Ok(Self { world, stated_radius_mm, last, guess_mm, pass, feet, waiting, half_mm, side, reached_mm })
     }
 
-    /// Moves it on: where its centre is in the frame of the part, and when by the controller's clock.
+    /// Moves the wheel: position of its centre in the frame of the part, and time by the controller's clock.
     pub fn at(&mut self, place_mm: Vec3, seconds: f64) {
         let Some((from_mm, then)) = self.last.replace((place_mm, seconds)) else { return };
         if from_mm == place_mm {
@@ -107,20 +111,21 @@ impl Wheel {
         }
     }
 
-    /// Nobody knows where it is any more, as before the machine is homed or after it was switched off: it does not touch the part.
+    /// Handles an unknown position, as before homing or after power-off: the wheel does not touch the part.
     pub fn away(&mut self) {
         self.last = None;
         let world = Arc::clone(&self.world);
         self.leave(&mut locked(&world));
     }
 
-    /// Some of its path was lost: how the part is nobody knows.
+    /// Handles a lost part of the path: the state of the part is then unknown.
     pub fn lost(&mut self) {
         self.away();
         locked(&self.world).unknown = true;
     }
 
-    /// What was ground is ground, if no neighbour comes any more; where the wheel is at the part, its track goes on.
+    /// Grinds the waiting track as one without a next neighbour. If the wheel is at the part, its present track
+    /// continues.
     pub fn settle(&mut self) {
         let world = Arc::clone(&self.world);
         let state = &mut *locked(&world);
@@ -129,12 +134,12 @@ impl Wheel {
         }
     }
 
-    /// Where the wheel is over the part, if it is near it.
+    /// Projects the wheel's centre onto the part, if it is near it.
     fn foot(&mut self, state: &mut State, [from_mm, place_mm]: [Vec3; 2], [then, seconds]: [f64; 2]) -> Option<Foot> {
         let error_mm = 1e-3 * state.spec.grinder.wheel_radius_error_um;
         let stated_mm = self.stated_radius_mm;
         let radius_mm = *state.true_wheel_radius_mm.get_or_insert(stated_mm + error_mm);
-        // The lag is stated at 1000 mm/min.
+        // The lag is specified at 1000 mm/min.
         let lag_s = 1e-3 * state.spec.grinder.following_um * 60.0 / 1000.0;
         let mut centre: Vec3 = std::array::from_fn(|k| {
             let speed = (place_mm[k] - from_mm[k]) / (seconds - then).max(1e-6);
@@ -153,7 +158,7 @@ impl Wheel {
 
     fn come_over(&mut self, state: &mut State, foot: Foot) {
         if !state.take(Kind::Grinder) {
-            // The probe is there.
+            // The probe is at the part.
             state.unknown = true;
             return;
         }
@@ -202,7 +207,7 @@ impl Wheel {
         state.sweeps.push(Sweep::default());
     }
 
-    /// The wheel has lifted off, or turned back.
+    /// Ends the track after the wheel has lifted off or turned back.
     fn end_track(&mut self, state: &mut State) {
         let feet = std::mem::take(&mut self.feet);
         let [half_x, half_y] = state.part.aperture.half_mm();
@@ -216,7 +221,7 @@ impl Wheel {
         }
     }
 
-    /// Grinds the track that waits, half way to where the next one is.
+    /// Grinds the waiting track, half way to the next one.
     fn grind_waiting(&mut self, state: &mut State, next_mm: Option<f64>) {
         let Some(track) = self.waiting.take() else { return };
         let Some(mut pass) = self.pass.take() else { return };
@@ -229,7 +234,7 @@ impl Wheel {
         let half = self.half_mm.unwrap_or(0.5 * NODE_SPACING_MM);
         let (far, near) = (track.y_mm + self.side * half, track.y_mm - self.side * half);
         let joined = self.reached_mm.filter(|reached| (reached - near).abs() < 0.2 * half);
-        // A border that is nobody else's takes in the row of nodes that is on it.
+        // A border without a neighbour includes the row of nodes that is on it.
         let outwards = [-self.side, self.side].map(|side| ON_BORDER * half * side);
         let strip = [joined.unwrap_or(near + outwards[0]), if step.is_some() { far } else { far + outwards[1] }];
         let beside = [(joined.is_none(), -self.side), (step.is_none(), self.side)];
@@ -247,7 +252,7 @@ impl Wheel {
     }
 }
 
-/// Returns how the grooves bend that a wheel leaves all over the part, if it leaves any.
+/// Returns the curvature of the grooves that a wheel leaves over the whole part, if it leaves any.
 fn bend(spec: &WorldSpec, part: &Part, radius_mm: f64) -> Option<HeightGrid> {
     spec.grinder.scallops.then(|| {
         let mut bend = HeightGrid::over(part.aperture.half_mm(), 0.0);
@@ -256,7 +261,8 @@ fn bend(spec: &WorldSpec, part: &Part, radius_mm: f64) -> Option<HeightGrid> {
     })
 }
 
-/// The grooves lie where the tracks of this pass do; where it has not come, those of the pass before keep their height.
+/// Updates the grooves: they lie at the tracks of this pass. Where it has not come, those of the pass before keep their
+/// height.
 fn leave_grooves(state: &mut State, pass: &Pass, track: &Track, half_mm: Option<f64>) {
     let (Some(half), Some(first_mm)) = (half_mm, pass.first_mm) else { return };
     let number = ((track.y_mm - first_mm) / (2.0 * half)).round();
@@ -274,7 +280,8 @@ fn leave_grooves(state: &mut State, pass: &Pass, track: &Track, half_mm: Option<
     state.part.grooves = Some(Grooves { first_mm, spacing_mm, wheel_radius_mm, bend });
 }
 
-/// Lets a track grind the nodes of its strip, and beside it, where no other track is, what its own curve reaches.
+/// Lets a track grind the nodes of its strip and, next to it where there is no other track, those that its own curve
+/// reaches.
 fn grind(state: &mut State, pass: &mut Pass, track: &Track, strip: [f64; 2], beside: impl Iterator<Item = f64>) {
     let spec = &state.spec.grinder;
     let strokes = |visits: u64| visits as f64 / pass.nodes.max(1.0);
@@ -308,7 +315,8 @@ fn grind(state: &mut State, pass: &mut Pass, track: &Track, strip: [f64; 2], bes
     }
 }
 
-/// Returns the nodes that a track crosses within a strip of y, and what the wheel would leave at each: as at its own y.
+/// Returns the nodes of a track within a strip of y, with the height that the wheel would leave at each: that at the
+/// track's own y.
 fn crossed(grid: &HeightGrid, track: &Track, strip: [f64; 2]) -> Vec<(usize, [f64; 2], f64)> {
     let mut nodes = Vec::new();
     for pair in track.feet.windows(2) {

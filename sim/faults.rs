@@ -1,35 +1,36 @@
-//! What is to go wrong at a machine that is told line by line, each once. What goes wrong with the requests of a wire differs, see
-//! [`crate::wire::faults`]: there it is drawn and comes again, and several may meet in one request.
+//! Faults of a machine that is controlled line by line; each happens once. The faults of Modbus requests differ, see
+//! [`crate::wire::faults`]: those are drawn and can repeat, and several can meet in one request.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 struct Rule<Place, Fault> {
     place: Place,
-    /// So many at such a place go well before.
+    /// Number of matching places that pass first without a fault.
     skip: u32,
     fault: Fault,
 }
 
-/// Faults that are still to come, each at a place as the machine names it. Clones share them.
+/// Pending faults, each at a place as the machine names it. Clones share them.
 pub struct Faults<Place, Fault>(Arc<Mutex<Vec<Rule<Place, Fault>>>>);
 
 impl<Place, Fault> Faults<Place, Fault> {
-    /// None.
+    /// Returns a list without faults.
     pub fn none() -> Self {
         Self(Arc::default())
     }
 
-    /// Has a fault happen at such a place, after so many others like it.
+    /// Adds a fault for a place, after `skip` matching places without it.
     pub fn add(&self, place: impl Into<Place>, skip: u32, fault: Fault) {
         self.rules().push(Rule { place: place.into(), skip, fault });
     }
 
-    /// Forgets those that are still to come.
+    /// Drops the pending faults.
     pub fn clear(&self) {
         self.rules().clear();
     }
 
-    /// Returns what happens now, where the places that are meant are these. The first of several is taken, the others wait.
+    /// Returns the fault that happens now, if any, at a place that matches. The first of several is taken, and the
+    /// others wait.
     pub(crate) fn at(&self, is_meant: impl Fn(&Place) -> bool) -> Option<Fault> {
         let mut rules = self.rules();
         let mut met = None;

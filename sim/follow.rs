@@ -1,30 +1,32 @@
-//! What a ball leaves that follows a program: how far its centre is from the nominal surface, all along the lines and arcs between its stops.
+//! Surface left by a ball that follows a program: the distance of its centre from the nominal surface, along the lines
+//! and arcs between the stops.
 
 use crate::part::Part;
 use crate::program::Program;
 use crate::shape::foot;
 
-/// Places along a move are no farther apart than this, in millimetres.
+/// Maximum distance of consecutive samples along a move, in mm.
 const APART_MM: f64 = 0.15;
-/// A ball that is farther than this from where it should touch grinds nothing.
+/// Maximum distance of the ball from the nominal contact at which it grinds, in mm.
 const NEAR_MM: f64 = 1.0;
 
-/// A place where the ball touches or would, and how high over the nominal surface, in millimetres.
+/// Place where the ball touches or would touch, and its height over the nominal surface, in mm.
 #[derive(Clone, Copy, Debug)]
 struct Touch {
     at_mm: [f64; 2],
     height_mm: f64,
 }
 
-/// Returns, at every node of a part, how far over the nominal surface a ball of this radius leaves it; not a number where it does not come.
+/// Returns at every node of a part the height over the nominal surface that a ball of this radius leaves, in mm; NaN
+/// where the ball does not come.
 pub(crate) fn heights_mm(part: &Part, program: &Program, radius_mm: f64, track_mm: f64) -> Vec<f64> {
     let reach_mm = (1.6 * track_mm).max(2.0 * APART_MM);
     let cells = Cells::of(touches(part, program, radius_mm), reach_mm);
     part.height.nodes().map(|at| cells.level_mm(on_part(part, at))).collect()
 }
 
-/// Returns a place, or for one beside the part the last that is on it on the way to its middle: beside it the wheel has lifted off, and what it
-/// would leave there is what it leaves at the edge.
+/// Returns a place on the part unchanged. For a place outside, returns the last place on the part on the way to its
+/// middle: outside, the wheel has lifted off, and the height at the edge is used.
 fn on_part(part: &Part, at_mm: [f64; 2]) -> [f64; 2] {
     let at = |share: f64| at_mm.map(|v| share * v);
     let is_on = |share: f64| part.aperture.contains(at(share)[0], at(share)[1]);
@@ -51,14 +53,14 @@ fn touches(part: &Part, program: &Program, radius_mm: f64) -> Vec<Touch> {
     found
 }
 
-/// The foot of the ball's centre on the nominal surface.
+/// Projects the centre of the ball onto the nominal surface.
 fn touch(part: &Part, centre: [f64; 3], radius_mm: f64) -> Option<Touch> {
     let (at_mm, over_mm) = foot(part.shape.as_ref(), centre, [centre[0], centre[1]])?;
     let height_mm = over_mm - radius_mm;
     (height_mm.abs() < NEAR_MM).then_some(Touch { at_mm, height_mm })
 }
 
-/// Touches, found by where they are.
+/// Touches, indexed by their place.
 struct Cells {
     reach_mm: f64,
     of: std::collections::HashMap<[i64; 2], Vec<Touch>>,
@@ -77,7 +79,8 @@ impl Cells {
         at_mm.map(|v| (v / self.reach_mm).floor() as i64)
     }
 
-    /// The height at a place by a plane through the touches around it; their weight falls to 0 at the reach.
+    /// Returns the height at a place, from a plane fitted to the touches around it; their weight falls to 0 at the
+    /// reach.
     fn level_mm(&self, at_mm: [f64; 2]) -> f64 {
         let [i, j] = self.cell(at_mm);
         // Normal equations of h = c0 + c1 u + c2 v.
@@ -92,14 +95,14 @@ impl Cells {
                 (0..3).for_each(|l| m[k][l] += weight * row[k] * row[l]);
             }
         }
-        // Touches along one line tell no slope across it: a little stiffness against it keeps the plane level.
+        // Touches along one line do not determine the slope across it; this small regularization keeps the plane level.
         m[1][1] += 1e-6 * m[0][0];
         m[2][2] += 1e-6 * m[0][0];
         first_of(m, b)
     }
 }
 
-/// The first unknown of three equations by Cramer's rule; not a number where there are none.
+/// Returns the first unknown of three equations by Cramer's rule; NaN if the system is singular.
 fn first_of(m: [[f64; 3]; 3], b: [f64; 3]) -> f64 {
     let of = |c: [f64; 3]| {
         c[0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (c[1] * m[2][2] - m[1][2] * c[2])
@@ -114,7 +117,8 @@ mod tests {
     use crate::program::Stop;
     use crate::spec::WorldSpec;
 
-    /// A part as its world has it, with a raster of a ball's centre over it that leaves a height over x and y.
+    /// Returns a part of the default world, with a raster of ball centres over it that leaves a given height over x and
+    /// y.
     fn followed(apart_mm: f64, left_mm: impl Fn(f64, f64) -> f64) -> (Part, Vec<f64>) {
         let part = Part::blank(&WorldSpec::default().part, 1);
         let [a, b] = part.aperture.half_mm();

@@ -1,15 +1,15 @@
-//! What grinding left on the part: a smooth random error along the normal.
+//! Form error left by grinding: a smooth random error along the normal.
 
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
 
 use crate::Rng;
 
-/// A Gaussian random surface error with a Gaussian autocovariance, as a sum of plane waves.
+/// Gaussian random surface error with a Gaussian autocovariance, as a sum of plane waves.
 ///
-/// Many waves of random direction, phase and (Gaussian) wave number give heights that are Gaussian to the eye and exact
-/// derivatives everywhere. The correlation length l is the lag at which the autocovariance has fallen to 1/e:
-/// C(s) = exp(-(s/l)^2), whose wave numbers have the standard deviation sqrt(2)/l on each axis.
+/// Many waves of random direction, phase and (Gaussian) wave number give heights that are nearly Gaussian, and exact
+/// derivatives everywhere. The correlation length l is the lag at which the autocovariance has fallen to 1/e: C(s) =
+/// exp(-(s/l)^2), whose wave numbers have the standard deviation sqrt(2)/l on each axis.
 #[derive(Clone, Debug)]
 pub struct FormError {
     /// Wave vector, phase and amplitude of each wave.
@@ -17,7 +17,8 @@ pub struct FormError {
 }
 
 impl FormError {
-    /// Draws an error of a given correlation length and peak to valley over the rectangle centred on the origin.
+    /// Draws an error with a given correlation length and a given peak to valley over the rectangle centred on the
+    /// origin.
     pub fn new(seed: u64, correlation_length_mm: f64, pv_mm: f64, width_mm: f64, depth_mm: f64) -> Self {
         let mut rng = crate::rng(seed);
         let sigma = 2f64.sqrt() / correlation_length_mm;
@@ -35,7 +36,7 @@ impl FormError {
         error
     }
 
-    /// Draws an error of a given correlation length and RMS (over the endless plane) from a generator.
+    /// Draws an error with a given correlation length and RMS (over the infinite plane) from a generator.
     ///
     /// A wave of amplitude a has the mean square a^2/2.
     pub fn with_rms(rng: &mut Rng, correlation_length_mm: f64, rms_mm: f64) -> Self {
@@ -50,20 +51,21 @@ impl FormError {
         Self { waves }
     }
 
-    /// No error at all.
+    /// Returns a form without any error.
     pub fn none() -> Self {
         Self { waves: Vec::new() }
     }
 
-    /// Returns the error at (x, y), in millimetres, positive where material stands proud.
+    /// Returns the error at (x, y), in mm, positive where there is excess material.
     pub fn height(&self, x: f64, y: f64) -> f64 {
         self.waves.iter().map(|[kx, ky, phase, a]| a * (kx * x + ky * y + phase).cos()).sum()
     }
 
-    /// Adds the error to values on a net, row by row, x fastest.
+    /// Adds the error to values on a grid, row by row, x fastest.
     ///
-    /// From node to node a wave turns by the same angle, so each is a rotation of the one before: no cosine is called within
-    /// a row. Rounding adds up to some 1e-14 of the amplitude over a row of hundreds.
+    /// From node to node, the phase of a wave advances by the same angle, so each value is a rotation of the one
+    /// before: no cosine is computed within a row. Rounding errors accumulate to about 1e-14 of the amplitude over a
+    /// row of hundreds of nodes.
     pub fn add_to_net(&self, first_mm: [f64; 2], step_mm: [f64; 2], columns: usize, values_mm: &mut [f64]) {
         let turns: Vec<_> = self.waves.iter().map(|[kx, ..]| (kx * step_mm[0]).sin_cos()).collect();
         for (j, row) in values_mm.chunks_mut(columns).enumerate() {

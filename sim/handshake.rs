@@ -1,7 +1,7 @@
-//! The handshake of docs/modbus.md as a machine keeps it: one state, commands that are values, and time that is told to it.
+//! Machine's side of the handshake of docs/modbus.md: one state, commands as values, and time as an input.
 //!
-//! Whatever a frame asks, the number and the answer are latched before anything moves, and a (job, cycle) moves once in a
-//! machine's life. Nothing here knows a register's address or a clock.
+//! For every frame, the number and the answer are latched before anything moves. A (job, cycle) moves the machine only
+//! once in its life. Nothing here knows the address of a register, or a clock.
 
 use std::borrow::Cow;
 use std::collections::BTreeSet;
@@ -23,13 +23,13 @@ const FAULT_SUPPLIES: u16 = 3;
 const FAULT_SILENT: u16 = 20;
 const FAULT_OTHER: u16 = 30;
 
-/// How long a token lives.
+/// Lifetime of a token.
 const TOKEN_LIFE: Duration = Duration::from_secs(30);
 
-/// The longest step in which the physics is moved on, unless there would be more than 200 in a tick.
+/// Maximum time step of the physics, in s, unless a tick would then have more than 200 steps.
 const STEP_S: f64 = 0.1;
 
-/// The job that was prepared.
+/// Prepared job.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Work {
     job: u32,
@@ -37,7 +37,7 @@ struct Work {
     digest: u32,
 }
 
-/// One machine's side of the handshake.
+/// Machine's side of the handshake.
 pub(crate) struct Handshake {
     pub(crate) body: Box<dyn Body>,
     pub(crate) log: Log,
@@ -59,15 +59,15 @@ pub(crate) struct Handshake {
     work: Work,
     token: u32,
     token_left: Duration,
-    /// A START began a job that has not ended.
+    /// True if a START began a job that has not ended.
     running: bool,
     begun_by: u32,
     begun: BTreeSet<(u32, u16)>,
     trusting: bool,
     gives_ahead: bool,
-    /// What comes into force next is changed once it has been looked at.
+    /// True if the next payload in force is changed after it has been checked.
     spoils: bool,
-    /// It has come into force, and nobody has looked yet.
+    /// True if such a payload is in force and has not been read yet.
     spoils_soon: bool,
     last_begun: (u32, u16),
     done: u32,
@@ -76,7 +76,7 @@ pub(crate) struct Handshake {
     owner: u32,
     epoch: u32,
     silent: Duration,
-    /// To the beats of the job that runs.
+    /// Beats of the owner during the running job.
     listening: Listening,
     acting_left: Duration,
 }
@@ -124,7 +124,7 @@ impl Handshake {
         }
     }
 
-    /// Looks at the command block, of which the last register has just been written.
+    /// Reads the command block after its last register was written.
     pub(crate) fn look(&mut self, words: &[u16; 20]) {
         let Some(frame) = Frame::read(self.order, words) else { return self.note(What::Broken) };
         let (sequence, command) = (frame.sequence, Command::of(frame.command));
@@ -143,18 +143,18 @@ impl Handshake {
         }
     }
 
-    /// Says whether a client is the one that owns the machine.
+    /// Returns true if a client owns the machine.
     pub(crate) fn is_owned_by(&self, owner: u32) -> bool {
         owner != 0 && owner == self.owner
     }
 
-    /// The owner's beat has moved.
+    /// Handles a new beat of the owner.
     pub(crate) fn beat(&mut self) {
         self.listening.hear(self.now);
         self.hear();
     }
 
-    /// The owner has given a sign of life.
+    /// Handles a sign of life of the owner.
     fn hear(&mut self) {
         self.silent = Duration::ZERO;
     }
@@ -242,7 +242,7 @@ impl Handshake {
         Some(hasher.finalize())
     }
 
-    /// Does what was accepted; number and answer stand already.
+    /// Carries out an accepted command; its number and answer are latched already.
     fn act(&mut self, command: Command, frame: &Frame) {
         match command {
             Command::Claim => {
@@ -292,7 +292,7 @@ impl Handshake {
         self.retract(State::Holding);
     }
 
-    /// Moves clear of the part and stays in a state that takes a while.
+    /// Moves clear of the part, and enters a state that lasts some time.
     fn retract(&mut self, acting: State) {
         self.token = 0;
         self.acting_left = self.acting;
@@ -300,7 +300,7 @@ impl Handshake {
         self.body.retract();
     }
 
-    /// Shows a fault, ends a job that is running as failed, and waits for CLEAR.
+    /// Shows a fault, ends a running job as failed, and waits for CLEAR.
     pub(crate) fn fail(&mut self, fault: u16) {
         self.token = 0;
         self.show(fault);
@@ -327,7 +327,7 @@ impl Handshake {
         }
     }
 
-    /// Ends a job that is running; false if its result cannot be put into words.
+    /// Ends a running job; returns false if its result cannot be encoded.
     fn end(&mut self, result: u16) -> bool {
         if !std::mem::take(&mut self.running) {
             return true;
@@ -339,19 +339,19 @@ impl Handshake {
         self.outbox.is_some()
     }
 
-    /// Whose result it is, that of the job that runs or has just ended.
+    /// Returns the origin of the result of the job that runs or has just ended.
     fn origin(&self) -> Origin {
         let slot = self.slots[if self.body.kind() == Kind::Cmm { 0 } else { 1 }].as_ref();
         let identity = slot.map_or([0; 32], |slot| slot.payload.identity);
         Origin { job: self.work.job, cycle: self.work.cycle, done: self.done, identity }
     }
 
-    /// Says whether full pages of a result can be had while its job still runs.
+    /// Returns true if full pages of a result are available while its job still runs.
     pub(crate) fn gives_ahead(&self) -> bool {
         self.gives_ahead && self.body.tells_so_far()
     }
 
-    /// Returns the outbox as it is now, if there is anything in it.
+    /// Returns the present outbox, if it has content.
     pub(crate) fn outbox(&self) -> Option<Cow<'_, Outbox>> {
         match self.state {
             State::Complete => self.outbox.as_ref().map(Cow::Borrowed),
@@ -371,7 +371,7 @@ impl Handshake {
         }
     }
 
-    /// Lets some real time pass, at most a few hundredths of a second.
+    /// Lets real time pass, at most a few hundredths of a second.
     pub(crate) fn pass(&mut self, elapsed: Duration) {
         self.now += elapsed;
         self.silent = self.silent.saturating_add(elapsed);
@@ -451,7 +451,7 @@ impl Handshake {
         self.body.interlocks() & interlock::ALL & !self.opened
     }
 
-    /// Opens interlocks whatever the physics says; 0 leaves it to the physics again.
+    /// Opens interlocks whatever the physics reports; 0 returns them to the physics.
     pub(crate) fn open(&mut self, bits: u16) {
         self.opened = bits;
         if self.state == State::Prepared && !self.is_safe(interlock::ALL) {
@@ -459,7 +459,7 @@ impl Handshake {
         }
     }
 
-    /// Turns the key at the panel; a machine that moves holds.
+    /// Turns the key at the panel; a moving machine holds.
     pub(crate) fn turn_key(&mut self, mode: Mode) {
         if self.mode != mode {
             self.mode = mode;
@@ -470,7 +470,7 @@ impl Handshake {
         }
     }
 
-    /// Somebody presses the button at the panel that has a held job go on.
+    /// Presses the button at the panel that continues a held job.
     pub(crate) fn press_start(&mut self) {
         if self.state == State::Held && self.running && self.is_safe(interlock::MOVING) {
             (self.fault, self.silent) = (0, Duration::ZERO);
@@ -478,7 +478,7 @@ impl Handshake {
         }
     }
 
-    /// Begins to move without an order, or is brought back to where it stood.
+    /// Starts an uncommanded motion, or returns the machine to its state before.
     pub(crate) fn stray(&mut self, strays: bool) {
         if strays && self.state == State::Idle {
             self.note(What::Strayed);
@@ -490,12 +490,12 @@ impl Handshake {
         }
     }
 
-    /// What comes into force next does not stay what was sent.
+    /// Makes the next payload in force differ from what was sent.
     pub(crate) fn spoil(&mut self) {
         self.spoils = true;
     }
 
-    /// Somebody has looked at what is in force.
+    /// Notes that a client has read what is in force.
     pub(crate) fn looked_at(&mut self) {
         if !std::mem::take(&mut self.spoils_soon) {
             return;
@@ -508,7 +508,8 @@ impl Handshake {
         }
     }
 
-    /// Starts the application anew: it forgets all but which jobs it began, and a motion that was cut off is a fault.
+    /// Restarts the application: it forgets everything except the jobs that it began, and an interrupted motion is a
+    /// fault.
     pub(crate) fn reboot(&mut self) {
         let cut_off = self.lose_memory();
         self.note(What::Rebooted { boot_id: self.boot_id });
@@ -519,12 +520,13 @@ impl Handshake {
         }
     }
 
-    /// Takes another boot id and forgets all but which jobs it began; returns whether a motion was cut off.
+    /// Takes another boot id and forgets everything except the jobs that it began; returns true if a motion was
+    /// interrupted.
     fn lose_memory(&mut self) -> bool {
         let cut_off = std::mem::take(&mut self.running);
         if cut_off {
             self.body.retract();
-            // The physics ends its job; what it leaves is lost with the application's memory.
+            // The physics ends its job; its result is lost with the application's memory.
             let _ = self.body.outcome(4);
         }
         self.boot_id = loop {
@@ -541,7 +543,8 @@ impl Handshake {
         cut_off
     }
 
-    /// Starts the application anew as one does that keeps its boot id and none of its jobs: it stands idle, as if it had never been asked.
+    /// Restarts an application that keeps its boot id and forgets its jobs: it is idle, as if it had never been
+    /// commanded.
     pub(crate) fn forget(&mut self) {
         let boot_id = self.boot_id;
         self.lose_memory();
@@ -556,7 +559,7 @@ impl Handshake {
         self.log.push(self.now, what);
     }
 
-    /// Puts a payload into force; else says why not.
+    /// Puts a payload into force; otherwise returns the answer that refuses it.
     pub(crate) fn take(&mut self, arrived: Arrived) -> Result<(), u16> {
         let (kind, identity) = (arrived.kind, arrived.identity);
         let slot = Slot::new(self.order, arrived);
@@ -572,12 +575,12 @@ impl Handshake {
         Ok(())
     }
 
-    /// Says whether the payloads may not be touched.
+    /// Returns true if the payloads must not be changed.
     pub(crate) fn is_moving(&self) -> bool {
         matches!(self.state, State::Execute | State::Holding | State::Held)
     }
 
-    /// Returns the status block but for its snapshot number and the beats.
+    /// Returns the status block, without its snapshot number and the beats.
     pub(crate) fn image(&self) -> Vec<u16> {
         let temperature = (self.body.temperature_c() * 100.0).round().clamp(-32768.0, 32767.0) as i16;
         Image::new(self.order, 48)

@@ -1,30 +1,32 @@
-//! A head that turns the wheel about one axis: where the wheel's centre is by what the slides and the scale of the axis show.
+//! Head that turns the wheel about one axis: position of the wheel's centre from the positions of the slides and the
+//! scale of the axis.
 //!
 //! ```text
 //!  pivot = slides + v          v: from the wheel's centre to the pivot with the head upright
 //!  centre = pivot - R v        R: the turn, about x for an A, about y for a B
 //! ```
 //!
-//! A control that keeps the wheel's centre does the same with its own figures: then the centre is where programs say.
+//! A control that keeps the wheel's centre computes the same with its own parameters: the centre is then where the
+//! program says.
 
 use crate::Vec3;
 use crate::program::{Program, Stop};
 
-/// A head.
+/// Rotary head.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Head {
-    /// What programs call its axis.
+    /// Letter of its axis in programs.
     pub letter: char,
-    /// Whether its scale counts left-handed.
+    /// True if its scale counts left-handed.
     pub left_handed: bool,
-    /// Least and largest angle on its scale.
+    /// Lower and upper limit of the angle on its scale.
     pub range_deg: [f64; 2],
-    /// From the wheel's centre to the pivot with the head upright, where the control leads the slides alone.
+    /// Vector from the wheel's centre to the pivot with the head upright, if the control moves only the slides.
     pub pivot_mm: Option<Vec3>,
 }
 
 impl Head {
-    /// Returns the centre of the wheel where slides and scale are.
+    /// Returns the centre of the wheel for positions of slides and scale.
     pub fn centre_mm(&self, slides_mm: Vec3, scale_deg: f64) -> Vec3 {
         let Some([u, v, w]) = self.pivot_mm else { return slides_mm };
         let angle = if self.left_handed { -scale_deg } else { scale_deg }.to_radians();
@@ -35,14 +37,15 @@ impl Head {
         std::array::from_fn(|k| pivot[k] - arm[k])
     }
 
-    /// Returns the centre of the wheel at a share of the way from a stop to the next; the head turns in proportion to what the slides have gone.
+    /// Returns the centre of the wheel at a share of the way from a stop to the next; the head turns in proportion to
+    /// the way of the slides.
     pub fn along_mm(&self, from: &Stop, to: &Stop, share: f64) -> Vec3 {
         let slides = to.on_the_way(from.at_mm, share);
         let ends = from.turn_deg.or(to.turn_deg).zip(to.turn_deg);
         ends.map_or(slides, |(a, b)| self.centre_mm(slides, a + share * (b - a)))
     }
 
-    /// Tells why this head cannot do a program.
+    /// Returns the reason why this head cannot execute a program.
     pub(crate) fn refuses(&self, program: &Program) -> Option<String> {
         let letter = program.axis?;
         if letter != self.letter {
@@ -74,7 +77,7 @@ mod tests {
             pivot_mm: Some([0.0, 0.0, 200.0]),
         };
         let close = |a: Vec3, b: Vec3| assert!((0..3).all(|k| (a[k] - b[k]).abs() < 1e-9), "{a:?} {b:?}");
-        // The pivot stays; the wheel below it swings to -x when B turns right-handed, to +y when A does.
+        // The pivot stays. The wheel below it swings to -x when B turns right-handed, and to +y when A does.
         close(head('B', false).centre_mm([0.0; 3], 90.0), [-200.0, 0.0, 200.0]);
         close(head('A', false).centre_mm([0.0; 3], 90.0), [0.0, 200.0, 200.0]);
         close(head('B', true).centre_mm([1.0, 2.0, 3.0], -90.0), [-199.0, 2.0, 203.0]);

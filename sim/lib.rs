@@ -1,44 +1,44 @@
-//! The truth behind a simulated grinding cell.
+//! Ground truth of a simulated grinding cell.
 //!
-//! This crate knows no type of the controller, so that the truth cannot leak into it and no error of the controller's
-//! geometry can hide by being made twice. Surfaces are closed forms with their own derivatives, contact is solved exactly,
-//! and everything random comes from one seed.
+//! This crate uses no type of the controller. The truth therefore cannot leak into the controller, and an error in the
+//! controller's geometry cannot hide by being repeated here. Surfaces are closed forms with analytic derivatives,
+//! contact is solved exactly, and all random numbers come from one seed.
 //!
 //! ```text
-//!  shape   what the part should be: height, gradient, curvature in closed form
-//!  form    what grinding left on it: a smooth random error along the normal
+//!  shape   nominal shape of the part: height, gradient, curvature in closed form
+//!  form    form error left by grinding: a smooth random error along the normal
 //!  probe   a ball that touches the part, in a frame of its own, with noise and outliers
 //!
-//!  spec       the truth in one table: what is wrong with everything
-//!  truth      what the two machines share, and where every random number comes from
+//!  spec       the truth in one table: all errors of the cell
+//!  truth      state that the two machines share, and the source of every random number
 //!  world      the two machines, and queries for tests
 //!  part       the part as it really is, and exact contact with it
-//!  process    the grinder: what a pass leaves, node by node along its path
-//!  executed   the grinder once more: what the wheel leaves along a path that a controller outside really executes
-//!  program    what a control reads in a program
-//!  follow     what a wheel leaves that follows it
-//!  cmm        the measuring machine: what it reports of a plan
+//!  process    the grinder: the surface that a pass leaves, node by node along its path
+//!  executed   the grinder with an external controller: the surface along the executed path
+//!  program    reader of programs, as a control reads them
+//!  follow     the surface left by a wheel that follows a program
+//!  cmm        the measuring machine: its result of a plan
 //!  payload    the bytes of docs/modbus.md
 //!
-//!  body       what the physics of one machine must be able to do
-//!  words      how values lie in registers
+//!  body       interface of the physics of one machine
+//!  words      encoding of values in registers
 //!  transfer   payloads in and results out, a page at a time
 //!  command    commands, answers and states as the wire has them
-//!  options    how a machine is set up: where its registers are
+//!  options    options of a machine, with its register map
 //!  handshake  one machine's side of the handshake: states, interlocks, silence
 //!  registers  a whole machine: what a Modbus client reads and writes
-//!  dme        a server of I++ DME, which is told touch by touch what to do
-//!  rsh        a controller by LinuxCNC, which is told which program to run
-//!  wheel      what a wheel leaves that is led by a program
-//!  faults     what is to go wrong at one of these three
-//!  hits       a machine that prints a line for each touch, and hears nothing
-//!  seen       what the machine saw and did
-//!  wire       Modbus TCP and RTU and I++ DME servers, lines of hits, a serial line without hardware, the path of a controller outside, and
-//!             everything that goes wrong on them
+//!  dme        a server of I++ DME, commanded touch by touch
+//!  rsh        a LinuxCNC controller, commanded program by program
+//!  wheel      the surface left by a wheel that a program moves
+//!  faults     faults of one of these three
+//!  hits       a machine that prints a line for each touch, and receives nothing
+//!  seen       events of the machine
+//!  wire       Modbus TCP and RTU and I++ DME servers, lines of hits, pseudo-terminals, the path of an external
+//!             controller, and the faults of all of them
 //! ```
 //!
-//! Units: millimetres and radians throughout. Frames: `shape` and `form` live in the model frame, the points a probe reports
-//! in the frame of the measuring machine.
+//! Units: millimetres and radians throughout. Frames: `shape` and `form` use the model frame; the points that a probe
+//! reports are in the frame of the measuring machine.
 
 pub mod body;
 pub mod cmm;
@@ -72,7 +72,7 @@ pub mod world;
 /// A position or a direction in space.
 pub type Vec3 = [f64; 3];
 
-/// The generator behind every random number here: portable across machines and releases.
+/// Random generator of the whole crate: portable across machines and releases.
 pub type Rng = rand::rngs::ChaCha8Rng;
 
 /// Returns the generator for a seed.

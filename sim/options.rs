@@ -1,10 +1,11 @@
-//! How a machine is set up, with a register map of its own: what the machine really has, where a cell file says what it should have.
+//! Options of a simulated machine, with a register map of its own: the map that the machine really has, while a cell
+//! file contains the map that it should have.
 
 use std::time::Duration;
 
 use crate::words::WordOrder;
 
-/// The first address of every block.
+/// First address of every block.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub struct Layout {
@@ -75,7 +76,7 @@ impl Layout {
         ]
     }
 
-    /// Returns the block that an address lies in, and where in it.
+    /// Returns the block that contains an address, and the offset in it.
     pub(crate) fn find(&self, address: usize) -> Option<(Block, usize, usize)> {
         self.blocks().into_iter().find_map(|(block, first, length)| {
             let offset = address.checked_sub(first.into())?;
@@ -84,32 +85,33 @@ impl Layout {
     }
 }
 
-/// How a simulated machine is set up.
+/// Options of a simulated machine.
 #[derive(Clone, Debug)]
 pub struct MachineOptions {
-    /// In which order the words of a value stand.
+    /// Order of the words of a value.
     pub word_order: WordOrder,
-    /// Whether the low byte of each register stands before the high one.
+    /// True if the low byte of each register comes before the high one.
     pub swaps_bytes: bool,
-    /// Where the blocks are.
+    /// Addresses of the blocks.
     pub layout: Layout,
     /// Seconds of the machine's own time in a real second.
     pub speed: f64,
-    /// Draws the tokens and the next boot ids.
+    /// Seed of the tokens and of the next boot ids.
     pub seed: u64,
-    /// Milliseconds after which a silent client is lost; 0 stands for 3000.
+    /// Silence in ms after which a client is lost; 0 means 3000.
     pub lost_after_ms: u16,
-    /// Real time that the machine is HOLDING, STOPPING or ABORTING.
+    /// Real time that the machine stays in HOLDING, STOPPING or ABORTING.
     pub acting: Duration,
-    /// The longest payload it holds.
+    /// Maximum length of a payload.
     pub payload_limit_bytes: u32,
-    /// The version of the map that it says it keeps.
+    /// Version of the register map that the machine reports.
     pub version: u16,
-    /// The job and cycle it began before it was switched off.
+    /// Job and cycle that the machine began before it was switched off.
     pub last_begun: Option<(u32, u16)>,
-    /// A CMM gives the full pages of a result while its job still runs, and says so.
+    /// True if a CMM gives, and declares, the full pages of a result while its job still runs.
     pub gives_ahead: bool,
-    /// It takes its client's word: begins a job that it has begun before, and does not hold what is in force against what is told to be.
+    /// True if the machine trusts its client: it begins a job that it has begun before, and does not check the payloads
+    /// in force against the digest.
     pub trusting: bool,
 }
 

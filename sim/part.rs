@@ -1,27 +1,29 @@
-//! The part as it really is, with an aperture and a grid of its own, for the truth must share no error with the code under test.
+//! True part, with an aperture and a grid of its own: the truth must share no error with the code under test.
 //!
-//! It is a closed form plus a height error that grinding changes, and the ball that touches it.
+//! The part is a closed form plus a height error that grinding changes. This module also computes the contact of a ball
+//! with it.
 //!
-//! The height error h stands on a fine grid over the part and a little beyond, in millimetres along the nominal normal,
-//! and is interpolated by bicubic convolution (Catmull-Rom), which has a continuous gradient. That interpolation is the
-//! truth: the real surface is r(x, y) = S(x, y) + h(x, y) n(x, y), and its tangents
+//! The height error h is given on a fine grid over the part and a little beyond, in mm along the nominal normal. It is
+//! interpolated by bicubic convolution (Catmull-Rom), which has a continuous gradient. That interpolation is the truth:
+//! the real surface is r(x, y) = S(x, y) + h(x, y) n(x, y), and its tangents
 //!
 //! ```text
 //!  r_x = S_x + h_x n + h n_x,    r_y = S_y + h_y n + h n_y
 //! ```
 //!
-//! are exact, with the derivative of n from the second derivatives of the closed form. Where it was ground the wheel has left a groove
-//! around each of its tracks, which stands over h by
+//! are exact, with the derivative of n from the second derivatives of the closed form. Where it was ground, the wheel
+//! has left a groove around each of its tracks, whose height over h is
 //!
 //! ```text
-//!  b(x, y) (y - y_k)^2 / 2        y_k the nearest track, b how much more the wheel bends across the track than the part
+//!  b(x, y) (y - y_k)^2 / 2        y_k the nearest track, b the curvature of the wheel across it minus the part's
 //! ```
 //!
-//! and where two grooves meet there is a ridge. A ball of radius R travelling along
-//! p + t d touches where r + R m = p + t d, m the unit normal of r: three equations for x, y, t, solved by Newton's method.
-//! The slopes that Newton steps with are differences; what they lead to is the root of the exact equations. A ball that is sharper than the
-//! wheel touches in one groove, or lies on the ridge between two: where the foot in each of both grooves, were it to go on, lies in the
-//! other. A ball that is as blunt as the wheel or blunter reaches into no groove and rides on the ridges, on the one that it meets first.
+//! and where two grooves meet there is a ridge. A ball of radius R travelling along p + t d touches where r + R m = p +
+//! t d, m the unit normal of r: three equations for x, y, t, solved by Newton's method. The slopes of the Newton steps
+//! are differences; the result is the root of the exact equations. A ball that is sharper than the wheel touches in one
+//! groove, or lies on the ridge between two: it lies on the ridge if the contact in each groove, continued beyond its
+//! strip, would lie in the strip of the other. A ball that is as blunt as the wheel or blunter reaches into no groove;
+//! it rides on the ridges, on the one that it meets first.
 
 use serde::{Deserialize, Serialize};
 
@@ -29,9 +31,9 @@ use crate::Vec3;
 use crate::form::FormError;
 use crate::shape::{Biconic, FreeForm, OffAxisAsphere, Shape, Sphere, ThroughOrigin, Wave, XyPolynomial};
 
-/// Distance of the grid's nodes in millimetres; more on a part so large that the grid would have over 400 nodes along.
+/// Spacing of the grid's nodes in mm; it is larger on a part where the grid would have over 400 nodes along a side.
 pub const NODE_SPACING_MM: f64 = 0.5;
-/// Nodes beyond the aperture on every side, so that interpolation at the edge has its neighbours.
+/// Number of nodes beyond the aperture on every side, so that interpolation at the edge has its neighbours.
 const MARGIN_NODES: usize = 2;
 
 /// The part and its blank, as the world's table says.
@@ -71,9 +73,9 @@ pub struct DefectSpec {
 }
 
 impl DefectSpec {
-    /// Returns its height at (x, y) in millimetres.
+    /// Returns the height of the defect at (x, y), in mm.
     pub fn height_mm(&self, [x, y]: [f64; 2]) -> f64 {
-        /// Flanks go half of it into the rectangle and half out of it.
+        /// Width of a flank, in mm: half of it is inside the rectangle and half outside.
         const FLANK_MM: f64 = 1.0;
         let from_middle = [x - self.at_mm[0], y - self.at_mm[1]];
         let share = if self.round {
@@ -162,7 +164,7 @@ pub struct Coefficient {
 }
 
 impl ShapeSpec {
-    /// Returns the surface.
+    /// Builds the surface.
     pub fn build(&self) -> Box<dyn Shape> {
         match self.clone() {
             Self::FreeForm {} => Box::new(FreeForm::default()),
@@ -199,7 +201,7 @@ pub enum Aperture {
 }
 
 impl Aperture {
-    /// Returns half the width and half the depth of the rectangle about it, in millimetres.
+    /// Returns half the width and half the depth of the bounding rectangle, in mm.
     pub fn half_mm(&self) -> [f64; 2] {
         match *self {
             Self::Rectangle { half_x_mm, half_y_mm } => [half_x_mm, half_y_mm],
@@ -207,7 +209,7 @@ impl Aperture {
         }
     }
 
-    /// Says whether (x, y) lies within.
+    /// Returns true if (x, y) is inside.
     pub fn contains(&self, x: f64, y: f64) -> bool {
         match *self {
             Self::Rectangle { half_x_mm, half_y_mm } => x.abs() <= half_x_mm && y.abs() <= half_y_mm,
@@ -223,12 +225,12 @@ pub struct HeightGrid {
     step_mm: [f64; 2],
     columns: usize,
     rows: usize,
-    /// Row by row, x fastest, in millimetres.
+    /// Heights row by row, x fastest, in mm.
     pub(crate) heights_mm: Vec<f64>,
 }
 
 impl HeightGrid {
-    /// Lays a grid over a rectangle about the origin, all at one height.
+    /// Creates a grid over a rectangle about the origin, with one height at all nodes.
     pub fn over(half_mm: [f64; 2], height_mm: f64) -> Self {
         let spacing = NODE_SPACING_MM.max(half_mm[0].max(half_mm[1]) / 200.0);
         let cells = half_mm.map(|half| ((2.0 * half / spacing).ceil() as usize).max(4));
@@ -243,8 +245,9 @@ impl HeightGrid {
         (0..self.rows).flat_map(move |j| (0..self.columns).map(move |i| self.node(i, j)))
     }
 
-    /// Returns the nodes from x0 up to x1 and from y0 up to y1, in whichever order those are given, each with its number: a border belongs to
-    /// what lies above it, so that of rectangles side by side no node is in two or in none.
+    /// Returns the nodes from x0 up to x1 and from y0 up to y1, in whichever order those are given, each with its
+    /// index. A border belongs to what lies above it, so that each node of adjacent rectangles is in exactly one of
+    /// them.
     pub(crate) fn within(&self, x_mm: [f64; 2], y_mm: [f64; 2]) -> impl Iterator<Item = (usize, [f64; 2])> + '_ {
         let from = |k: usize, place: f64| ((place - self.first_mm[k]) / self.step_mm[k]).ceil().max(0.0) as usize;
         let range =
@@ -289,7 +292,7 @@ impl HeightGrid {
 
 /// Returns the first of the four nodes about a place, their weights, and the derivatives of the weights.
 ///
-/// Beyond the innermost cells the place is held at the border, and the derivatives are 0.
+/// Beyond the innermost cells, the place is clamped to the border, and the derivatives are 0.
 fn weights(t: f64, first: f64, step: f64, nodes: usize) -> (usize, [f64; 4], [f64; 4]) {
     let place = (t - first) / step;
     let held = place.clamp(1.0, (nodes - 2) as f64);
@@ -306,21 +309,22 @@ fn weights(t: f64, first: f64, step: f64, nodes: usize) -> (usize, [f64; 4], [f6
     (cell - 1, w, d.map(|c| c * inside))
 }
 
-/// What the wheel has left around its tracks, which run along x.
+/// Grooves that the wheel has left around its tracks, which run along x.
 #[derive(Clone, Debug)]
 pub struct Grooves {
-    /// Place of a track, in y.
+    /// y of a track, in mm.
     pub first_mm: f64,
-    /// Distance of the tracks.
+    /// Spacing of the tracks, in mm.
     pub spacing_mm: f64,
-    /// Radius of the wheel across them.
+    /// Radius of the wheel across the tracks, in mm.
     pub wheel_radius_mm: f64,
-    /// How much more the wheel bends across the track than the part, over y, in 1/mm; 0 where nothing was ground.
+    /// Curvature of the wheel across the track minus that of the part, over y, in 1/mm; 0 where nothing was ground.
     pub bend: HeightGrid,
 }
 
 impl Grooves {
-    /// Returns how much more a wheel bends across tracks along x than the part at (x, y): the least gap between both along the track, over y.
+    /// Returns the curvature of a wheel across tracks along x minus that of the part at (x, y), over y, from the
+    /// minimum gap between both along the track.
     pub fn bend_at(shape: &dyn Shape, wheel_radius_mm: f64, [x, y]: [f64; 2]) -> f64 {
         let ([p, q], hessian) = (shape.gradient(x, y), shape.hessian(x, y));
         let w = 1.0 / (1.0 + p * p + q * q).sqrt();
@@ -347,34 +351,34 @@ impl Grooves {
     }
 }
 
-/// What came of moving a ball towards the part.
+/// Result of moving a ball towards the part.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Contact {
     /// The ball touches.
     Touched {
-        /// Its centre in the model frame, in millimetres.
+        /// Centre of the ball in the model frame, in mm.
         centre_mm: Vec3,
-        /// Where it touches, over the plane.
+        /// Projection of the contact onto the plane (x, y), in mm.
         foot_mm: [f64; 2],
     },
-    /// The ball was in the material already where the search should begin.
+    /// The ball was in the material already where the search begins.
     Unexpected,
     /// The search ended without a touch, or the place is beyond the part's edge.
     Missed,
 }
 
-/// The way of a ball's centre, in the model frame.
+/// Way of a ball's centre, in the model frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Approach {
-    /// The target.
+    /// Target point, in mm.
     pub point_mm: Vec3,
-    /// The direction from which the ball comes, of unit length.
+    /// Direction from which the ball comes, of unit length.
     pub direction: Vec3,
-    /// Radius of the ball.
+    /// Radius of the ball, in mm.
     pub radius_mm: f64,
-    /// Distance of the centre from the target, along the direction, where the search begins.
+    /// Distance of the centre from the target, along the direction, where the search begins, in mm.
     pub from_mm: f64,
-    /// The same where it ends.
+    /// Distance of the centre from the target, along the direction, where the search ends, in mm.
     pub to_mm: f64,
 }
 
@@ -384,15 +388,16 @@ impl Approach {
     }
 }
 
-/// A part with its real surface.
+/// Part with its real surface.
 pub struct Part {
-    /// What it should be.
+    /// Nominal surface.
     pub shape: Box<dyn Shape>,
-    /// Where it is.
+    /// Aperture of the part.
     pub aperture: Aperture,
-    /// How far it stands proud, along the nominal normal; where it is ground, at the bottom of the grooves.
+    /// Height of the real surface over the nominal, along the nominal normal; where it is ground, at the bottom of the
+    /// grooves.
     pub height: HeightGrid,
-    /// The grooves that the last pass left; none on a blank.
+    /// Grooves that the last pass left; `None` on a blank.
     pub grooves: Option<Grooves>,
 }
 
@@ -413,12 +418,12 @@ impl Part {
         Self { shape: spec.shape.build(), aperture: spec.aperture, height, grooves: None }
     }
 
-    /// Returns how far the real surface stands proud at (x, y), along the nominal normal, in millimetres.
+    /// Returns the deviation of the real surface at (x, y), along the nominal normal, in mm.
     pub fn deviation_mm(&self, x: f64, y: f64) -> f64 {
         self.proud(x, y, self.nearest_track(y)).0
     }
 
-    /// Returns how far the ridges stand over the bottom of the grooves at (x, y), in millimetres.
+    /// Returns the height of the ridges over the bottom of the grooves at (x, y), in mm.
     pub fn ridge_mm(&self, x: f64, y: f64) -> f64 {
         self.grooves.as_ref().map_or(0.0, |grooves| grooves.bend.at(x, y).0 * grooves.spacing_mm.powi(2) / 8.0)
     }
@@ -427,7 +432,7 @@ impl Part {
         self.grooves.as_ref().map_or(0.0, |grooves| grooves.nearest(y))
     }
 
-    /// Height and its gradient, in the groove of a track.
+    /// Returns the height and its gradient, in the groove of a track.
     fn proud(&self, x: f64, y: f64, track: f64) -> (f64, [f64; 2]) {
         let (h, slope) = self.height.at(x, y);
         let Some(grooves) = &self.grooves else { return (h, slope) };
@@ -435,13 +440,14 @@ impl Part {
         (h + over, [slope[0] + by[0], slope[1] + by[1]])
     }
 
-    /// Returns the point of the real surface over (x, y) of the nominal, and the unit normal of the real surface there.
+    /// Returns the point of the real surface over (x, y) of the nominal, and the unit normal of the real surface at
+    /// that point.
     pub fn surface(&self, x: f64, y: f64) -> (Vec3, Vec3) {
         let (point, tx, ty) = self.tangents(x, y, self.nearest_track(y));
         (point, unit_normal(tx, ty))
     }
 
-    /// The point and its derivatives by x and y, in the groove of a track as if it went on for ever.
+    /// Returns the point and its derivatives by x and y, in the groove of a track continued without end.
     fn tangents(&self, x: f64, y: f64, track: f64) -> (Vec3, Vec3, Vec3) {
         let ([p, q], [zxx, zxy, zyy]) = (self.shape.gradient(x, y), self.shape.hessian(x, y));
         let (h, [hx, hy]) = self.proud(x, y, track);
@@ -461,7 +467,7 @@ impl Part {
 
     /// Moves a ball along its way until it touches.
     ///
-    /// A touch whose foot lies beyond the aperture is none: the part's side and rim are not modelled.
+    /// A touch whose contact lies beyond the aperture is a miss: the part's side and rim are not modelled.
     pub fn touch(&self, way: &Approach) -> Contact {
         let start = way.centre(way.from_mm);
         let Some(t) = self.near_contact(way) else { return Contact::Missed };
@@ -478,14 +484,14 @@ impl Part {
         }
     }
 
-    /// Returns the distance of a centre from the real surface less the radius, to first order.
+    /// Returns the distance of a centre from the real surface minus the radius, to first order.
     fn gap(&self, c: Vec3, radius_mm: f64) -> f64 {
         let [p, q] = self.shape.gradient(c[0], c[1]);
         let vertical = c[2] - self.shape.height(c[0], c[1]);
         vertical / (1.0 + p * p + q * q).sqrt() - self.height.at(c[0], c[1]).0 - radius_mm
     }
 
-    /// Steps down the way by what is free until the ball is near to touching.
+    /// Moves down the way in steps of the free distance until the ball is near contact.
     fn near_contact(&self, way: &Approach) -> Option<f64> {
         let mut t = way.from_mm;
         for _ in 0..100 {
@@ -501,7 +507,7 @@ impl Part {
         Some(t)
     }
 
-    /// Returns where the ball touches, from a place nearby; none where no place is found.
+    /// Returns the contact from a start nearby; `None` if none is found.
     fn exact_contact(&self, way: &Approach, t: f64) -> Option<([f64; 2], f64)> {
         let centre = way.centre(t);
         let [p, q] = self.shape.gradient(centre[0], centre[1]);
@@ -530,7 +536,7 @@ impl Part {
         None
     }
 
-    /// Solves |r - c| = R and (r - c) . r_x = 0 along the ridge at y, with c = p + t d, from a place nearby.
+    /// Solves |r - c| = R and (r - c) . r_x = 0 along the ridge at y, with c = p + t d, from a start nearby.
     fn contact_on_ridge(&self, way: &Approach, [mut x, mut t]: [f64; 2], y: f64) -> Option<([f64; 2], f64)> {
         let track = self.nearest_track(y);
         let mut last = f64::INFINITY;
@@ -559,7 +565,8 @@ impl Part {
         (last < 1e-10).then_some(([x, y], t))
     }
 
-    /// Solves r + R m = p + t d in the groove of a track from a place nearby; none where that does not converge.
+    /// Solves r + R m = p + t d in the groove of a track from a start nearby; `None` if the iteration does not
+    /// converge.
     fn contact_in(&self, way: &Approach, from: Vec3, track: f64) -> Option<([f64; 2], f64)> {
         let offset = |x: f64, y: f64| -> Vec3 {
             let (r, tx, ty) = self.tangents(x, y, track);
@@ -573,7 +580,7 @@ impl Part {
             let (c, ball) = (offset(x, y), way.centre(t));
             let miss: Vec3 = std::array::from_fn(|i| c[i] - ball[i]);
             let size = miss.iter().fold(0.0, |most: f64, e| most.max(e.abs()));
-            // At the rounding of the coordinates the miss ceases to fall.
+            // At the rounding error of the coordinates, the residual stops falling.
             if !size.is_finite() || size < 1e-14 || (size < 1e-11 && size >= last) {
                 last = last.min(size);
                 break;
@@ -613,7 +620,7 @@ fn solve([a, b, c]: [Vec3; 3], right: Vec3) -> Option<Vec3> {
     x.iter().all(|value| value.is_finite()).then_some(x)
 }
 
-/// Returns where a ball's centre comes to rest on a sphere, coming from the outside.
+/// Returns the position of a ball's centre in contact with a sphere, coming from the outside.
 pub fn touch_sphere(centre_mm: Vec3, sphere_radius_mm: f64, way: &Approach) -> Contact {
     let from_centre: Vec3 = std::array::from_fn(|i| way.point_mm[i] - centre_mm[i]);
     let along = dot(from_centre, way.direction);
@@ -624,7 +631,7 @@ pub fn touch_sphere(centre_mm: Vec3, sphere_radius_mm: f64, way: &Approach) -> C
     }
     let t = (reach * reach - beside).sqrt() - along;
     if t > way.from_mm {
-        // Coming from the far side, the ball may leave the sphere before the search begins.
+        // A ball that comes from the far side can leave the sphere before the search begins.
         let inside = t - 2.0 * (t + along) < way.from_mm;
         return if inside { Contact::Unexpected } else { Contact::Missed };
     }
@@ -649,7 +656,7 @@ mod tests {
         Approach { point_mm: part.shape.point(x, y), direction, radius_mm: 1.5, from_mm: 4.5, to_mm: -1.5 }
     }
 
-    /// Returns the distance of a point from the real surface by looking everywhere nearby, ever closer.
+    /// Returns the distance of a point from the real surface by a search of the neighbourhood with shrinking steps.
     fn distance_by_search(part: &Part, c: Vec3) -> f64 {
         let (mut best, mut middle, mut half) = (f64::INFINITY, [c[0], c[1]], 3.0);
         while half > 1e-7 {
@@ -706,7 +713,7 @@ mod tests {
         }
     }
 
-    /// A part that a wheel has left its grooves on.
+    /// Returns a part with the grooves of a wheel.
     fn grooved(wheel_radius_mm: f64, spacing_mm: f64) -> Part {
         let mut part = rough_part();
         let mut bend = HeightGrid::over(part.aperture.half_mm(), 0.0);
@@ -724,13 +731,14 @@ mod tests {
         assert_eq!([at(&chip, 2.0, 0.0), at(&chip, 0.0, -2.5), at(&chip, 9.0, 9.0)], [0.0; 3]);
         let bump = DefectSpec { height_um: 16.0, round: true, ..chip };
         assert_eq!([at(&bump, 0.0, 0.0), at(&bump, 1.5, 0.0), at(&bump, 0.0, 2.0)], [0.016, 0.0, 0.0]);
-        // Half of the square of its radius from its middle: a quarter of its height is left.
+        // Half the square of its radius from its middle: a quarter of its height is left.
         assert!((at(&bump, 0.75_f64.hypot(0.75), 0.0) - 0.004).abs() < 1e-12);
     }
 
     #[test]
     fn a_ball_touches_grooves_and_ridges_and_cuts_nothing() {
-        // A ball of 1.5 mm lies in the grooves of a wheel of 12.5 mm, hardly in those of 1.6 mm, and rides on the ridges of one of 1 mm.
+        // A ball of 1.5 mm lies in the grooves of a wheel of 12.5 mm, hardly in those of 1.6 mm, and rides on the
+        // ridges of one of 1 mm.
         for (wheel_radius_mm, spacing_mm, rides) in [(12.5, 0.5, false), (1.6, 0.3, false), (1.0, 0.2, true)] {
             let part = grooved(wheel_radius_mm, spacing_mm);
             let (mut on_ridges, mut in_grooves) = (0, 0);
@@ -742,7 +750,7 @@ mod tests {
                 let Contact::Touched { centre_mm: c, foot_mm } = part.touch(&way) else {
                     panic!("no touch at {x} {y}")
                 };
-                // Looked at from everywhere nearby: nothing is nearer than the radius, and the foot is as near.
+                // Search of the neighbourhood: no point is nearer than the radius, and the contact is at the radius.
                 let distance = |[x, y]: [f64; 2]| {
                     let r = part.surface(x, y).0;
                     (0..3).map(|i| (r[i] - c[i]).powi(2)).sum::<f64>().sqrt()
@@ -764,7 +772,7 @@ mod tests {
     fn grooves_are_as_the_wheel_bends_more_than_the_part() {
         let flat = crate::shape::Wave { height_mm: 1e-9 };
         assert!((Grooves::bend_at(&flat, 12.5, [3.0, 4.0]) - 0.08).abs() < 1e-9);
-        // At the foot of a bowl and of a dome, and none where the bowl is narrower than the wheel.
+        // At the bottom of a bowl and at the top of a dome; no groove if the bowl is narrower than the wheel.
         let bowl = |radius_mm: f64| Grooves::bend_at(&Sphere { radius_mm }, 12.5, [0.0, 0.0]);
         assert!((bowl(50.0) - 0.06).abs() < 1e-12 && (bowl(-50.0) - 0.1).abs() < 1e-12 && bowl(12.0) == 0.0);
     }

@@ -1,19 +1,20 @@
-//! The payloads of docs/modbus.md by a reader and writer of its own, for an error in one must not stand at both ends of the wire.
+//! Payloads of docs/modbus.md, with an independent reader and writer: an error must not be the same at both ends of the
+//! wire.
 //!
-//! Plan, map and pass come in, points and pass record go out, as bytes, high word first.
+//! The machines receive plan, map and pass, and send points and pass record, as bytes with the high word first.
 //!
-//! What comes in is trusted in nothing: format, length, count, reserved zeros, finite numbers and declared extremes are
-//! checked before anything of that size is set aside, and what does not hold is a [`Refusal`] in words. The other way
-//! round, [`Plan::encode`] and its like exist so that a test can play the client.
+//! Received bytes are not trusted: format, length, count, reserved zeros, finite numbers and declared extremes are
+//! checked before memory of that size is allocated. A fault gives a [`Refusal`] in words. [`Plan::encode`] and the
+//! other functions of the opposite direction exist so that a test can act as the client.
 
 use crate::Vec3;
 use crate::body::Refusal;
 
-/// Most targets that a plan may have.
+/// Maximum number of targets in a plan.
 pub const MOST_TARGETS: u32 = 500_000;
-/// Most columns, and most rows, that a map may have.
+/// Maximum number of columns, and of rows, in a map.
 pub const MOST_NODES_ALONG: u32 = 4_000;
-/// Most nodes that a map may have.
+/// Maximum number of nodes in a map.
 pub const MOST_NODES: u64 = 4_000_000;
 
 /// Answer of docs/modbus.md: a payload is missing, broken or of another part.
@@ -23,7 +24,7 @@ pub const INTERLOCK: u16 = 9;
 /// Answer of docs/modbus.md: a value is outside the machine's limits.
 pub const OUTSIDE: u16 = 10;
 
-/// What a target is on.
+/// Feature that a target is on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Feature {
     /// The ground part.
@@ -32,12 +33,12 @@ pub enum Feature {
     ReferenceSphere = 2,
 }
 
-/// A point to touch, in the frame of the measuring machine.
+/// Point to touch, in the frame of the measuring machine.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Target {
-    /// The number by which the client knows it.
+    /// Number of the target in the client.
     pub index: u32,
-    /// What it is on.
+    /// Feature that the target is on.
     pub feature: Feature,
     /// The nominal contact point in millimetres.
     pub point_mm: Vec3,
@@ -45,10 +46,10 @@ pub struct Target {
     pub normal: Vec3,
 }
 
-/// Kind 1: what the measuring machine shall touch, and how.
+/// Kind 1: targets of the measuring machine, and how to touch them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plan {
-    /// Radius the probe is said to have, in millimetres.
+    /// Stated radius of the probe, in mm.
     pub probe_radius_mm: f64,
     /// Distance of the ball's surface from the target where the search begins, in millimetres.
     pub approach_mm: f64,
@@ -58,13 +59,13 @@ pub struct Plan {
     pub speed_mm_s: f64,
     /// Height over the highest target at which the probe travels, in millimetres.
     pub safe_height_mm: f64,
-    /// So many of the first targets are touched with care, at a speed of their own in millimetres per second; 0 for none.
+    /// Number of first targets that are touched slowly, and their speed in mm/s; 0 for none.
     pub careful: (u32, f64),
     /// The targets in the order in which they are touched.
     pub targets: Vec<Target>,
 }
 
-/// Kind 2: by how much the ground surface is wanted displaced.
+/// Kind 2: commanded displacement of the ground surface.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Map {
     /// Nodes along x.
@@ -73,67 +74,67 @@ pub struct Map {
     pub rows: u32,
     /// Place of the first node in the model frame, in millimetres.
     pub first_mm: [f64; 2],
-    /// Distance of the nodes along x and y, in millimetres.
+    /// Spacing of the nodes along x and y, in mm.
     pub spacing_mm: [f64; 2],
-    /// Identity of the nominal surface it is made for.
+    /// Identity of the nominal surface for which the map was made.
     pub nominal: [u8; 32],
     /// The displacements in millimetres, row by row, x fastest.
     pub values_mm: Vec<f64>,
 }
 
-/// Kind 3: how the grinder shall move.
+/// Kind 3: motion of the grinder.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pass {
     /// Repetitions of the finishing stroke without in-feed.
     pub spark_out: u16,
-    /// Radius the wheel is said to have, in millimetres.
+    /// Stated radius of the wheel, in mm.
     pub wheel_radius_mm: f64,
     /// Feed along the tracks in millimetres per minute.
     pub feed_mm_min: f64,
-    /// Distance of the tracks in millimetres.
+    /// Spacing of the tracks, in mm.
     pub track_spacing_mm: f64,
-    /// Height of the wanted surface over the nominal, in millimetres.
+    /// Height of the commanded surface over the nominal, in mm.
     pub level_mm: f64,
-    /// Most that may be taken off anywhere by one stroke, in millimetres.
+    /// Maximum depth that one stroke may remove anywhere, in mm.
     pub depth_of_cut_mm: f64,
-    /// The part in the model frame, in millimetres: x least, x most, y least, y most.
+    /// Extent of the part in the model frame, in mm: x min, x max, y min, y max.
     pub extent_mm: [f64; 4],
     /// Identity of the nominal surface.
     pub nominal: [u8; 32],
 }
 
-/// What became of a target.
+/// Result of a target.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Status {
     /// The ball touched.
     Touched = 1,
     /// The search ended without a touch.
     NotFound = 2,
-    /// The probe did not come to the place where the search begins.
+    /// The probe did not reach the place where the search begins.
     NotReached = 3,
 }
 
 /// One record of kind 4.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PointRecord {
-    /// The target's number.
+    /// Number of the target.
     pub index: u32,
-    /// What became of it.
+    /// Result of the target.
     pub status: Status,
-    /// 0 good to 100 bad.
+    /// Quality, from 0 (good) to 100 (bad).
     pub quality: u16,
-    /// The ball's centre in millimetres; zeros where nothing was touched.
+    /// Centre of the ball, in mm; zeros if nothing was touched.
     pub position_mm: Vec3,
 }
 
-/// Kind 5: what a pass did.
+/// Kind 5: result of a pass.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PassRecord {
-    /// The part's run.
+    /// Run of the part.
     pub job: u32,
-    /// Its cycle.
+    /// Cycle of the run.
     pub cycle: u16,
-    /// 1 complete, 2 stopped, 3 aborted, 4 failed.
+    /// Result: 1 complete, 2 stopped, 3 aborted, 4 failed.
     pub result: u16,
     /// Path travelled in millimetres.
     pub path_mm: f64,
@@ -143,9 +144,9 @@ pub struct PassRecord {
     pub depth_mm: f64,
     /// Share of the path that cut nothing.
     pub air_share: f64,
-    /// Spindle load of 1.
+    /// Spindle load, as a share of 1.
     pub spindle_load: f64,
-    /// Radius the wheel is taken to have, in millimetres.
+    /// Radius of the wheel that the machine assumes, in mm.
     pub wheel_radius_mm: f64,
 }
 
@@ -202,7 +203,7 @@ impl Reader<'_> {
     }
 }
 
-/// Refuses bytes that are not exactly a header and so many records.
+/// Refuses bytes whose length is not exactly that of the header and the records.
 fn exact(bytes: &[u8], header: u64, records: u64, size: u64) -> Result<(), Refusal> {
     let expected = header + records * size;
     if bytes.len() as u64 == expected {
@@ -239,7 +240,7 @@ impl Plan {
     /// Reads a plan.
     ///
     /// # Errors
-    /// Bytes that are not a plan, and values that no probe has.
+    /// The bytes are not a plan, or a value is not possible for a probe.
     pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
         let mut reader = Reader { rest: bytes };
         reader.format()?;
@@ -291,7 +292,8 @@ impl Map {
     /// Reads a map.
     ///
     /// # Errors
-    /// Bytes that are not a map, a size beyond the machine's memory, a declared largest value that is not that of the nodes.
+    /// The bytes are not a map, its size is beyond the machine's memory, or the declared largest value is not that of
+    /// the nodes.
     pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
         let mut reader = Reader { rest: bytes };
         reader.format()?;
@@ -345,7 +347,7 @@ impl Map {
         self.values_mm.iter().fold(0.0, |most, value| value.abs().max(most))
     }
 
-    /// Returns the displacement at (x, y) in millimetres: bilinear, and the value of the nearest edge outside the net.
+    /// Returns the displacement at (x, y) in mm: bilinear inside the grid; outside, the value at the nearest edge.
     pub fn at(&self, x: f64, y: f64) -> f64 {
         let along = |t: f64, axis: usize, nodes: u32| {
             let place = ((t - self.first_mm[axis]) / self.spacing_mm[axis]).clamp(0.0, f64::from(nodes - 1));
@@ -363,7 +365,7 @@ impl Pass {
     /// Reads a pass.
     ///
     /// # Errors
-    /// Bytes that are not a pass, and values that no grinder has.
+    /// The bytes are not a pass, or a value is not possible for a grinder.
     pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
         exact(bytes, 128, 0, 0)?;
         let mut reader = Reader { rest: bytes };
@@ -422,7 +424,7 @@ pub fn encode_points(records: &[PointRecord], scale_mm: Option<f64>) -> Vec<u8> 
         bytes.extend(record.quality.to_be_bytes());
         match scale_mm {
             None => push(&mut bytes, &record.position_mm),
-            // A cast to an integer saturates and makes 0 of NaN; the travel of the machine lies far within.
+            // A cast to an integer saturates, and turns NaN into 0; the travel of the machine is far within the range.
             Some(scale) => {
                 bytes.extend(record.position_mm.iter().flat_map(|c| ((c / scale).round() as i32).to_be_bytes()));
             }
@@ -434,7 +436,7 @@ pub fn encode_points(records: &[PointRecord], scale_mm: Option<f64>) -> Vec<u8> 
 /// Reads the records of points, for tests and truth queries.
 ///
 /// # Errors
-/// Bytes that are not such records.
+/// The bytes are not such records.
 pub fn decode_points(bytes: &[u8], scale_mm: Option<f64>) -> Result<Vec<PointRecord>, Refusal> {
     let size = if scale_mm.is_some() { 20 } else { 32 };
     exact(bytes, 0, (bytes.len() / size) as u64, size as u64)?;
@@ -487,7 +489,7 @@ impl PassRecord {
     /// Reads the record, for tests.
     ///
     /// # Errors
-    /// Bytes that are not a record.
+    /// The bytes are not a record.
     pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
         exact(bytes, 64, 0, 0)?;
         let mut reader = Reader { rest: bytes };

@@ -1,4 +1,4 @@
-//! A ball that touches the part.
+//! Ball probe that touches the part.
 
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
@@ -7,21 +7,21 @@ use crate::form::FormError;
 use crate::shape::Shape;
 use crate::{Rng, Vec3};
 
-/// A rigid motion given by its rotation matrix (rows) and its translation.
+/// Rigid motion, given by its rotation matrix (rows) and its translation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Placement {
-    /// The rotation, row by column.
+    /// Rotation matrix, row by column.
     pub rotation: [[f64; 3]; 3],
-    /// The translation in millimetres, applied after the rotation.
+    /// Translation in mm, applied after the rotation.
     pub translation_mm: Vec3,
 }
 
 impl Placement {
-    /// The part's frame and the machine's are one.
+    /// Identity: the part's frame and the machine's frame are the same.
     pub const IDENTITY: Self =
         Self { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation_mm: [0.0; 3] };
 
-    /// Returns the placement that turns about x, then y, then z (fixed axes), then shifts.
+    /// Returns the placement that rotates about x, then y, then z (fixed axes), then translates.
     pub fn new(translation_mm: Vec3, angles_deg: Vec3) -> Self {
         let [(sx, cx), (sy, cy), (sz, cz)] = angles_deg.map(|a| a.to_radians().sin_cos());
         Self {
@@ -50,7 +50,7 @@ impl Placement {
         }
     }
 
-    /// Moves a point from the part's frame to the machine's.
+    /// Transforms a point from the part's frame to the machine's.
     pub fn apply(&self, p: Vec3) -> Vec3 {
         std::array::from_fn(|i| {
             let r = &self.rotation[i];
@@ -59,17 +59,18 @@ impl Placement {
     }
 }
 
-/// A unit vector drawn uniformly from the sphere in N dimensions.
+/// Draws a unit vector uniformly from the sphere in N dimensions.
 fn unit<const N: usize>(rng: &mut Rng) -> [f64; N] {
     let v: [f64; N] = std::array::from_fn(|_| StandardNormal.sample(&mut *rng));
     let norm = v.iter().map(|c: &f64| c * c).sum::<f64>().sqrt();
     v.map(|c| c / norm)
 }
 
-/// Returns the centre of a ball that touches the ground surface where it lies along the nominal normal at (x, y).
+/// Returns the centre of a ball that touches the ground surface at its point on the nominal normal of (x, y).
 ///
-/// The ground surface is S + e n; its own normal, not the nominal one, carries the ball. With the nominal normal n and the
-/// surface gradient of e the offset is exact, so the second-order term of the paper's eq. (6) is in the data.
+/// The ground surface is S + e n. The ball touches along the normal of that surface, not along the nominal one. With
+/// the nominal normal n and the surface gradient of e the offset is exact, so the second-order term of the paper's eq.
+/// (6) is in the data.
 pub fn centre(shape: &dyn Shape, form: &FormError, radius_mm: f64, x: f64, y: f64) -> Vec3 {
     let (s, n, e) = (shape.point(x, y), shape.normal(x, y), form.height(x, y));
     let [p, q] = shape.gradient(x, y);
@@ -88,7 +89,7 @@ pub fn centre(shape: &dyn Shape, form: &FormError, radius_mm: f64, x: f64, y: f6
     std::array::from_fn(|i| s[i] + e * n[i] + radius_mm * m[i] / norm)
 }
 
-/// Adds Gaussian noise of a standard deviation per axis to every point.
+/// Adds Gaussian noise with this standard deviation per axis to every point.
 pub fn add_noise(rng: &mut Rng, points: &mut [Vec3], sigma_mm: f64) {
     for c in points.iter_mut().flatten() {
         let z: f64 = StandardNormal.sample(&mut *rng);
@@ -96,7 +97,8 @@ pub fn add_noise(rng: &mut Rng, points: &mut [Vec3], sigma_mm: f64) {
     }
 }
 
-/// Moves a share of the points by `least_mm` to `most_mm` in random directions and returns which, in rising order.
+/// Moves a share of the points by `least_mm` to `most_mm` in random directions; returns their indices, in ascending
+/// order.
 pub fn add_outliers(rng: &mut Rng, points: &mut [Vec3], share: f64, least_mm: f64, most_mm: f64) -> Vec<usize> {
     let mut moved = Vec::new();
     for (index, point) in points.iter_mut().enumerate() {

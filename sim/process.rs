@@ -1,33 +1,35 @@
-//! The grinder: where the wheel goes, what it leaves, and why not what was wanted.
+//! Grinder: the path of the wheel, the surface that it leaves, and why that differs from the commanded surface.
 //!
-//! At every node of the part's grid, and at the moment when the wheel is there, the surface that a stiff machine would leave
-//! stands over the nominal by
+//! At every node of the part's grid, at the moment when the wheel is there, a stiff machine would leave the surface at
+//! this height over the nominal:
 //!
 //! ```text
 //!  cmd = level + u + S + F + W(t) - T(t) + N
 //!
-//!  level, u   what the client asked for: the pass's level and the map
-//!  S          what comes back in every pass: wheel radius, setting, straightness, screw, waviness
+//!  level, u   commanded by the client: the level of the pass, and the map
+//!  S          systematic error, the same in every pass: wheel radius, setting, straightness, screw, waviness
 //!  F          following error: the axes lag, on alternate tracks to alternate sides
 //!  W, T       wear of the wheel (leaves more) and growth of the spindle (leaves less), both along the path
-//!  N          drawn afresh for every pass: what no compensation can take away
+//!  N          random error of each pass, which no compensation can remove
 //! ```
 //!
-//! and since machine and part give way, a share mu of what stood proud stays: h becomes mu h + (1 - mu) cmd where h > cmd, and
-//! where h <= cmd the wheel cuts air. Spark-out repeats the stroke.
+//! Machine and part deflect, so a share mu of the excess height remains: h becomes mu h + (1 - mu) cmd where h > cmd.
+//! Where h <= cmd, the wheel cuts air. Spark-out repeats the stroke.
 //!
-//! **Scallops.** The wheel is a ball, and where it cuts it leaves a groove around each track: h is the bottom of the grooves, and the ridges
-//! between them belong to the part that is measured ([`crate::part`]). Grooves lie where the last pass has its tracks; where a pass that was broken off or cut air has not
-//! come, those of the pass before keep their height.
+//! **Scallops.** The wheel is a ball. Where it cuts, it leaves a groove around each track: h is the bottom of the
+//! grooves, and the ridges between them belong to the part that is measured ([`crate::part`]). Grooves lie at the
+//! tracks of the last pass. Where that pass was broken off or cut air, the grooves of the pass before keep their
+//! height.
 //!
-//! **Depth of cut.** What stands higher over cmd than the depth of cut is taken off by roughing strokes first, each by at
-//! most the depth of cut, with ten times the feed and a wheel of their own (no wear, no growth). They leave at most the depth of cut
-//! for the finishing stroke, so a pass ends as one finishing stroke from there. More than [`MOST_STROKES`] are refused.
+//! **Depth of cut.** Roughing strokes first remove the material that is more than the depth of cut above cmd. Each
+//! removes at most the depth of cut, with ten times the feed and a wheel of its own (no wear, no growth). They leave at
+//! most the depth of cut for the finishing stroke, so a pass always ends with one finishing stroke. More than
+//! [`MOST_STROKES`] are refused.
 //!
 //! **Time.** Tracks run along x, at the track spacing in y, alternately forth and back, with 1.5 mm of overtravel on
-//! every side. A node is ground in the middle of its track's strip; `advance` grinds the nodes whose moment has come, so that a pass that is
-//! broken off leaves a half-ground part. The wheel is dressed and touches off before it finishes: wear and growth count from
-//! there. The heat stays in the spindle from pass to pass and cools while the part is measured.
+//! every side. A node is ground in the middle of its track's strip. `advance` grinds the nodes whose time has come, so
+//! a pass that is broken off leaves a half-ground part. The wheel is dressed and touched off before it finishes: wear
+//! and growth count from there. The heat stays in the spindle from pass to pass, and decays while the part is measured.
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
@@ -42,22 +44,23 @@ use crate::program::{Control, Program};
 use crate::spec::{GrinderSpec, Mirrored, Misreported, WorldSpec};
 use crate::truth::{GrindEntry, Source, State, locked, nothing_done, stream};
 
-/// Most strokes of one pass, roughing and finishing.
+/// Maximum number of strokes of a pass, roughing and finishing together.
 pub const MOST_STROKES: u32 = 400;
-/// How far the wheel travels beyond the part on every side, in millimetres.
+/// Overtravel of the wheel beyond the part on every side, in mm.
 pub const OVERTRAVEL_MM: f64 = 1.5;
-/// Feed of a roughing stroke over that of a finishing stroke.
+/// Ratio of the feed of a roughing stroke to that of a finishing stroke.
 const ROUGHING_FEED: f64 = 10.0;
 
 impl GrinderSpec {
-    /// Returns what comes back in every pass but the wheel's radius, at (x, y) of a part, in micrometres.
+    /// Returns the systematic error at (x, y) of a part, without the effect of the wheel's radius, in µm.
     fn systematic_um(&self, part: &Part, [x, y]: [f64; 2]) -> f64 {
         let [half_x, half_y] = part.aperture.half_mm();
         let [p, q] = part.shape.gradient(x, y);
         let nz = 1.0 / (1.0 + p * p + q * q).sqrt();
         let [ex, ey] = self.setting_error_um;
         let setting = nz * (p * ex + q * ey + self.setting_error_z_um);
-        // What is ground into a part that is tilted by a about a point of its frame is turned back by it: -a . (r x n), n = nz (-p, -q, 1).
+        // Grinding a part tilted by a about a point of its frame leaves the opposite tilt: -a . (r x n), n = nz (-p,
+        // -q, 1).
         let z = part.shape.height(x, y);
         let [about_x, about_y] = self.part_tilt_urad.map(|tilt| 1e-3 * tilt);
         let tilt = -nz * (about_x * (y + q * z) - about_y * (x + p * z));
@@ -68,19 +71,19 @@ impl GrinderSpec {
         finite_or_zero(setting + tilt + straightness + screw)
     }
 
-    /// Returns the wear of the wheel after so many finishing strokes since it was dressed, in micrometres.
+    /// Returns the wear of the wheel after a number of finishing strokes since it was dressed, in µm.
     pub(crate) fn wear_at_um(&self, strokes: f64) -> f64 {
         let fast = if self.break_in_share > 0.0 { 1.0 - (-strokes / self.break_in_share).exp() } else { 0.0 };
         self.wear_um * strokes + self.break_in_um * fast
     }
 }
 
-/// Corners of a round part's grid may lie where its formula has no value.
+/// Replaces a non-finite value by 0. The formula can have no value at the corners of a round part's grid.
 pub(crate) fn finite_or_zero(value: f64) -> f64 {
     if value.is_finite() { value } else { 0.0 }
 }
 
-/// Returns the systematic error at every node, waviness included and the wheel's radius not, in millimetres.
+/// Returns the systematic error at every node, in mm, with waviness and without the effect of the wheel's radius.
 pub(crate) fn systematic_mm(spec: &WorldSpec, part: &Part) -> Vec<f64> {
     let (seed, spec) = (spec.seed, &spec.grinder);
     let waves = smooth(&mut stream(seed, Source::Waviness, 0), spec.waviness_correlation_mm, spec.waviness_um);
@@ -93,27 +96,27 @@ pub(crate) fn smooth(rng: &mut crate::Rng, correlation_mm: f64, rms_um: f64) -> 
     if rms_um > 0.0 { FormError::with_rms(rng, correlation_mm, rms_um * 1e-3) } else { FormError::none() }
 }
 
-/// One travel over the whole part.
+/// Stroke over the whole part.
 #[derive(Clone, Copy, Debug)]
 struct Stroke {
     begin_s: f64,
     feed_mm_s: f64,
-    /// How much a roughing stroke stays above the finishing one; none for finishing and spark-out.
+    /// Height of a roughing stroke above the finishing stroke, in mm; `None` for finishing and spark-out.
     above_mm: Option<f64>,
 }
 
-/// A pass, made ready or going on.
+/// Prepared or running pass.
 struct Run {
     job: u32,
     cycle: u16,
     map_identity: [u8; 32],
     map_largest_mm: f64,
     pass: Pass,
-    /// Places along one stroke and the nodes ground there, in order.
+    /// Positions along one stroke, each with the node ground there, in order.
     order: Vec<(f64, u32)>,
-    /// What does not change along the path, a value for every node, in millimetres.
+    /// Error that does not change along the path, for every node, in mm.
     fixed_mm: Vec<f64>,
-    /// The grooves that the wheel leaves where it cuts.
+    /// Grooves that the wheel leaves where it cuts.
     grooves: Option<Grooves>,
     strokes: Vec<Stroke>,
     stroke_mm: f64,
@@ -141,7 +144,7 @@ impl Run {
         1.0 - (1.0 - self.heat_at_begin) * (-seconds / spec.thermal_tau_s).exp()
     }
 
-    /// Grinds every node whose moment has come.
+    /// Grinds every node whose time has come.
     fn grind(&mut self, state: &mut State) {
         while let Some(stroke) = self.strokes.get(self.stroke).copied() {
             while let Some(&(place, node)) = self.order.get(self.next) {
@@ -171,7 +174,7 @@ impl Run {
         }
     }
 
-    /// Returns the length of the path travelled so far, in millimetres.
+    /// Returns the length of the travelled path, in mm.
     fn path_mm(&self) -> f64 {
         let time = self.elapsed_s.min(self.total_s);
         self.strokes.iter().map(|s| ((time - s.begin_s).max(0.0) * s.feed_mm_s).min(self.stroke_mm)).sum()
@@ -196,15 +199,16 @@ impl Run {
             volume_mm3,
             depth_mm,
             air_share,
-            // Idling takes a tenth, a stroke of the full depth of cut everywhere seven tenths.
+            // Idling takes a tenth of the spindle load; a stroke at the full depth of cut everywhere takes seven
+            // tenths.
             spindle_load: (0.1 + 0.6 * (1.0 - air_share) * (each_mm / self.pass.depth_of_cut_mm).min(1.0)).min(1.0),
             wheel_radius_mm: self.pass.wheel_radius_mm,
         }
     }
 }
 
-/// Lets the wheel come over a node where a stiff machine would leave `cmd_mm`, and says whether it cut anything. `bend` is that of the groove
-/// which it leaves, if it leaves any.
+/// Moves the wheel over a node where a stiff machine would leave `cmd_mm`, and returns true if it cut. `bend` is the
+/// curvature of the groove that it leaves, if any.
 pub(crate) fn cut(state: &mut State, node: usize, cmd_mm: f64, bend: Option<f64>) -> bool {
     let h = &mut state.part.height.heights_mm[node];
     if state.spec.faults.no_part || *h <= cmd_mm {
@@ -218,7 +222,7 @@ pub(crate) fn cut(state: &mut State, node: usize, cmd_mm: f64, bend: Option<f64>
     true
 }
 
-/// Puts what is not so into a record.
+/// Falsifies a record as the fault requires.
 fn misreporting(record: PassRecord, misreported: Misreported) -> PassRecord {
     match misreported {
         Misreported::Nothing | Misreported::Duration => record,
@@ -230,7 +234,7 @@ fn misreporting(record: PassRecord, misreported: Misreported) -> PassRecord {
     }
 }
 
-/// Returns the nodes that the wheel comes to, with their places along the path, and the length of the path in millimetres.
+/// Returns the nodes on the path of the wheel with their positions along it, and the length of the path in mm.
 fn raster(part: &Part, pass: &Pass) -> (Vec<(f64, u32)>, f64) {
     let [x0, x1, y0, y1] = grown(pass.extent_mm);
     let (length, spacing) = (x1 - x0, pass.track_spacing_mm);
@@ -251,7 +255,7 @@ fn grown([x0, x1, y0, y1]: [f64; 4]) -> [f64; 4] {
     [x0 - OVERTRAVEL_MM, x1 + OVERTRAVEL_MM, y0 - OVERTRAVEL_MM, y1 + OVERTRAVEL_MM]
 }
 
-/// Returns what the machine steers to at every node but for wear and growth, in millimetres.
+/// Returns the height that the machine steers to at every node, without wear and growth, in mm.
 fn fixed_mm(state: &State, map: &Map, pass: &Pass, program: Option<&Program>) -> Vec<f64> {
     let (spec, part) = (&state.spec.grinder, &state.part);
     let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun + 1);
@@ -280,12 +284,12 @@ fn fixed_mm(state: &State, map: &Map, pass: &Pass, program: Option<&Program>) ->
     steered
 }
 
-/// Returns the true radius of the wheel in a pass.
+/// Returns the true radius of the wheel in a pass, in mm.
 fn true_radius_mm(state: &State, pass: &Pass) -> f64 {
     state.true_wheel_radius_mm.unwrap_or(pass.wheel_radius_mm + 1e-3 * state.spec.grinder.wheel_radius_error_um)
 }
 
-/// Returns the grooves that the wheel leaves all over the part.
+/// Returns the grooves that the wheel leaves over the whole part.
 fn grooves(state: &State, pass: &Pass) -> Grooves {
     let wheel_radius_mm = true_radius_mm(state, pass);
     let part = &state.part;
@@ -294,7 +298,7 @@ fn grooves(state: &State, pass: &Pass) -> Grooves {
     Grooves { first_mm: grown(pass.extent_mm)[2], spacing_mm: pass.track_spacing_mm, wheel_radius_mm, bend }
 }
 
-/// Returns what this machine makes of the map at (x, y).
+/// Returns the value that this machine, with its faults, uses for the map at (x, y).
 fn displaced(state: &State, map: &Map, x: f64, y: f64) -> f64 {
     let faults = &state.spec.faults;
     let (x, y) = match faults.map_mirrored {
@@ -309,25 +313,25 @@ fn displaced(state: &State, map: &Map, x: f64, y: f64) -> f64 {
     if faults.map_sign_flipped { -u } else { u }
 }
 
-/// Where a control finds its programs, and whose control it is.
+/// Folder of the programs of a control, and the kind of control.
 #[derive(Clone, Debug)]
 pub struct Programs {
-    /// The folder.
+    /// Folder of the programs.
     pub folder: PathBuf,
-    /// Who reads them.
+    /// Control that reads them.
     pub control: Control,
-    /// The head that they may turn.
+    /// Head that the programs can turn.
     pub head: Option<Head>,
 }
 
 impl Programs {
-    /// Finds the program that names a map, and reads it.
+    /// Finds and reads the program that names a map.
     fn of_map(&self, identity: &[u8; 32]) -> Result<Program, String> {
         let map: String = identity.iter().map(|byte| format!("{byte:02x}")).collect();
         let files = std::fs::read_dir(&self.folder).map_err(|error| format!("{}: {error}", self.folder.display()))?;
         let is_of_map = |text: &String| {
             let words: Vec<String> = text.lines().map(str::to_ascii_lowercase).collect();
-            // Long comments may be divided.
+            // Long comments can be split over several lines.
             words.iter().any(|line| line.contains("map: sha256")) && words.iter().any(|line| line.contains(&map))
         };
         let texts = files.flatten().filter_map(|file| std::fs::read_to_string(file.path()).ok());
@@ -337,7 +341,7 @@ impl Programs {
     }
 }
 
-/// The grinder of a world.
+/// Grinder of a world.
 pub struct Grinder {
     world: Arc<Mutex<State>>,
     programs: Option<Programs>,
@@ -350,14 +354,14 @@ impl Grinder {
         Self { world, programs: None, ready: None, running: None }
     }
 
-    /// Has it grind by programs in a folder, and not by the map alone.
+    /// Makes the grinder follow programs in a folder, instead of the map alone.
     #[must_use]
     pub fn by_programs(mut self, programs: Programs) -> Self {
         self.programs = Some(programs);
         self
     }
 
-    /// Refuses what this machine cannot reach or move.
+    /// Refuses a pass beyond the reach or the limits of this machine.
     fn limits(state: &State, pass: &Pass) -> Result<(), Refusal> {
         let spec = &state.spec.grinder;
         if pass.feed_mm_min > spec.feed_most_mm_min {
@@ -399,7 +403,7 @@ impl Grinder {
     }
 }
 
-/// Returns the strokes of a pass, and the time they take together.
+/// Returns the strokes of a pass, and their total duration.
 fn strokes(roughing: u32, pass: &Pass, stroke_mm: f64) -> (Vec<Stroke>, f64) {
     let feed_mm_s = pass.feed_mm_min / 60.0;
     let above = (1..=roughing).rev().map(|k| Some(f64::from(k) * pass.depth_of_cut_mm));
@@ -415,7 +419,7 @@ fn strokes(roughing: u32, pass: &Pass, stroke_mm: f64) -> (Vec<Stroke>, f64) {
     (strokes, begin_s)
 }
 
-/// Makes a pass ready for the part as it stands.
+/// Prepares a pass for the part in its present state.
 fn run(
     state: &State,
     (job, cycle): (u32, u16),
@@ -426,7 +430,7 @@ fn run(
     let fixed_mm = fixed_mm(state, map, &pass, program);
     let grooves = state.spec.grinder.scallops.then(|| grooves(state, &pass));
     let (mut order, stroke_mm) = raster(&state.part, &pass);
-    // Where the program does not come nothing is ground.
+    // Nodes that the program does not reach are not ground.
     order.retain(|&(_, node)| fixed_mm[node as usize].is_finite());
     let within = |&(_, node): &(f64, u32)| state.part.height.heights_mm[node as usize] - fixed_mm[node as usize];
     let proud_mm = order.iter().map(within).fold(0.0, f64::max);
@@ -460,7 +464,7 @@ fn run(
     })
 }
 
-/// Progress in thousandths of the path.
+/// Returns the progress in thousandths of the path.
 fn progress(run: &Run) -> Progress {
     let finished = run.finished();
     let done = if finished { 1000 } else { ((1000.0 * run.elapsed_s / run.total_s) as u32).min(999) };
@@ -563,7 +567,7 @@ impl Body for Grinder {
     fn advance(&mut self, seconds: f64) -> Progress {
         let mut state = locked(&self.world);
         let Some(run) = self.running.as_mut() else {
-            // Nothing was begun: something else has the part.
+            // Nothing was begun: the other machine has the part.
             return Progress { done: 0, total: 1000, finished: false, fault: 1 };
         };
         if seconds > 0.0 && seconds.is_finite() {
@@ -618,7 +622,7 @@ impl Body for Grinder {
 }
 
 impl Drop for Grinder {
-    /// A machine that is taken away keeps nothing.
+    /// Releases the part.
     fn drop(&mut self) {
         locked(&self.world).release(Kind::Grinder);
     }

@@ -1,17 +1,19 @@
-//! What a control reads in a program: by its own means, written from what its makers say of it, so that no error of a writer hides here.
+//! Reader of programs as a control reads them: implemented independently from the documentation of the makers, so that
+//! an error of a writer cannot hide here.
 //!
 //! ```text
-//!  text -> block by block -> where the wheel's centre stops, or the slides and the head that carry it, how fast and by which way it came there
+//!  text -> blocks -> stops of the wheel's centre, or of the slides and the head that carry it; feed and way to each
 //! ```
 //!
-//! A real control would do something with almost anything. This one refuses what would move a real machine elsewhere than its text says at
-//! first sight: a coordinate in increments, inches, places from the last one, a move before the path mode is told, a program without an end.
+//! A real control accepts almost any program. This reader refuses everything that would move a real machine to another
+//! place than the text seems to say: incremental coordinates, inches, places relative to the last one, a move before
+//! the path mode is set, a program without an end.
 
 use std::collections::BTreeMap;
 
 use crate::head::Head;
 
-/// Whose control it is.
+/// Kind of control.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Control {
     /// LinuxCNC.
@@ -25,24 +27,25 @@ pub enum Control {
     Heidenhain,
 }
 
-/// Millimetres that a number without a point counts in with IS-C.
+/// Unit of a number without a decimal point with IS-C, in mm.
 const INCREMENT_MM: f64 = 1e-4;
 
-/// An arc as every control has it: about a centre in a plane of two axes, while the third goes along evenly with the angle.
+/// Arc, the same for every control: about a centre in a plane of two axes, while the third axis moves in proportion to
+/// the angle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Turn {
-    /// The two axes of the plane, and the one across.
+    /// The two axes of the plane, and the axis normal to it.
     axes: [usize; 3],
     centre_mm: [f64; 2],
-    /// Counter-clockwise, from the first axis to the second, is positive.
+    /// Angle of the arc; positive is counter-clockwise, from the first axis to the second.
     sweep_rad: f64,
 }
 
 impl Turn {
-    /// Turns from a place to another one.
+    /// Computes the arc from one place to another.
     ///
     /// # Errors
-    /// Radii at the beginning and at the end that differ by more than a control takes, and no way at all.
+    /// The radii at the beginning and at the end differ by more than a control accepts, or the arc has no length.
     pub fn new(
         axes: [usize; 3],
         [from, to]: [[f64; 3]; 2],
@@ -53,7 +56,7 @@ impl Turn {
         let arm = |at: [f64; 3]| [0, 1].map(|k| at[axes[k]] - centre_mm[k]);
         let (begin, end) = (arm(from), arm(to));
         let [r, q] = [begin, end].map(|[u, v]| u.hypot(v));
-        // What is not a number is refused with the rest.
+        // NaN is refused too.
         if !((r - q).abs() <= takes_mm && r > 0.0) {
             return Err(format!("the radius is {r} mm where the arc begins and {q} mm where it ends"));
         }
@@ -65,7 +68,7 @@ impl Turn {
         Ok(Self { axes, centre_mm, sweep_rad })
     }
 
-    /// Returns the place at a share of the turn that began here.
+    /// Returns the place at a share of the arc that begins at `from`.
     fn at(&self, from: [f64; 3], to: [f64; 3], share: f64) -> [f64; 3] {
         let [a, b, c] = self.axes;
         let (u, v) = (from[a] - self.centre_mm[0], from[b] - self.centre_mm[1]);
@@ -81,30 +84,30 @@ impl Turn {
         (from[self.axes[0]] - self.centre_mm[0]).hypot(from[self.axes[1]] - self.centre_mm[1])
     }
 
-    /// Returns how many chords are no farther than this from the turn.
+    /// Returns the number of chords whose distance from the arc is at most `within_mm`.
     fn chords(&self, from: [f64; 3], within_mm: f64) -> usize {
         let each = (8.0 * within_mm / self.radius_mm(from)).sqrt();
         (self.sweep_rad.abs() / each).ceil().clamp(1.0, 1e6) as usize
     }
 }
 
-/// Where a move ends.
+/// End of a move.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Stop {
-    /// In millimetres; not a number along an axis that has not been told yet.
+    /// Position in mm; NaN along an axis that has not been programmed yet.
     pub at_mm: [f64; 3],
-    /// In degrees, on the scale of the rotary axis; none where none has been told yet.
+    /// Angle in degrees, on the scale of the rotary axis; `None` if none has been programmed yet.
     pub turn_deg: Option<f64>,
-    /// In mm/min; none where it comes rapidly. Of a move that is told its time it is how fast the slides are.
+    /// Feed in mm/min; `None` for a rapid move. For a move with a programmed time, the speed of the slides.
     pub feed_mm_min: Option<f64>,
-    /// The time of the move in minutes, where that is told.
+    /// Time of the move in minutes, if it is programmed.
     pub minutes: Option<f64>,
-    /// How it comes there, where it does not come straight.
+    /// Arc of the move; `None` for a straight move.
     pub turn: Option<Turn>,
 }
 
 impl Stop {
-    /// Returns the place at a share of the way from the stop before it.
+    /// Returns the place at a share of the way from the previous stop.
     pub fn on_the_way(&self, from_mm: [f64; 3], share: f64) -> [f64; 3] {
         match &self.turn {
             Some(turn) => turn.at(from_mm, self.at_mm, share),
@@ -112,7 +115,7 @@ impl Stop {
         }
     }
 
-    /// Returns how long that way is, in millimetres.
+    /// Returns the length of that way, in mm.
     pub fn way_mm(&self, from_mm: [f64; 3]) -> f64 {
         let along = |k: usize| self.at_mm[k] - from_mm[k];
         match &self.turn {
@@ -121,7 +124,7 @@ impl Stop {
         }
     }
 
-    /// Returns the ends of straight moves that are no farther than this from the way.
+    /// Returns the ends of straight moves whose distance from the way is at most `within_mm`.
     pub fn in_chords(&self, from_mm: [f64; 3], within_mm: f64) -> Vec<[f64; 3]> {
         let count = self.turn.as_ref().map_or(1, |turn| turn.chords(from_mm, within_mm));
         let inner = (1..count).map(|k| self.on_the_way(from_mm, k as f64 / count as f64));
@@ -129,30 +132,30 @@ impl Stop {
     }
 }
 
-/// A program as a control has read it.
+/// Program as a control has read it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Program {
-    /// Where the moves end, in order.
+    /// Ends of the moves, in order.
     pub stops: Vec<Stop>,
-    /// The rotary axis that it turns.
+    /// Rotary axis that the program turns.
     pub axis: Option<char>,
-    /// Whether it has the control keep the wheel's centre while the head turns.
+    /// True if the program makes the control keep the wheel's centre while the head turns.
     pub keeps_centre: bool,
-    /// Whether the control's own kinematics keep it, of which no program speaks.
+    /// True if the control's own kinematics keep the centre, which no program mentions.
     pub(crate) by_kinematics: bool,
-    /// The head that it turns, once it is known.
+    /// Head that the program turns, once it is known.
     pub(crate) head: Option<Head>,
-    /// How far corners may be rounded off, where the program says it.
+    /// Tolerance by which corners may be rounded, if the program gives it.
     pub tolerance_mm: Option<f64>,
-    /// The comments.
+    /// Comments of the program.
     pub comments: Vec<String>,
 }
 
 impl Program {
-    /// Gives it to a machine with this head, if it has one.
+    /// Assigns the program to a machine with this head, if it has one.
     ///
     /// # Errors
-    /// What the machine cannot do.
+    /// The machine cannot execute the program.
     pub fn on(mut self, head: Option<Head>) -> Result<Self, String> {
         let why = match (self.axis, head) {
             (Some(letter), None) => Some(format!("the program turns {letter}, and this machine has no rotary axis")),
@@ -163,7 +166,7 @@ impl Program {
         why.map_or(Ok(self), Err)
     }
 
-    /// Returns where the wheel's centre is at a share of the way from a stop to the next.
+    /// Returns the position of the wheel's centre at a share of the way from a stop to the next.
     pub fn centre_mm(&self, from: &Stop, to: &Stop, share: f64) -> [f64; 3] {
         match &self.head {
             Some(head) => head.along_mm(from, to, share),
@@ -171,7 +174,7 @@ impl Program {
         }
     }
 
-    /// Returns how long that way is, in millimetres; where a head turns, how far its ends are apart.
+    /// Returns the length of that way, in mm; if a head turns, the distance of its ends.
     pub fn way_mm(&self, from: &Stop, to: &Stop) -> f64 {
         match self.axis {
             Some(_) => {
@@ -184,7 +187,7 @@ impl Program {
 }
 
 impl Control {
-    /// Returns the control that a dialect of this name is for.
+    /// Returns the control of a dialect by its name.
     pub fn named(dialect: &str) -> Option<Self> {
         let known = [
             ("linuxcnc", Self::Linuxcnc),
@@ -198,7 +201,7 @@ impl Control {
     /// Reads a program.
     ///
     /// # Errors
-    /// What the control would stop at, or what would not do what it seems to, with its line.
+    /// The control would stop, or the program would not do what it seems to; the message gives the line.
     pub fn read(self, text: &str) -> Result<Program, String> {
         let mut reader = Reader { control: self, ..Reader::default() };
         reader.program.by_kinematics = self == Self::Linuxcnc;
@@ -214,26 +217,27 @@ struct Reader {
     control: Control,
     program: Program,
     at_mm: Option<[f64; 3]>,
-    /// 0 rapid, 1 at feed, 2 and 3 along an arc: clockwise and counter-clockwise.
+    /// Motion mode: 0 rapid, 1 at feed, 2 and 3 along an arc, clockwise and counter-clockwise.
     motion: Option<u8>,
-    /// The plane that was selected last, and where Klartext has its centre, axis by axis.
+    /// Plane that was selected last, and the centre of Klartext, by axis.
     plane: Option<[usize; 3]>,
     centre: BTreeMap<char, f64>,
-    /// Whether LinuxCNC was told that centres are from the beginning of an arc, or that they are places.
+    /// For LinuxCNC: true if centres are relative to the beginning of an arc, false if they are absolute, `None` before
+    /// the program sets it.
     from_start: Option<bool>,
     turn_deg: Option<f64>,
-    /// Of the last block that told one; in 1/min where feeds are by time, and then of no other block.
+    /// Feed of the last block that gave one. With inverse-time feeds, in 1/min and valid for its own block only.
     feed: Option<f64>,
     by_time: bool,
     keeps_centre: bool,
-    /// Whether a Sinumerik has its work offset, and turns axes in proportion between points.
+    /// For Sinumerik: whether the work offset is set, and whether axes turn in proportion between points.
     no_offset: bool,
     in_proportion: bool,
     metric: bool,
     absolute: bool,
     by_minute: bool,
     exact: bool,
-    /// Lines of Klartext, the name of the program, and whether cycle 32 waits for its tolerance.
+    /// Line count of Klartext, name of the program, and whether cycle 32 waits for its tolerance.
     lines: u64,
     name: Option<String>,
     cycle: bool,
@@ -283,7 +287,7 @@ impl Reader {
         Ok(self.program)
     }
 
-    /// A block of letters and numbers.
+    /// Reads a block of letters and numbers.
     fn block(&mut self, line: &str) -> Result<(), String> {
         if line == "%" {
             self.percents += 1;
@@ -339,7 +343,7 @@ impl Reader {
         if to.is_empty() { Ok(()) } else { self.go(&to) }
     }
 
-    /// A word G, in tenths; returns one of how exactly the path is kept to.
+    /// Handles a G word, in tenths; returns it if it sets the path mode.
     fn preparatory(&mut self, tenths: i64) -> Result<Option<i64>, String> {
         match (self.control, tenths) {
             (_, 0 | 10 | 20 | 30) => self.motion = Some((tenths / 10) as u8),
@@ -363,7 +367,7 @@ impl Reader {
         Ok(None)
     }
 
-    /// What a word of exactness means by itself: nothing is kept by a mode that rounds corners off as it likes.
+    /// Handles a word of the path mode by itself: nothing is kept by a mode that rounds corners without a limit.
     fn exactness(&mut self, smooth: Option<i64>, level: Option<f64>) -> Result<(), String> {
         let tolerance = self.program.tolerance_mm.is_some_and(|mm| mm > 0.0);
         self.exact = match (self.control, smooth) {
@@ -420,7 +424,7 @@ impl Reader {
         Ok(())
     }
 
-    /// Turns a rotary axis: one in a program, and in one way from beginning to end.
+    /// Turns a rotary axis. A program may turn only one axis, and only in one direction from beginning to end.
     fn tilt(&mut self, axis: char, to_deg: f64) -> Result<(), String> {
         let first = self.program.axis.is_none();
         if *self.program.axis.get_or_insert(axis) != axis {
@@ -439,7 +443,7 @@ impl Reader {
         Ok(())
     }
 
-    /// The arc of a block: its centre is told along the axes of the plane, and both of its ends there.
+    /// Computes the arc of a block. Its centre, and both of its ends, must be given along the axes of the plane.
     fn turn(&self, ends: [[f64; 3]; 2], told: &BTreeMap<char, f64>, clockwise: bool) -> Result<Turn, String> {
         let axes = self.plane.ok_or("the plane of its arc was not told")?;
         let [a, b, c] = axes;
@@ -447,7 +451,7 @@ impl Reader {
         if ![a, b].iter().all(|k| told.contains_key(&letter("XYZ", *k))) {
             return Err("it does not tell where in the plane its arc ends".into());
         }
-        // How far the radii of an arc may differ, as its maker has it at first.
+        // Maximum difference of the radii of an arc, as the maker's default.
         let (of, from_start, takes_mm) = match self.control {
             Control::Linuxcnc => (told, self.from_start.ok_or("it does not say where centres are told from")?, 0.005),
             Control::Fanuc => (told, true, 0.005),
@@ -469,7 +473,7 @@ impl Reader {
         Turn::new(axes, ends, centre_mm, clockwise, takes_mm)
     }
 
-    /// A line of Klartext, with its number.
+    /// Reads a line of Klartext, with its number.
     fn klartext(&mut self, line: &str) -> Result<(), String> {
         let (number, rest) = line.split_once(' ').unwrap_or((line, ""));
         if number.parse() != Ok(self.lines) {
@@ -479,7 +483,7 @@ impl Reader {
         let rest = rest.trim();
         let program = |begins: &str| rest.strip_prefix(begins)?.strip_suffix(" MM").map(str::to_owned);
         if self.lines == 1 {
-            // All the rest is so by the language.
+            // The language fixes all these modes.
             (self.metric, self.absolute, self.by_minute) = (true, true, true);
             self.name = Some(program("BEGIN PGM ").ok_or("it does not begin with BEGIN PGM in MM")?);
             return Ok(());
@@ -519,7 +523,7 @@ impl Reader {
         }
     }
 
-    /// What comes after a CC: two axes, which are the plane of the circles about it.
+    /// Reads the arguments of a CC: two axes, which are the plane of the circles about it.
     fn told_centre(&mut self, rest: &str) -> Result<(), String> {
         self.centre.clear();
         for word in rest.split_whitespace() {
@@ -540,7 +544,7 @@ impl Reader {
         Ok(())
     }
 
-    /// What comes after an L or, where nothing says how it moves but a DR, after a C.
+    /// Reads the arguments of an L, or of a C, which has only a DR for its direction.
     fn straight(&mut self, rest: &str, motion: Option<u8>) -> Result<(), String> {
         let mut to = BTreeMap::new();
         self.motion = motion;
@@ -561,7 +565,7 @@ impl Reader {
     }
 }
 
-/// A word: letters, and a number behind them or behind an equals sign.
+/// Word: letters, and a number after them or after an equals sign.
 struct Word {
     name: String,
     number: Option<f64>,
@@ -636,7 +640,8 @@ mod tests {
         }
     }
 
-    /// Half a turn about (3, 7) in the plane of z and x, from the larger z to the smaller by way of the larger x, y along with it; then a line.
+    /// Half a turn about (3, 7) in the plane of z and x, from the larger z to the smaller one through the larger x,
+    /// with y moving along; then a line.
     const ARCS: [(Control, &str); 4] = [
         (Control::Linuxcnc, "G21 G90 G94 G17\nG91.1 G61\nG0 X3 Y1 Z9\nG18 G3 X3Z5I0K-2Y1.5F600\nG1 X0\nM2\n"),
         (
@@ -671,7 +676,7 @@ mod tests {
                 2.0 - (middle[0] - 3.0).hypot(middle[1] - 7.0)
             };
             assert!(chords.windows(2).map(sagging).all(|sag| sag > 0.5e-4 && sag < 1.001e-4));
-            // The other way round it goes by the smaller x.
+            // The other way round passes through the smaller x.
             let round = text.replace("G3 ", "G2 ").replace("G03 ", "G02 ").replace("DR+", "DR-");
             let round = control.read(&round).unwrap().stops[1];
             assert!(off(round.on_the_way(from.at_mm, 0.5), [1.0, 1.0 + 0.5 * rises, 7.0]), "{control:?}");

@@ -1,7 +1,7 @@
-//! A machine as a Modbus client meets it: blocks of registers to read and to write, and time that passes.
+//! Machine as a Modbus client sees it: blocks of registers to read and to write, and time that passes.
 //!
-//! [`Machine`] is the whole simulated machine without its wire. Every answer follows from what was read, written and ticked,
-//! so a test runs hours of it in a moment and twice alike. Real time comes in by [`Machine::tick`] alone.
+//! [`Machine`] is the whole simulated machine without its wire. Every answer depends only on what was read, written and
+//! ticked, so a test simulates hours in a moment and is repeatable. Real time enters only through [`Machine::tick`].
 
 use std::time::Duration;
 
@@ -13,35 +13,35 @@ use crate::seen::{Seen, What, Witness};
 use crate::transfer::{Inbox, page_image, slots_image};
 use crate::words::{Image, WordOrder};
 
-/// Why a request is not carried out, as Modbus numbers it.
+/// Modbus exception code of a refused request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exception {
     /// The function is not one of 3, 6 and 16.
     Function = 1,
     /// The address is outside the blocks, read only, or across a border.
     Address = 2,
-    /// The content cannot be taken.
+    /// The content is not acceptable.
     Value = 3,
-    /// The machine's application does not look at its inbox.
+    /// The machine's application does not read its inbox.
     Busy = 6,
-    /// Nobody answers to the unit.
+    /// No machine has this unit id.
     Target = 0x0B,
 }
 
-/// The longest slice in which a tick is taken.
+/// Maximum time slice of a tick.
 const SLICE: Duration = Duration::from_millis(20);
-/// How often the machine's own beat advances.
+/// Interval of the machine's own beat.
 const BEAT: Duration = Duration::from_millis(100);
 
-/// A simulated machine: registers, handshake and physics.
+/// Simulated machine: registers, handshake and physics.
 pub struct Machine {
     handshake: Handshake,
     options: MachineOptions,
     inbox: Inbox,
     sync: [u16; 2],
-    /// As it was written last, by whomever.
+    /// Beat block as written last by any client.
     beat_block: [u16; 3],
-    /// The owner's counter, as it was heard last.
+    /// Counter of the owner's last beat.
     beat: u16,
     command: [u16; 20],
     inbox_header: [u16; 24],
@@ -53,12 +53,12 @@ pub struct Machine {
     status: Vec<u16>,
     torn: bool,
     frozen: bool,
-    /// A command came while the application did not look.
+    /// True if a command came while the application was frozen.
     unseen: bool,
 }
 
 impl Machine {
-    /// Switches a machine on. `boot_id` should differ at every start of the program; 0 is taken for 1.
+    /// Switches a machine on. `boot_id` should differ at every start of the program; 0 is replaced by 1.
     pub fn new(body: Box<dyn Body>, boot_id: u32, options: MachineOptions) -> Self {
         let mut machine = Self {
             handshake: Handshake::new(body, boot_id, &options),
@@ -86,7 +86,7 @@ impl Machine {
     /// Reads some registers.
     ///
     /// # Errors
-    /// An address outside the blocks; none or more than 125 registers.
+    /// The address is outside the blocks, or the count is 0 or more than 125.
     pub fn read(&mut self, address: u16, count: u16) -> Result<Vec<u16>, Exception> {
         if !(1..=125).contains(&count) {
             return Err(Exception::Value);
@@ -102,7 +102,7 @@ impl Machine {
         Ok(self.on_the_line(registers))
     }
 
-    /// Puts the bytes of registers in the order in which they stand on the line, or back.
+    /// Swaps the bytes of registers between the machine's order and the order on the line.
     fn on_the_line(&self, mut registers: Vec<u16>) -> Vec<u16> {
         if self.options.swaps_bytes {
             registers.iter_mut().for_each(|register| *register = register.swap_bytes());
@@ -110,10 +110,10 @@ impl Machine {
         registers
     }
 
-    /// Writes some registers; what they ask for is done before this returns.
+    /// Writes some registers; the effect is complete when this returns.
     ///
     /// # Errors
-    /// An address outside the client's blocks or across a border; content that cannot be taken.
+    /// The address is outside the client's blocks or the write crosses a border, or the content is not acceptable.
     pub fn write(&mut self, address: u16, values: &[u16]) -> Result<(), Exception> {
         if !(1..=123).contains(&values.len()) {
             return Err(Exception::Value);
@@ -166,7 +166,7 @@ impl Machine {
         self.publish();
     }
 
-    /// A beat says whose it is; only that of the owner is one.
+    /// Handles a written beat. It contains the id of its client; only the owner's beat counts.
     fn write_beat(&mut self, values: &[u16]) -> Result<(), Exception> {
         let [count, high, low]: [u16; 3] = values.try_into().map_err(|_| Exception::Value)?;
         self.beat_block = [count, high, low];
@@ -272,7 +272,7 @@ impl Machine {
         image
     }
 
-    /// Brings the status block up to date; a frozen application does not.
+    /// Updates the status block; a frozen application does not.
     fn publish(&mut self) {
         if self.frozen {
             return;
@@ -286,12 +286,12 @@ impl Machine {
         }
     }
 
-    /// Returns which machine it is.
+    /// Returns the kind of machine.
     pub fn kind(&self) -> Kind {
         self.handshake.body.kind()
     }
 
-    /// Returns the state it is in, frozen or not.
+    /// Returns the state of the machine, frozen or not.
     pub fn state(&self) -> State {
         self.handshake.state
     }
@@ -301,32 +301,32 @@ impl Machine {
         self.handshake.boot_id
     }
 
-    /// Returns the name by which it calls itself.
+    /// Returns the name of the machine.
     pub fn name(&self) -> String {
         self.handshake.body.name()
     }
 
-    /// Returns where its blocks are.
+    /// Returns the addresses of its blocks.
     pub fn layout(&self) -> &Layout {
         &self.options.layout
     }
 
-    /// Returns the order of words that it speaks.
+    /// Returns the word order of the machine.
     pub fn word_order(&self) -> WordOrder {
         self.options.word_order
     }
 
-    /// Returns the newest things that it saw and did, the oldest of them first.
+    /// Returns the newest events, the oldest of them first.
     pub fn log(&self) -> &[Seen] {
         self.handshake.log.all()
     }
 
-    /// Has somebody told of everything that it sees and does from now on, while it happens.
+    /// Sets an observer of all events from now on.
     pub fn witness(&mut self, witness: Witness) {
         self.handshake.log.witness(witness);
     }
 
-    /// Returns how many older things are no longer in the log.
+    /// Returns the number of older events that are no longer in the log.
     pub fn forgotten(&self) -> u64 {
         self.handshake.log.forgotten()
     }
@@ -340,7 +340,7 @@ impl Machine {
         self.log().iter().filter_map(began).collect()
     }
 
-    /// Returns the physics, for a test that changes it from under the handshake.
+    /// Returns the physics, for a test that changes it without the handshake.
     pub fn body_mut(&mut self) -> &mut dyn Body {
         &mut *self.handshake.body
     }
@@ -350,19 +350,20 @@ impl Machine {
         self.handshake.speed = speed.max(0.0);
     }
 
-    /// Stops or continues the application, while the wire goes on answering with the registers as they are.
+    /// Freezes or continues the application; the wire continues to answer with the registers as they are.
     pub fn freeze(&mut self, frozen: bool) {
         self.frozen = frozen;
         self.publish();
     }
 
-    /// Starts the application anew, with another boot id and empty memory; a motion it cuts off is fault 30.
+    /// Restarts the application, with another boot id and empty memory; an interrupted motion is fault 30.
     pub fn reboot(&mut self) {
         self.handshake.reboot();
         self.empty_memory();
     }
 
-    /// The same by an application that keeps its boot id, forgets which jobs it began, and calls nothing a fault: a machine that lies.
+    /// Restarts an application that keeps its boot id, forgets which jobs it began, and reports no fault: a machine
+    /// that lies.
     pub fn forget(&mut self) {
         self.handshake.forget();
         self.empty_memory();
@@ -389,19 +390,19 @@ impl Machine {
         self.publish();
     }
 
-    /// Presses the button at the machine's panel that has a held job go on.
+    /// Presses the button at the machine's panel that continues a held job.
     pub fn press_start(&mut self) {
         self.handshake.press_start();
         self.publish();
     }
 
-    /// Lets a machine that is idle move without an order until it is held; `false` brings it back to where it stood.
+    /// Makes an idle machine move without a command until it is held; `false` returns it to its state before.
     pub fn stray(&mut self, strays: bool) {
         self.handshake.stray(strays);
         self.publish();
     }
 
-    /// Changes what comes into force next from under the client, once it has been looked at.
+    /// Makes the next payload in force change after it has been checked, without the client.
     pub fn spoil(&mut self) {
         self.handshake.spoil();
     }

@@ -1,4 +1,4 @@
-//! What a simulated machine saw and did, in order, for a test to hold against the controller's journal.
+//! Events of a simulated machine, in order. A test compares them with the controller's journal.
 
 use std::fmt;
 use std::time::Duration;
@@ -7,50 +7,50 @@ use serde::{Serialize, Serializer};
 
 use crate::command::{Answer, Frame, State};
 
-/// One thing that happened.
+/// Event with its time.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Seen {
-    /// Real time since the machine was made, as its ticks told it.
+    /// Real time since the machine was made, as the sum of its ticks.
     #[serde(rename = "at_s", serialize_with = "seconds")]
     pub at: Duration,
-    /// What happened.
+    /// Kind of the event.
     #[serde(flatten)]
     pub what: What,
 }
 
-/// What can happen at a machine.
+/// Kind of an event.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "what", rename_all = "snake_case")]
 pub enum What {
-    /// A command was acted upon, or refused with an answer.
+    /// A command was carried out, or refused with an answer.
     Commanded {
-        /// The frame as it was read.
+        /// Frame as it was read.
         frame: Frame,
-        /// What the machine answered.
+        /// Answer of the machine.
         answer: Answer,
-        /// In which state.
+        /// State of the machine at that time.
         state: State,
     },
-    /// The frame that was acted upon last came once more and changed nothing.
+    /// The last accepted frame came again and changed nothing.
     Repeated {
         /// Its sequence number.
         sequence: u32,
     },
-    /// A frame was not looked at: its copies or its CRC disagree, or its number is 0.
+    /// A frame was ignored: its copies or its CRC disagree, or its number is 0.
     Broken,
-    /// A sound frame was not looked at: its number is not greater than the one acknowledged.
+    /// A correct frame was ignored: its number is not greater than the acknowledged one.
     Old {
         /// Its sequence number.
         sequence: u32,
     },
     /// The state changed.
     Changed {
-        /// From.
+        /// State before.
         from: State,
-        /// To.
+        /// State after.
         to: State,
     },
-    /// The physics began to move for a job; this is what may happen once for a (job, cycle).
+    /// The physics began to move for a job. This can happen only once for a (job, cycle).
     Began {
         /// Sequence number of the START.
         start: u32,
@@ -65,13 +65,13 @@ pub enum What {
         start: u32,
         /// 1 complete, 2 stopped, 3 aborted, 4 failed.
         result: u16,
-        /// How its client gave signs of life meanwhile.
+        /// Beats of the client during the job.
         #[serde(flatten)]
         beats: Beats,
     },
     /// A payload came into force.
     Taken {
-        /// Which.
+        /// Kind of the payload.
         kind: u16,
         /// Its identity.
         #[serde(serialize_with = "digits")]
@@ -79,9 +79,9 @@ pub enum What {
     },
     /// A payload arrived that the machine cannot use.
     Refused {
-        /// Which.
+        /// Kind of the payload.
         kind: u16,
-        /// In words.
+        /// Reason in words.
         reason: String,
     },
     /// A fault was shown; 20 is a silent client.
@@ -89,32 +89,32 @@ pub enum What {
         /// Its number in docs/modbus.md.
         fault: u16,
     },
-    /// It began to move without an order.
+    /// The machine began to move without a command.
     Strayed,
-    /// The machine's application started anew.
+    /// The machine's application restarted.
     Rebooted {
         /// Its new boot id.
         boot_id: u32,
     },
-    /// The same under its old boot id, and it says that it never began what it was at.
+    /// The application restarted with its old boot id, and denies that it began its last job.
     Forgot,
 }
 
-/// How the owner's beats came while a job ran, from its START to its end.
+/// Statistics of the owner's beats during a job, from its START to its end.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Beats {
-    /// How many.
+    /// Number of beats.
     #[serde(rename = "beats")]
     pub heard: u32,
-    /// Mean time from one to the next; 0 of fewer than two.
+    /// Mean time between beats; 0 for fewer than two.
     #[serde(rename = "mean_beat_s", serialize_with = "seconds")]
     pub mean: Duration,
-    /// The longest time without one.
+    /// Longest time without a beat.
     #[serde(rename = "longest_silence_s", serialize_with = "seconds")]
     pub longest_silence: Duration,
 }
 
-/// Listens to the owner's beats while a job runs.
+/// Collector of the owner's beats during a job.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Listening {
     began: Duration,
@@ -129,7 +129,7 @@ impl Listening {
         Self { began, ..Self::default() }
     }
 
-    /// A beat comes at a time.
+    /// Records a beat at a time.
     pub(crate) fn hear(&mut self, now: Duration) {
         self.longest = self.silence_at(now);
         self.first = self.first.or(Some(now));
@@ -137,7 +137,7 @@ impl Listening {
         self.heard = self.heard.saturating_add(1);
     }
 
-    /// What came until now.
+    /// Returns the statistics until now.
     pub(crate) fn until(&self, now: Duration) -> Beats {
         let between = self.last.zip(self.first).map_or(Duration::ZERO, |(last, first)| last - first);
         let mean = between.checked_div(self.heard.saturating_sub(1)).unwrap_or_default();
@@ -149,7 +149,7 @@ impl Listening {
     }
 }
 
-/// The newest things that happened; the older half is forgotten when it is full.
+/// Newest events; the older half is dropped when the log is full.
 #[derive(Default)]
 pub(crate) struct Log {
     seen: Vec<Seen>,
@@ -157,7 +157,7 @@ pub(crate) struct Log {
     witness: Option<Witness>,
 }
 
-/// Who is told of everything as it happens.
+/// Observer that receives each event when it happens.
 pub type Witness = Box<dyn FnMut(&Seen) + Send>;
 
 impl fmt::Debug for Log {
@@ -189,7 +189,7 @@ impl Log {
         self.seen.push(seen);
     }
 
-    /// Has somebody told of everything from now on.
+    /// Sets an observer of all events from now on.
     pub(crate) fn witness(&mut self, witness: Witness) {
         self.witness = Some(witness);
     }

@@ -1,10 +1,10 @@
-//! What the part should be, by formulas of its own, for the truth must share no error with the code under test.
+//! Nominal shape of the part, from formulas of its own: the truth must share no error with the code under test.
 //!
 //! Closed-form surfaces z(x, y) with exact derivatives.
 
 use crate::Vec3;
 
-/// A surface that is a height over the plane.
+/// Surface given as a height over the plane.
 ///
 /// Units: millimetres; `gradient` is dimensionless, `hessian` in 1/mm.
 pub trait Shape: Send + Sync {
@@ -37,10 +37,10 @@ pub trait Shape: Send + Sync {
     }
 }
 
-/// The free-form mirror of the trials: about 102 x 62 mm, slopes to 30 degrees, curvature of both signs, no symmetry.
+/// Free-form mirror of the trials: about 102 x 62 mm, slopes to 30 degrees, curvature of both signs, no symmetry.
 #[derive(Clone, Copy, Debug)]
 pub struct FreeForm {
-    /// Multiplies the height; 1 for the part of the trials.
+    /// Factor of the height; 1 for the part of the trials.
     pub scale: f64,
 }
 
@@ -49,7 +49,7 @@ impl FreeForm {
     pub const WIDTH_MM: f64 = 102.0;
     /// Depth in y, in millimetres.
     pub const DEPTH_MM: f64 = 62.0;
-    /// Columns and rows of the nominal cloud of the paper's size, 451,401 points.
+    /// Columns and rows of the nominal cloud, of the size in the paper: 451,401 points.
     pub const PAPER_GRID: (usize, usize) = (901, 501);
 }
 
@@ -92,7 +92,7 @@ impl Shape for FreeForm {
     }
 }
 
-/// A cap of a sphere about the z axis, its vertex at the origin; a positive radius opens towards +z.
+/// Cap of a sphere about the z axis, with its vertex at the origin; a positive radius opens towards +z.
 #[derive(Clone, Copy, Debug)]
 pub struct Sphere {
     /// Radius of curvature in millimetres, signed.
@@ -117,7 +117,7 @@ impl Shape for Sphere {
     }
 }
 
-/// A conic with different radii and conic constants in x and y.
+/// Conic with different radii and conic constants in x and y.
 #[derive(Clone, Copy, Debug)]
 pub struct Biconic {
     /// Radii of curvature in x and y, in millimetres.
@@ -161,8 +161,8 @@ impl Shape for Biconic {
     }
 }
 
-/// The off-axis section of an even asphere: the parent's surface about (`shift_mm`, 0), in parent coordinates moved so
-/// that the section's centre is the origin.
+/// Off-axis section of an even asphere: the parent's surface about (`shift_mm`, 0), in parent coordinates moved so that
+/// the section's centre is the origin.
 #[derive(Clone, Copy, Debug)]
 pub struct OffAxisAsphere {
     /// Vertex radius of the parent in millimetres.
@@ -206,7 +206,7 @@ impl Shape for OffAxisAsphere {
     }
 }
 
-/// A shallow wave on a nearly flat part.
+/// Shallow wave on a nearly flat part.
 #[derive(Clone, Copy, Debug)]
 pub struct Wave {
     /// Peak to valley of the wave in millimetres.
@@ -232,10 +232,10 @@ impl Shape for Wave {
     }
 }
 
-/// A sum of powers of x and y.
+/// Sum of powers of x and y.
 #[derive(Clone, Debug)]
 pub struct XyPolynomial {
-    /// What x and y are divided by, in millimetres.
+    /// Normalization radius by which x and y are divided, in mm.
     pub normalisation_radius_mm: f64,
     /// The powers of x and of y, and the coefficient in millimetres.
     pub terms: Vec<(u32, u32, f64)>,
@@ -267,7 +267,7 @@ impl Shape for XyPolynomial {
     }
 }
 
-/// A surface moved along z so that the origin lies on it.
+/// Surface moved along z so that it passes through the origin.
 #[derive(Clone, Debug)]
 pub struct ThroughOrigin<S>(pub S);
 
@@ -285,8 +285,8 @@ impl<S: Shape> Shape for ThroughOrigin<S> {
     }
 }
 
-/// Returns the foot of a point on a surface, from a place nearby, and how far along the normal the point is; none where that does not
-/// converge.
+/// Projects a point onto a surface, from a start nearby. Returns the projection and the signed distance of the point
+/// along the normal; `None` if the iteration does not converge.
 ///
 /// Solves (c - S) . S_x = 0 and (c - S) . S_y = 0 by Newton's method.
 pub(crate) fn foot(shape: &dyn Shape, centre: Vec3, [mut x, mut y]: [f64; 2]) -> Option<([f64; 2], f64)> {

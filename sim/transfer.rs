@@ -1,29 +1,29 @@
-//! Payloads on their way in and results on their way out, a page at a time.
+//! Transfer of payloads to the machine and of results from it, page by page.
 
 use crate::body::{Kind, Outcome, Payload};
 use crate::words::{Image, WordOrder, bytes_of, registers_of, turn_payload};
 
-/// Data registers of a full page.
+/// Number of data registers of a full page.
 pub const PAGE_REGISTERS: usize = 112;
 const PAGE_BYTES: u32 = 2 * PAGE_REGISTERS as u32;
 
-/// Whether an inbox has what it was promised.
+/// State of an inbox.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum InboxState {
-    /// No header yet.
+    /// There is no header yet.
     #[default]
     Empty = 0,
-    /// Waiting for pages.
+    /// The inbox waits for pages.
     Receiving = 1,
     /// The payload is in force.
     Taken = 2,
-    /// All pages came and are not what the header promised.
+    /// All pages have arrived, and do not match the header.
     CrcWrong = 3,
     /// The machine cannot use it.
     Refused = 4,
 }
 
-/// A payload that has wholly arrived, in the machine's word order as it was sent.
+/// Payload that has arrived completely, in the machine's word order as it was sent.
 #[derive(Clone, Debug)]
 pub(crate) struct Arrived {
     pub kind: u16,
@@ -31,7 +31,7 @@ pub(crate) struct Arrived {
     pub identity: [u8; 32],
 }
 
-/// Where a payload is put together.
+/// Inbox in which a payload is assembled.
 #[derive(Debug, Default)]
 pub(crate) struct Inbox {
     kind: u16,
@@ -46,7 +46,7 @@ pub(crate) struct Inbox {
 }
 
 impl Inbox {
-    /// Takes a header; false if its content cannot be taken.
+    /// Accepts a header; returns false if its content is not acceptable.
     pub(crate) fn header(&mut self, order: WordOrder, words: &[u16], of: Kind, limit_bytes: u32) -> bool {
         let (kind, promised) = (words[0], order.to_u32([words[2], words[3]]));
         if slot_of(of, kind).is_none() || promised == 0 || promised > limit_bytes {
@@ -65,7 +65,7 @@ impl Inbox {
         true
     }
 
-    /// Takes a page; `None` if it is out of turn or its length is wrong, `Some(Some(_))` if it was the last.
+    /// Accepts a page; returns `None` if it is out of turn or its length is wrong, `Some(Some(_))` if it was the last.
     pub(crate) fn page(&mut self, order: WordOrder, words: &[u16]) -> Option<Option<Arrived>> {
         if self.has_page(order, words) {
             return Some(None);
@@ -81,7 +81,7 @@ impl Inbox {
         Some(if self.bytes.len() as u32 == self.promised { self.close() } else { None })
     }
 
-    /// Says whether a page was taken already.
+    /// Returns true if a page was accepted already.
     pub(crate) fn has_page(&self, order: WordOrder, words: &[u16]) -> bool {
         order.to_u32([words[0], words[1]]) < self.next_page
     }
@@ -96,7 +96,7 @@ impl Inbox {
         Some(Arrived { kind: self.kind, bytes: self.bytes.clone(), identity: self.identity })
     }
 
-    /// Says that the machine cannot use what has arrived.
+    /// Reports that the machine cannot use the payload that has arrived.
     pub(crate) fn refuse(&mut self, answer: u16) {
         self.state = InboxState::Refused;
         self.reason = answer;
@@ -114,7 +114,7 @@ impl Inbox {
     }
 }
 
-/// Returns which slot in force a kind of payload goes to, `None` if a machine has no use for it.
+/// Returns the slot in force for a kind of payload, `None` if the machine has no use for it.
 pub(crate) fn slot_of(machine: Kind, kind: u16) -> Option<usize> {
     match (machine, kind) {
         (Kind::Cmm, 1) => Some(0),
@@ -124,12 +124,12 @@ pub(crate) fn slot_of(machine: Kind, kind: u16) -> Option<usize> {
     }
 }
 
-/// A payload in force.
+/// Payload in force.
 #[derive(Clone, Debug)]
 pub(crate) struct Slot {
-    /// As the physics reads it.
+    /// Payload as the physics reads it.
     pub payload: Payload,
-    /// Over the bytes as they were sent.
+    /// CRC of the bytes as they were sent.
     pub crc: u32,
 }
 
@@ -160,14 +160,14 @@ pub(crate) fn slots_image(order: WordOrder, slots: &[Option<Slot>; 3]) -> Vec<u1
     image.done()
 }
 
-/// What a job left, until it is acknowledged.
+/// Result of a job, until it is acknowledged.
 #[derive(Clone, Debug)]
 pub(crate) struct Outbox {
     header: Vec<u16>,
     registers: Vec<u16>,
 }
 
-/// Whose result it is.
+/// Origin of a result.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Origin {
     pub job: u32,
@@ -177,7 +177,7 @@ pub(crate) struct Origin {
 }
 
 impl Outbox {
-    /// Packs what a job that still runs has left so far: without a CRC, without the number of an end, and in full pages alone.
+    /// Packs the present result of a running job: without a CRC, without a `done` number, and only in full pages.
     pub(crate) fn so_far(order: WordOrder, outcome: Outcome, origin: Origin) -> Option<Self> {
         let mut outbox = Self::new(order, outcome, Origin { done: 0, ..origin })?;
         outbox.header[4..6].fill(0);
@@ -186,7 +186,7 @@ impl Outbox {
         Some(outbox)
     }
 
-    /// Packs an outcome; `None` if one of its figures is not a number that may be sent.
+    /// Packs a result; `None` if one of its figures is not a number that may be sent.
     pub(crate) fn new(order: WordOrder, outcome: Outcome, origin: Origin) -> Option<Self> {
         let figures = [outcome.probe_radius_mm, outcome.scale_mm, outcome.temperature_c, outcome.duration_s];
         if !figures.iter().all(|figure| figure.is_finite()) {
@@ -220,14 +220,14 @@ impl Outbox {
         self.header.clone()
     }
 
-    /// Returns the 116 registers of a page; beyond the last page they say 0 data registers.
+    /// Returns the 116 registers of a page; beyond the last page, they give 0 data registers.
     pub(crate) fn page_image(&self, order: WordOrder, page: u32) -> Vec<u16> {
         let data = self.registers.chunks(PAGE_REGISTERS).nth(page as usize).unwrap_or(&[]);
         page_image(order, page, data)
     }
 }
 
-/// Returns a page of an outbox: which it is, how many registers count, and they.
+/// Returns the registers of a page of an outbox: number of the page, number of valid registers, and the registers.
 pub(crate) fn page_image(order: WordOrder, page: u32, data: &[u16]) -> Vec<u16> {
     Image::new(order, 4 + PAGE_REGISTERS).u32(0, page).u16(2, data.len() as u16).words(4, data).done()
 }

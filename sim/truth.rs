@@ -1,7 +1,7 @@
-//! What both machines share: the part and what has been done to it.
+//! State shared by both machines: the part and its history.
 //!
-//! Every random number has a stream of its own, by what it is for and how often that has been drawn, so that one more
-//! source of error changes no other, and neither do the steps in which time goes on.
+//! Every random number has its own stream, selected by its purpose and its count. An additional source of error
+//! therefore changes no other source, and neither does the size of the time steps.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -13,43 +13,45 @@ use crate::part::Part;
 use crate::probe::Placement;
 use crate::spec::WorldSpec;
 
-/// A pass that the grinder began.
+/// Pass that the grinder began.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GrindEntry {
-    /// The part's run.
+    /// Run of the part.
     pub job: u32,
-    /// Its cycle.
+    /// Cycle of the run.
     pub cycle: u16,
-    /// The height that was wanted, in millimetres.
+    /// Commanded height, in mm.
     pub level_mm: f64,
-    /// Largest value of the map that came with it, in millimetres.
+    /// Largest value of the map of the pass, in mm.
     pub map_largest_mm: f64,
     /// Identity of the map.
     pub map: [u8; 32],
-    /// Strokes to take off what stood above the depth of cut.
+    /// Number of strokes that removed material higher than the depth of cut.
     pub roughing_strokes: u32,
-    /// How it ended as in the pass record; 0 while it goes on.
+    /// Result as in the pass record; 0 while the pass runs.
     pub result: u16,
-    /// Volume removed in cubic millimetres.
+    /// Removed volume, in mm³.
     pub volume_mm3: f64,
 }
 
-/// A pass along a path that a controller executed: from when the wheel came to the part until the part was taken away.
+/// Pass along a path that an external controller executed: from the first contact of wheel and part until the part was
+/// taken away.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sweep {
-    /// How often the wheel came over the whole part: 1, and 1 for every spark-out, where nothing was left out and nothing done twice.
+    /// Number of strokes over the whole part: 1, plus 1 for every spark-out, if nothing was left out and nothing was
+    /// done twice.
     pub strokes: f64,
-    /// Of that, in the air.
+    /// Part of `strokes` that was in the air.
     pub strokes_in_air: f64,
-    /// Tracks.
+    /// Number of tracks.
     pub tracks: u32,
-    /// Distance of the tracks, in millimetres; 0 before there were two.
+    /// Spacing of the tracks, in mm; 0 before the second track.
     pub spacing_mm: f64,
-    /// Seconds from its first track to the end of its last.
+    /// Time from the start of the first track to the end of the last, in s.
     pub seconds: f64,
 }
 
-/// What a stream of random numbers is for.
+/// Purpose of a stream of random numbers.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Source {
     Blank = 1,
@@ -68,47 +70,47 @@ pub(crate) fn stream(seed: u64, source: Source, number: u32) -> crate::Rng {
     rng
 }
 
-/// What both machines share.
+/// State shared by both machines.
 pub(crate) struct State {
     pub spec: WorldSpec,
     pub part: Part,
-    /// Systematic error of the grinder at every node but the wheel's radius, in millimetres.
+    /// Systematic error of the grinder at every node, in mm, without the effect of the wheel's radius.
     pub systematic_mm: Vec<f64>,
     /// Number of the blank in the grinder, from 1.
     pub blanks: u32,
-    /// The job that the blank belongs to.
+    /// Job of the blank.
     pub job: Option<u32>,
     /// Identity of the part in the grinder.
     pub held: Option<[u8; 32]>,
     pub true_wheel_radius_mm: Option<f64>,
     pub passes_begun: u32,
-    /// After how many passes over the blank something has happened to it last.
+    /// Number of passes over the blank after which it was last damaged.
     pub damaged_after: Option<u32>,
-    /// Passes over the blank that is in the grinder.
+    /// Number of passes over the blank in the grinder.
     pub passes_of_blank: u32,
     pub measurements_begun: u32,
     pub loadings: u32,
-    /// The part has not left the CMM since it was measured last.
+    /// True if the part has stayed on the CMM since the last measurement.
     pub on_table: bool,
-    /// Takes the model frame to the CMM's.
+    /// Placement that maps the model frame to the CMM's.
     pub placement: Placement,
-    /// How warm the spindle is, 0 to 1.
+    /// Warmth of the spindle, 0 to 1.
     pub heat: f64,
-    /// Finishing strokes since the wheel was dressed.
+    /// Number of finishing strokes since the wheel was dressed.
     pub worn_strokes: f64,
-    /// The machine whose job has the part.
+    /// Machine whose job has the part.
     pub busy: Option<Kind>,
-    /// The machine whose wheel or probe is at the part.
+    /// Machine whose wheel or probe is at the part.
     pub engaged: Option<Kind>,
     pub history: Vec<GrindEntry>,
-    /// The passes along executed paths, in order.
+    /// Passes along executed paths, in order.
     pub sweeps: Vec<Sweep>,
-    /// Some of an executed path was lost, or the wheel ran into a probe: nobody knows how the part is.
+    /// True if part of an executed path was lost, or if the wheel ran into a probe: the state of the part is unknown.
     pub unknown: bool,
 }
 
 impl State {
-    /// The state before anything has happened; `systematic_mm` says what is wrong with the grinder at the part's nodes.
+    /// Creates the initial state; `systematic_mm` returns the systematic error of the grinder at the part's nodes.
     pub fn new(spec: WorldSpec, systematic_mm: impl FnOnce(&WorldSpec, &Part) -> Vec<f64>) -> Self {
         let part = Part::blank(&spec.part, blank_seed(spec.seed, 1));
         let systematic_mm = systematic_mm(&spec, &part);
@@ -145,7 +147,7 @@ impl State {
         (self.passes_of_blank, self.damaged_after) = (0, None);
     }
 
-    /// Sees to it that the part in the grinder is that of the job.
+    /// Ensures that the part in the grinder is that of the job.
     pub fn blank_for(&mut self, job: u32) {
         if self.spec.part.fresh_per_job && self.job.is_some_and(|other| other != job) {
             self.load_blank();
@@ -153,7 +155,8 @@ impl State {
         self.job = Some(job);
     }
 
-    /// Returns the placement for a measurement: the last one if the part has lain still, else one of a fresh loading.
+    /// Returns the placement for a measurement: the last one if the part has not moved, otherwise that of a new
+    /// loading.
     pub fn load_on_table(&mut self) -> Placement {
         if !self.on_table {
             self.damage();
@@ -164,7 +167,7 @@ impl State {
         self.placement
     }
 
-    /// Lets happen to the part, once, what happens to it after so many passes.
+    /// Applies the damage that is due after this number of passes, once.
     fn damage(&mut self) {
         if self.damaged_after.replace(self.passes_of_blank) == Some(self.passes_of_blank) {
             return;
@@ -181,7 +184,7 @@ impl State {
         self.busy.is_some_and(|other| other != kind)
     }
 
-    /// Gives the part to a machine, unless the other has it.
+    /// Gives the part to a machine, unless the other machine has it.
     pub fn take(&mut self, kind: Kind) -> bool {
         if self.taken_by_other(kind) {
             return false;
@@ -211,7 +214,7 @@ impl State {
     }
 }
 
-/// Returns where the part lies on the measuring machine after the n-th loading; 0 is where the table says.
+/// Returns the placement of the part on the measuring machine after the n-th loading; 0 is the placement in the table.
 fn placement(spec: &WorldSpec, loading: u32) -> Placement {
     let mut rng = stream(spec.seed, Source::Loading, loading);
     let mut about = |middle: Vec3, sigma: f64| -> Vec3 {
@@ -236,12 +239,12 @@ fn blank_seed(seed: u64, number: u32) -> u64 {
     stream(seed, Source::Blank, number).random()
 }
 
-/// A panic elsewhere leaves a state that still tells the truth about the part.
+/// Locks the state. After a panic elsewhere, the state is still the truth about the part, so poisoning is ignored.
 pub(crate) fn locked(state: &Mutex<State>) -> MutexGuard<'_, State> {
     state.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The outbox of a job that never began.
+/// Returns the outbox of a job that never began.
 pub(crate) fn nothing_done(temperature_c: f64) -> Outcome {
     Outcome {
         kind: 0,

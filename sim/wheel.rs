@@ -1,9 +1,9 @@
-//! A wheel that is led from place to place by a controller that knows neither part nor pass, and what it leaves.
+//! Wheel that a controller without knowledge of part or pass moves from place to place, and the surface that it leaves.
 //!
-//! The wheel is a ball. Where its centre C is, it stands over the nominal surface by the distance of C from the surface less its radius, at
-//! the foot of C; what a stiff machine would leave between two tracks is what the wheel left on either, by the way between them. Machine and part give
-//! way as in [`crate::process`], which says what `S` and `mu` are: h becomes mu h + (1 - mu) cmd where h > cmd. The grooves of the single
-//! tracks, wear and growth are not in here.
+//! The wheel is a ball. With its centre at C, its height over the nominal surface is the distance of C from the surface
+//! minus its radius, at the projection of C. Between two tracks, a stiff machine would leave the heights of both
+//! tracks, interpolated linearly. Machine and part deflect as in [`crate::process`], which defines `S` and `mu`: h
+//! becomes mu h + (1 - mu) cmd where h > cmd. The grooves of single tracks, wear and growth are not modelled here.
 
 use std::sync::{Arc, Mutex};
 
@@ -12,12 +12,12 @@ use crate::body::Kind;
 use crate::shape::foot;
 use crate::truth::{State, locked};
 
-/// Higher than this over the nominal surface nothing is there to be ground.
+/// Height over the nominal surface above which there is no material, in mm.
 const AIR_MM: f64 = 1.0;
-/// Tracks are further apart than this.
+/// Distance in y within which places belong to the same track, in mm.
 const SAME_TRACK_MM: f64 = 0.2;
 
-/// What the wheel stood at along a track: x, and the height over the nominal surface.
+/// Samples of the wheel along a track: x, and the height over the nominal surface.
 #[derive(Clone, Debug, Default)]
 struct Track {
     y_mm: f64,
@@ -25,7 +25,7 @@ struct Track {
 }
 
 impl Track {
-    /// The height at a place along the track; at its ends where it does not reach so far.
+    /// Returns the height at a place along the track; beyond its ends, that of the end.
     fn at(&self, x: f64) -> Option<f64> {
         let near = |a: &&[f64; 2], b: &&[f64; 2]| (a[0] - x).abs().total_cmp(&(b[0] - x).abs());
         let below = self.places.iter().filter(|place| place[0] <= x).min_by(near);
@@ -37,7 +37,7 @@ impl Track {
     }
 }
 
-/// The wheel of a world's grinder.
+/// Wheel of a world's grinder.
 pub struct PlainWheel {
     world: Arc<Mutex<State>>,
     radius_mm: f64,
@@ -47,13 +47,13 @@ pub struct PlainWheel {
 }
 
 impl PlainWheel {
-    /// A wheel that its controller takes to have this radius.
+    /// Creates a wheel whose controller assumes this radius.
     pub(crate) fn new(world: Arc<Mutex<State>>, stated_mm: f64) -> Self {
         let radius_mm = stated_mm + 1e-3 * locked(&world).spec.grinder.wheel_radius_error_um;
         Self { world, radius_mm, first: None, before: None, now: None }
     }
 
-    /// The part is clamped for a program. Whether it is there.
+    /// Clamps the part for a program; returns true if it is there.
     pub fn take(&mut self) -> bool {
         let mut state = locked(&self.world);
         (self.first, self.before, self.now) = (None, None, None);
@@ -61,12 +61,12 @@ impl PlainWheel {
         state.take(Kind::Grinder)
     }
 
-    /// The wheel is away from the part, and others may have it.
+    /// Moves the wheel away from the part, so that the other machine can take the part.
     pub fn let_go(&mut self) {
         locked(&self.world).release(Kind::Grinder);
     }
 
-    /// Its centre comes to a place of the model frame.
+    /// Moves the centre of the wheel to a place of the model frame.
     pub fn come(&mut self, centre_mm: Vec3) {
         let world = Arc::clone(&self.world);
         let mut state = locked(&world);
@@ -99,7 +99,7 @@ impl PlainWheel {
         }
     }
 
-    /// It has been all over the part: the strips beyond the outermost tracks are as those.
+    /// Ends a complete sweep: the strips beyond the outermost tracks take the heights of those tracks.
     pub fn been_all_over(&mut self) {
         self.next_track();
         let world = Arc::clone(&self.world);
@@ -113,7 +113,7 @@ impl PlainWheel {
     }
 }
 
-/// Grinds what lies between these bounds to a height over the nominal surface.
+/// Grinds the material between these bounds to a height over the nominal surface.
 fn grind(state: &mut State, (along, across): ([f64; 2], [f64; 2]), wanted: impl Fn([f64; 2]) -> Option<f64>) {
     let mu = state.spec.grinder.error_copying;
     let within = |[least, most]: [f64; 2], value: f64| (least..=most).contains(&value);

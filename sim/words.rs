@@ -1,9 +1,11 @@
-//! How values lie in registers: word order and checksums of its own, for an error in one must not stand at both ends of the wire.
+//! Encoding of values in registers: word order and checksums, implemented independently: an error must not be the same
+//! at both ends of the wire.
 //!
-//! A machine that stands low word first does so in its payloads too, while the physics behind it reads them high word first.
-//! So the machine must know where in a payload the values of more than one register begin; that is the table at the end.
+//! A machine with the low word first also uses that order in its payloads, while the physics behind it reads them high
+//! word first. The machine must therefore know the values of more than one register in a payload; the table at the end
+//! lists them.
 
-/// In which order the registers of one value stand.
+/// Order of the registers of one value.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum WordOrder {
     /// High word first.
@@ -51,7 +53,7 @@ impl WordOrder {
     }
 }
 
-/// A block of registers that is being filled in.
+/// Block of registers under construction.
 #[derive(Debug)]
 pub(crate) struct Image {
     order: WordOrder,
@@ -78,7 +80,7 @@ impl Image {
         self.words(offset, &words)
     }
 
-    /// Puts bytes whose order no convention touches: text, an identity.
+    /// Writes bytes that no word order changes: text, an identity.
     pub(crate) fn bytes(self, offset: usize, bytes: &[u8]) -> Self {
         self.words(offset, &registers_of(bytes))
     }
@@ -110,9 +112,9 @@ pub fn crc16(bytes: &[u8]) -> u16 {
     })
 }
 
-/// Turns a payload from one word order into the other, in place; what follows the last whole record is left alone.
+/// Converts a payload from one word order to the other, in place; bytes after the last whole record stay unchanged.
 ///
-/// The kinds are those of docs/modbus.md; a kind that is not known is left alone.
+/// The kinds are those of docs/modbus.md; an unknown kind stays unchanged.
 pub fn turn_payload(kind: u16, format: u16, bytes: &mut [u8]) {
     let (header, record) = fields(kind, format);
     let length = header.iter().map(|field| field.unsigned_abs()).sum::<usize>().min(bytes.len());
@@ -137,7 +139,7 @@ fn turn_fields(bytes: &mut [u8], fields: &[isize]) {
     }
 }
 
-/// Lengths in bytes of the values of a payload's header and of its records; a negative length is raw bytes.
+/// Returns the lengths in bytes of the values of a payload's header and of its records; a negative length is raw bytes.
 fn fields(kind: u16, format: u16) -> (&'static [isize], &'static [isize]) {
     match (kind, format) {
         (1, _) => (&[2, 2, 4, 8, 8, 8, 8, 8, 4, -4, 8], &[4, 2, 2, 8, 8, 8, 8, 8, 8]),

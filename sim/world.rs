@@ -1,11 +1,12 @@
-//! A grinding cell's truth: one table says what is wrong with everything in it, one seed draws the rest.
+//! Ground truth of a grinding cell: one table contains all errors, and one seed draws all random numbers.
 //!
-//! [`World`] hands out the two machines as [`Body`](crate::body::Body) and answers, to tests alone, what no controller may ask: where the
-//! part really lies, how far its surface really stands from the nominal, and what the grinder really did.
+//! [`World`] gives out the two machines as [`Body`](crate::body::Body). For tests only, it also returns the truth that
+//! no controller may ask for: the real placement of the part, the real deviation of its surface from the nominal, and
+//! what the grinder really did.
 //!
-//! Grinder and measuring machine share the part. From the beginning of a job to its end (`outcome`) the part is with
-//! that machine, and the other one finds its clamp empty (interlock bit 2) and refuses to prepare with answer 9. A machine is
-//! clear (bit 1) while it has not begun, has finished, or has been retracted.
+//! Grinder and measuring machine share the part. From the beginning of a job to its end (`outcome`) the part is in that
+//! machine. The other machine finds its clamp empty (interlock bit 2) and refuses to prepare with answer 9. A machine
+//! is clear (bit 1) before it begins, after it finishes, or after it is retracted.
 
 use std::fmt;
 use std::sync::{Arc, Mutex};
@@ -19,7 +20,7 @@ use crate::spec::{Faults, SpecError, WorldSpec};
 use crate::truth::{GrindEntry, State, Sweep, locked};
 use crate::wheel::PlainWheel;
 
-/// A simulated cell. Clones share one truth.
+/// Simulated cell. Clones share one truth.
 #[derive(Clone)]
 pub struct World {
     state: Arc<Mutex<State>>,
@@ -33,51 +34,52 @@ impl fmt::Debug for World {
 }
 
 impl World {
-    /// Makes the world of a table.
+    /// Creates the world of a table.
     ///
     /// # Errors
-    /// A number that the simulation does not hold for.
+    /// A number is outside the range for which the simulation is valid.
     pub fn new(spec: WorldSpec) -> Result<Self, SpecError> {
         spec.check()?;
         Ok(Self { state: Arc::new(Mutex::new(State::new(spec, systematic_mm))) })
     }
 
-    /// Returns the grinder; there is one, so hand it to one wire.
+    /// Returns the grinder. There is only one, so give it to one wire.
     pub fn grinder(&self) -> Grinder {
         Grinder::new(self.state.clone())
     }
 
-    /// Returns the measuring machine; there is one, so hand it to one wire.
+    /// Returns the measuring machine. There is only one, so give it to one wire.
     pub fn cmm(&self) -> Cmm {
         Cmm::new(self.state.clone())
     }
 
-    /// Returns the probe of the measuring machine, to be led touch by touch; there is one, so hand it to one wire.
+    /// Returns the probe of the measuring machine, for control touch by touch. There is only one, so give it to one
+    /// wire.
     pub fn led(&self) -> Led {
         Led::new(self.state.clone())
     }
 
-    /// Returns a wheel of the grinder that is led from place to place on tracks far apart, stated to have this radius; see [`crate::wheel`]. There is
-    /// one grinder, so take this, [`World::wheel`] or [`World::grinder`].
+    /// Returns a wheel of the grinder with this stated radius, which is moved from place to place on widely spaced
+    /// tracks; see [`crate::wheel`]. There is one grinder, so take this, [`World::wheel`] or [`World::grinder`].
     pub fn plain_wheel(&self, stated_mm: f64) -> PlainWheel {
         PlainWheel::new(self.state.clone(), stated_mm)
     }
 
-    /// Returns the wheel of a grinder whose controller is none of this world, to be moved along the path that that executes; there is one
-    /// grinder, so take either this or [`World::grinder`].
+    /// Returns the wheel of a grinder with an external controller; it is moved along the path that the controller
+    /// executes. There is one grinder, so take either this or [`World::grinder`].
     ///
     /// # Errors
-    /// A radius that no wheel has.
+    /// The radius is not possible for a wheel.
     pub fn wheel(&self, stated_radius_mm: f64) -> Result<Wheel, SpecError> {
         Wheel::new(self.state.clone(), stated_radius_mm)
     }
 
-    /// Puts a new blank in, as an operator would.
+    /// Loads a new blank, as an operator would.
     pub fn load_blank(&self) {
         locked(&self.state).load_blank();
     }
 
-    /// Changes what is broken, from the next job on.
+    /// Sets the faults, from the next job on.
     pub fn set_faults(&self, faults: Faults) {
         let mut state = locked(&self.state);
         state.spec.faults = faults;
@@ -89,22 +91,23 @@ impl World {
         locked(&self.state).spec.clone()
     }
 
-    /// Truth: how far the real surface stands over the nominal at (x, y) of the model frame, along the normal, in millimetres, the ridges
-    /// between the grinder's tracks included.
+    /// Returns the true deviation of the real surface from the nominal at (x, y) of the model frame, along the normal,
+    /// in mm. The ridges between the grinder's tracks are included.
     pub fn deviation_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
         locked(&self.state).part.deviation_mm(x_mm, y_mm)
     }
 
-    /// Truth: the same at many places, at one moment.
+    /// Returns the true deviations at many places at one moment, in mm.
     pub fn deviations_mm(&self, places_mm: &[[f64; 2]]) -> Vec<f64> {
         let state = locked(&self.state);
         places_mm.iter().map(|&[x, y]| state.part.deviation_mm(x, y)).collect()
     }
 
-    /// Truth: how far the centre of a ball stands above the offset of the nominal, at one moment, where the ball touches the real surface along
-    /// the nominal normal over each place, in millimetres.
+    /// Returns, for each place, the true height in mm of the centre of a ball above the offset of the nominal surface,
+    /// where the ball touches the real surface along the nominal normal. All values are of one moment.
     ///
-    /// In a groove it stands higher or lower than [`Self::deviation_mm`] says: the ball touches beside its centre. Beyond the part it touches nothing.
+    /// In a groove, this differs from [`Self::deviation_mm`], because the ball touches beside its centre. Beyond the
+    /// part the ball touches nothing.
     pub fn touched_mm(&self, places_mm: &[[f64; 2]], radius_mm: f64) -> Vec<Option<f64>> {
         const REACH_MM: f64 = 1.0;
         let state = locked(&self.state);
@@ -119,19 +122,19 @@ impl World {
         places_mm.iter().map(height_mm).collect()
     }
 
-    /// Truth: the point of the nominal surface over (x, y) and its unit normal.
+    /// Returns the point of the nominal surface over (x, y) and its unit normal.
     pub fn nominal(&self, x_mm: f64, y_mm: f64) -> (crate::Vec3, crate::Vec3) {
         let state = locked(&self.state);
         (state.part.shape.point(x_mm, y_mm), state.part.shape.normal(x_mm, y_mm))
     }
 
-    /// Truth: where the part lay in the last measurement (before the first: where it will, but for the loading), half a turn included.
-    /// Takes the model frame to the CMM's at 20 degrees Celsius.
+    /// Returns the true placement of the part in the last measurement, half a turn included; before the first
+    /// measurement, the placement without the random error of loading. It maps the model frame to the CMM's at 20 °C.
     pub fn placement(&self) -> Placement {
         locked(&self.state).placement
     }
 
-    /// Truth: mean of the deviation over the part, in millimetres.
+    /// Returns the true mean of the deviation over the part, in mm.
     pub fn level_mm(&self) -> f64 {
         let state = locked(&self.state);
         let part = &state.part;
@@ -146,32 +149,32 @@ impl World {
         on_part.iter().sum::<f64>() / on_part.len() as f64
     }
 
-    /// Truth: RMS of what a pass draws afresh, which no compensation can take away, in millimetres.
+    /// Returns the true RMS of the random error of a pass, in mm. No compensation can remove it.
     pub fn floor_mm(&self) -> f64 {
         locked(&self.state).spec.grinder.repeatability_um * 1e-3
     }
 
-    /// Truth: every pass that was begun, in order.
+    /// Returns every pass that was begun, in order.
     pub fn history(&self) -> Vec<GrindEntry> {
         locked(&self.state).history.clone()
     }
 
-    /// Truth: every pass along an executed path, in order.
+    /// Returns every pass along an executed path, in order.
     pub fn sweeps(&self) -> Vec<Sweep> {
         locked(&self.state).sweeps.clone()
     }
 
-    /// Truth: how often a pass was begun for a job and cycle.
+    /// Returns how often a pass was begun for a job and cycle.
     pub fn grinds_begun(&self, job: u32, cycle: u16) -> usize {
         locked(&self.state).history.iter().filter(|entry| (entry.job, entry.cycle) == (job, cycle)).count()
     }
 
-    /// Truth: how many measurements were begun.
+    /// Returns the number of measurements that were begun.
     pub fn measurements_begun(&self) -> u32 {
         locked(&self.state).measurements_begun
     }
 
-    /// Truth: which blank is in the grinder, counted from 1.
+    /// Returns the number of the blank in the grinder, from 1.
     pub fn blank(&self) -> u32 {
         locked(&self.state).blanks
     }

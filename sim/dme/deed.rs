@@ -1,40 +1,40 @@
-//! What the machine behind a server of I++ DME did, in order, for a test to hold against what its client has on record.
+//! Events of the machine behind a server of I++ DME, in order. A test compares them with the record of the client.
 
 use crate::Vec3;
 
-/// One thing that the machine did.
+/// Event of the machine.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Deed {
-    /// It began to move, by a command of this name; a touch goes on from there along the normal, and comes back.
+    /// The machine began to move for this command. A touch continues from there along the normal, and returns.
     Moves {
-        /// The command.
+        /// Name of the command.
         command: String,
-        /// Where the probe's centre was, in the machine's frame.
+        /// Start position of the probe's centre, in the machine's frame.
         from_mm: Vec3,
-        /// Where it goes.
+        /// Target of the motion.
         to_mm: Vec3,
     },
-    /// What it was at is over, or was broken off: it stands.
+    /// The motion has ended or was interrupted: the machine is at rest.
     Stands {
-        /// Where the probe's centre is.
+        /// Position of the probe's centre.
         at_mm: Vec3,
     },
-    /// It touched the part, or the sphere, and says so.
+    /// The machine touched the part or the sphere, and reports it.
     Touched {
-        /// Where it was sent.
+        /// Commanded point.
         point_mm: Vec3,
-        /// Along which normal.
+        /// Normal of the touch.
         normal: Vec3,
-        /// Where the probe's centre was.
+        /// Position of the probe's centre.
         centre_mm: Vec3,
     },
-    /// It was told to abort, and did.
+    /// The machine carried out an abort.
     Aborted,
-    /// Its stop circuit opened.
+    /// The stop circuit opened.
     Stopped,
-    /// Its server was started anew, and knows nothing of what was.
+    /// The server was restarted, and has forgotten everything before.
     Restarted,
 }
 
-/// Who is told of everything as it happens.
+/// Observer that receives each event when it happens.
 pub type Witness = Box<dyn FnMut(&Deed) + Send>;

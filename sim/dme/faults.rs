@@ -1,43 +1,43 @@
-//! What goes wrong at a server of I++ DME.
+//! Faults of a server of I++ DME.
 
 use std::time::Duration;
 
-/// Something that goes wrong with a command.
+/// Fault of a command.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Fault {
-    /// It is acknowledged late.
+    /// The acknowledgement is late.
     LateAcknowledgement(Duration),
-    /// It is carried out, and never said to be over.
+    /// The command is carried out, and its completion is never sent.
     NoCompletion,
-    /// Its data come twice.
+    /// The data come twice.
     Twice,
-    /// Its data come byte for byte.
+    /// The data come byte by byte.
     Split,
-    /// The fields of its data come in another order.
+    /// The fields of the data come in another order.
     Reordered,
-    /// A quality comes that was not asked for.
+    /// The data contain a quality that was not requested.
     UnaskedQuality,
-    /// Its data lack their parentheses.
+    /// The data lack their parentheses.
     Garbled,
-    /// Data of a command come that was never given.
+    /// Data come for a command that was never sent.
     Stranger,
-    /// The connection ends when it is carried out.
+    /// The connection ends when the command is carried out.
     Disconnect,
-    /// AbortE is acknowledged, and nothing comes of it.
+    /// AbortE is acknowledged, and has no effect.
     AbortIgnored,
-    /// Its error has another severity.
+    /// The error has another severity.
     Severity(u8),
-    /// The stop circuit opens when it comes.
+    /// The stop circuit opens when the command arrives.
     EmergencyStop,
-    /// It and all that follows take as long as at a real machine.
+    /// This command and all later ones take as long as at a real machine.
     InRealTime,
     /// The connection ends in the middle of a scan.
     CutInScan,
-    /// A point of a scan is not said.
+    /// A point of a scan is not sent.
     PointLost,
-    /// A point of a scan is said in the place of the one before it, and none is said for its last target.
+    /// Each point of a scan is sent in the place of the one before it, and the last target gets none.
     PointsShifted,
 }
 
-/// Faults at commands, by their names.
+/// Faults by the names of commands.
 pub type Faults = crate::faults::Faults<String, Fault>;

@@ -1,10 +1,10 @@
-//! Commands as they come over the wire, by a reader of its own: an error in one reader must not stand at both ends.
+//! Parser of received commands, implemented independently: an error must not be the same at both ends of the wire.
 
 use std::fmt;
 
 use super::faults::Fault;
 
-/// A tag.
+/// Tag of a command.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tag {
     event: bool,
@@ -12,10 +12,10 @@ pub struct Tag {
 }
 
 impl Tag {
-    /// What nobody asked for.
+    /// Tag of a message that no command requested.
     pub const UNASKED: Self = Self { event: true, number: 0 };
 
-    /// Whether it is that of a command that is carried out at once.
+    /// Returns true if the tag is of a command that is carried out at once.
     pub fn is_event(self) -> bool {
         self.event
     }
@@ -27,19 +27,19 @@ impl fmt::Display for Tag {
     }
 }
 
-/// An error as it is told.
+/// Error as it is sent.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Error {
-    /// 1 warns, 2 and 3 stop, 9 ends.
+    /// Severity: 1 warns, 2 and 3 stop, 9 ends.
     pub severity: u8,
-    /// Its number.
+    /// Number of the error.
     pub number: u16,
-    /// What it came of.
+    /// Cause of the error.
     pub cause: String,
 }
 
 impl Error {
-    /// An error of the standard, with its severity.
+    /// Creates an error of the standard, with its severity.
     pub fn new(number: u16, cause: &str) -> Self {
         let severity = match number {
             504 => 1,
@@ -79,27 +79,27 @@ impl fmt::Display for Error {
     }
 }
 
-/// What stands between two commas of a command.
+/// Argument of a command.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Argument {
     /// A number.
     Number(f64),
     /// A string.
     Text(String),
-    /// A name, and the numbers in its parentheses where it has any.
+    /// Name, with the numbers in its parentheses if it has any.
     Name(String, Option<Vec<f64>>),
-    /// A name with other names in its parentheses, such as the format of a curve.
+    /// Name with other names in its parentheses, for example the format of a curve.
     Names(String, Vec<String>),
 }
 
-/// A command.
+/// Command with its arguments.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Command {
-    /// Its name.
+    /// Name of the command.
     pub name: String,
-    /// What stands in its parentheses.
+    /// Arguments in its parentheses.
     pub arguments: Vec<Argument>,
-    /// What goes wrong with it.
+    /// Fault of the command.
     pub fault: Option<Fault>,
 }
 
@@ -111,10 +111,10 @@ impl Command {
 
 type Refused = (Option<Tag>, Error);
 
-/// Reads a line without its end.
+/// Parses a line without its line end.
 ///
 /// # Errors
-/// The tag, where it could be read, and the error to be told.
+/// Returns the tag, if it could be read, and the error to send.
 pub fn read(line: &str) -> Result<(Tag, Command), Refused> {
     let bytes = line.as_bytes();
     if let Some(bad) = bytes.iter().find(|b| !(32..127).contains(*b)) {
@@ -150,7 +150,7 @@ fn command(text: &str) -> Result<Command, u16> {
     Ok(Command { name: name.to_owned(), arguments, fault: None })
 }
 
-/// Parts what stands between commas that are in no string and in no parentheses.
+/// Splits the text at commas that are outside strings and parentheses.
 fn arguments(inside: &str) -> Result<Vec<Argument>, u16> {
     let (mut depth, mut quoted, mut from, mut parts) = (0i32, false, 0, Vec::new());
     for (at, c) in inside.char_indices() {

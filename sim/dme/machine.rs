@@ -1,4 +1,5 @@
-//! The machine behind the server: tools, frames, parameters within their limits, motion within the volume, and touches of the true part.
+//! Machine behind the server: tools, frames, parameters within their limits, motion within the volume, and touches of
+//! the true part.
 
 use std::collections::VecDeque;
 
@@ -7,18 +8,18 @@ use super::line::{Argument, Command, Error};
 use crate::Vec3;
 use crate::cmm::{Led, Touch};
 
-/// How the server and its machine are set up.
+/// Options of the server and its machine.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Tools by name, and what the machine takes their radius to be; `NoTool` has none.
+    /// Names of the tools, each with the radius that the machine assumes, in mm; `NoTool` has none.
     pub tools: Vec<(String, f64)>,
-    /// What it calls its class.
+    /// Class that the machine reports.
     pub class: String,
-    /// The version of the standard that it says it keeps.
+    /// Version of the standard that the machine reports.
     pub version: String,
-    /// Whether it has been homed before the client comes.
+    /// True if the machine is homed before the client connects.
     pub homed: bool,
-    /// Fastest travel and fastest touch, in millimetres per second.
+    /// Maximum speeds of travel and of a touch, in mm/s.
     pub fastest_mm_s: [f64; 2],
 }
 
@@ -34,18 +35,18 @@ impl Default for Options {
     }
 }
 
-/// What a command brings, and how long it takes.
+/// Result of a command, and its duration.
 #[derive(Clone, Debug, Default)]
 pub struct Done {
-    /// Seconds of the machine's time.
+    /// Duration in the machine's time, in s.
     pub seconds: f64,
-    /// Lines of data, each by its fields.
+    /// Lines of data, each as its fields.
     pub data: Vec<Vec<String>>,
-    /// What stops nothing.
+    /// Warnings, which stop nothing.
     pub warnings: Vec<Error>,
-    /// Lines that are said while it moves.
+    /// Lines that are sent while the machine moves.
     pub(super) scanned: VecDeque<super::scan::Scanned>,
-    /// The touch that it was.
+    /// Touch that the command made.
     pub(super) touched: Option<Deed>,
 }
 
@@ -55,7 +56,7 @@ impl Done {
     }
 }
 
-/// Parameters of a tool: speed of travel, then speed, approach, search and retract of a touch, then speed and retract of a scan.
+/// Parameters of a tool: speed of travel; speed, approach, search and retract of a touch; speed and retract of a scan.
 const PARAMETERS: [&str; 7] = [
     "GoToPar.Speed",
     "PtMeasPar.Speed",
@@ -68,7 +69,7 @@ const PARAMETERS: [&str; 7] = [
 
 const FIRST_PARAMETERS: [f64; 7] = [50.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0];
 
-/// A frame: rows of the rotation that takes the machine's frame to it, and where the machine's origin is in it.
+/// Frame: rows of the rotation from the machine's frame to this frame, and the machine's origin in it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Frame {
     rows: [Vec3; 3],
@@ -80,7 +81,7 @@ impl Frame {
     const MACHINE: Self =
         Self { rows: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], origin: [0.0; 3], written: [0.0; 6] };
 
-    /// Origin, then theta about x' between psi about z and phi about z''.
+    /// Creates a frame from its origin and its Euler angles: theta about x', between psi about z and phi about z''.
     fn new(written: [f64; 6]) -> Self {
         let [x, y, z, theta, psi, phi] = written;
         let about_z = |deg: f64| {
@@ -115,7 +116,7 @@ fn times(a: [Vec3; 3], b: [Vec3; 3]) -> [Vec3; 3] {
     a.map(|row| std::array::from_fn(|k| (0..3).map(|i| row[i] * b[i][k]).sum()))
 }
 
-/// The machine.
+/// Simulated machine.
 pub struct Machine {
     options: Options,
     pub(super) probe: Led,
@@ -131,22 +132,22 @@ pub struct Machine {
     tells_radius: bool,
     pub(super) contacts: u32,
     pub(super) touched_mm: Option<f64>,
-    /// Where the probe's centre is, in the machine's frame, and where it goes.
+    /// Position of the probe's centre in the machine's frame, and the position to which it moves.
     at_mm: Vec3,
     to_mm: Vec3,
     joystick: bool,
-    /// The command that is being carried out, and what it has set going.
+    /// Command that is being carried out, and the events that it has caused.
     at: String,
     pub(super) deeds: Vec<Deed>,
 }
 
-/// Whether a command moves the machine.
+/// Returns true if the command moves the machine.
 pub(super) fn moves(command: &str) -> bool {
     matches!(command, "GoTo" | "PtMeas" | "ScanOnCurve" | "ChangeTool" | "Home")
 }
 
 impl Machine {
-    /// A machine with its probe high over its table.
+    /// Creates a machine with its probe high over its table.
     pub fn new(probe: Led, options: Options) -> Self {
         let [least, most] = probe.volume_mm();
         let at_mm = [0.5 * (least[0] + most[0]), 0.5 * (least[1] + most[1]), most[2]];
@@ -173,27 +174,27 @@ impl Machine {
         }
     }
 
-    /// Where the probe's centre is, in the machine's frame.
+    /// Returns the position of the probe's centre, in the machine's frame.
     pub fn at_mm(&self) -> Vec3 {
         self.at_mm
     }
 
-    /// Its probe can touch, and not scan.
+    /// Makes the probe a touch-trigger probe, which cannot scan.
     pub fn touches_only(&mut self) {
         self.scans = false;
     }
 
-    /// Its server does not tell the radius of its tool.
+    /// Makes the server hide the radius of its tool.
     pub fn tells_no_radius(&mut self) {
         self.tells_radius = false;
     }
 
-    /// How often the probe came to the part: touches and scans.
+    /// Returns how often the probe came to the part: touches and scans.
     pub fn contacts(&self) -> u32 {
         self.contacts
     }
 
-    /// Somebody leads the probe up, as high as it goes.
+    /// Moves the probe up as far as it goes, as a person would.
     pub fn lift(&mut self) {
         self.at_mm[2] = self.probe.volume_mm()[1][2];
         self.to_mm = self.at_mm;
@@ -206,10 +207,10 @@ impl Machine {
         self.at_nominals = false;
     }
 
-    /// Errors are forgotten: the probe may touch again.
+    /// Re-arms the probe after errors are cleared: it can touch again. The simulated probe needs no action.
     pub(super) fn arm(&mut self) {}
 
-    /// It is switched on anew: it has to be homed, and knows neither tool nor parameters nor frame.
+    /// Restarts the machine: it must be homed, and has no tool, no parameters and no frame.
     pub(super) fn restart(&mut self) {
         self.homed = false;
         self.tool = "NoTool".into();
@@ -217,28 +218,28 @@ impl Machine {
         (self.part_frame, self.in_part_frame, self.joystick) = (Frame::MACHINE, false, true);
     }
 
-    /// The motion of the command has come to its end.
+    /// Ends the motion of the command at its target.
     pub(super) fn arrive(&mut self) {
         self.stop_short(1.0);
     }
 
-    /// The probe has come so far in contact.
+    /// Moves the probe to a place while it is in contact.
     pub(super) fn is_at(&mut self, at_mm: Vec3) {
         self.at_mm = at_mm;
     }
 
-    /// The motion ends after this share of its way.
+    /// Ends the motion after this share of its way.
     pub(super) fn stop_short(&mut self, share: f64) {
         self.at_mm = std::array::from_fn(|k| self.at_mm[k] + share * (self.to_mm[k] - self.at_mm[k]));
         self.to_mm = self.at_mm;
-        // Well above what it touched, the probe lets the part go.
+        // High enough above the contact, the probe releases the part.
         if self.touched_mm.is_none_or(|height| self.at_mm[2] > height + 2.0 * self.parameters[2]) {
             self.touched_mm = None;
             self.probe.let_go();
         }
     }
 
-    /// Begins a command and says what it will have brought when its time is over.
+    /// Begins a command, and returns the result that it has when its time is over.
     pub(super) fn carry_out(&mut self, command: &Command) -> Result<Done, Error> {
         let no = |number| Error::new(number, &command.name);
         let arguments = &command.arguments[..];
@@ -346,7 +347,7 @@ impl Machine {
         if self.in_part_frame { self.part_frame } else { Frame::MACHINE }
     }
 
-    /// A place in the machine's frame; axes that are not named stay.
+    /// Returns a place in the machine's frame; axes that are not named keep their value.
     fn place(&self, axes: &[Argument]) -> Option<Vec3> {
         let mut at = self.frame().of_machine(self.at_mm);
         for axis in axes {
@@ -376,7 +377,7 @@ impl Machine {
         Done { seconds: way_mm / speed, ..Done::default() }
     }
 
-    /// Touches the part as it really is.
+    /// Touches the real part.
     fn touch(&mut self, axes: &[Argument]) -> Result<Done, u16> {
         let point_mm = self.place(axes).ok_or(502u16)?;
         let direction = axes.iter().find_map(|axis| match axis {
@@ -456,7 +457,7 @@ impl Machine {
         told.collect::<Result<_, _>>().map(Done::told)
     }
 
-    /// Sets parameters; what is beyond the machine's limits is kept within, and warned of.
+    /// Sets parameters. A value beyond the machine's limits is limited, with a warning.
     fn set(&mut self, properties: &[Argument], cause: &str) -> Result<Done, u16> {
         let mut warnings = Vec::new();
         for property in properties {
@@ -475,7 +476,7 @@ impl Machine {
     }
 }
 
-/// The name of a property that is asked for.
+/// Returns the name of a requested property.
 fn asked(argument: &Argument) -> Option<String> {
     match argument {
         Argument::Name(name, Some(numbers)) if numbers.is_empty() => Some(name.clone()),

@@ -1,15 +1,17 @@
-//! A server of I++ DME before a simulated measuring machine: what it answers to each line, and when. No wire is in here; `wire/dme` has one.
+//! Server of I++ DME for a simulated measuring machine: its answer to each line, and the time of the answer. This
+//! module contains no wire; `wire/dme` has one.
 //!
 //! ```text
-//!  line     commands as they come, by a reader of its own
+//!  line     parser of received commands, implemented independently
 //!  machine  what the machine is and does: tools, frames, motion, touches
-//!  scan     curves that are passed over in contact
-//!  faults   what goes wrong, at which command
-//!  deed     what the machine did
+//!  scan     scans: curves followed in contact
+//!  faults   faults, by command
+//!  deed     events of the machine
 //! ```
 //!
-//! Commands are acknowledged as they come and carried out one after another; those that end in E at once. After an error nothing but
-//! ClearAllErrors is taken. What an abort meets is told so, each with error 0006.
+//! Commands are acknowledged when they arrive and carried out one after another; those whose name ends in E are carried
+//! out at once. After an error, the server accepts only ClearAllErrors. Each command that an abort ends gets error
+//! 0006.
 
 pub mod deed;
 pub mod faults;
@@ -25,32 +27,32 @@ use faults::{Fault, Faults};
 use line::{Command, Error, Tag};
 use machine::{Done, Machine};
 
-/// A line that is to go out, or the end of the connection.
+/// Line to send, or the end of the connection.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Outgoing {
-    /// When, in the time of the caller.
+    /// Time to send it, in the caller's time.
     pub at: Duration,
-    /// The line, its end too.
+    /// Line, with its line end.
     pub text: String,
-    /// It comes byte for byte.
+    /// True if the line is sent byte by byte.
     pub split: bool,
-    /// The connection is closed behind it.
+    /// True if the connection closes after the line.
     pub closes: bool,
 }
 
-/// A command that is being carried out.
+/// Command that is being carried out.
 struct Running {
     tag: Tag,
     command: Command,
     began: Duration,
     ends: Duration,
     done: Result<Done, Error>,
-    /// Its client has gone: nobody is told how it ends.
+    /// True if its client is gone: nobody gets its result.
     unheard: bool,
 }
 
 impl Running {
-    /// When something comes of it next: a line of a scan, or its end.
+    /// Returns the time of its next output: a line of a scan, or its end.
     fn next(&self, speed: f64) -> Duration {
         let line = self.done.as_ref().ok().and_then(|done| done.scanned.front());
         line.map_or(self.ends, |line| {
@@ -59,7 +61,7 @@ impl Running {
     }
 }
 
-/// A server, between its client and its machine.
+/// Server with its client and its machine.
 pub struct Server {
     machine: Machine,
     faults: Faults,
@@ -74,7 +76,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// A server before a machine.
+    /// Creates a server for a machine.
     pub fn new(machine: Machine, speed: f64, faults: Faults) -> Self {
         Self {
             machine,
@@ -89,16 +91,16 @@ impl Server {
         }
     }
 
-    /// Looks at the machine, or changes it.
+    /// Returns the machine, to read or change it.
     pub fn machine(&mut self) -> &mut Machine {
         &mut self.machine
     }
 
-    /// The client is gone: what runs comes to its end, and nothing else is begun.
+    /// Handles the loss of the client: the running command continues to its end, and no other command begins.
     pub fn hung_up(&mut self, now: Duration) {
         self.waiting.clear();
         self.out.clear();
-        // What is acknowledged late is begun late, or not at all.
+        // A command whose acknowledgement was delayed has not begun yet, so it is dropped.
         if self.running.as_ref().is_some_and(|running| running.began > now) {
             self.abandon(now, &Error::new(6, ""));
             self.out.clear();
@@ -107,7 +109,7 @@ impl Server {
         (self.in_session, self.latched) = (false, false);
     }
 
-    /// The server is started anew: what runs is broken off where it is, and the machine has to be homed.
+    /// Restarts the server: the running command is interrupted where it is, and the machine must be homed.
     pub fn restart(&mut self, now: Duration) {
         self.hung_up(now);
         self.abandon(now, &Error::new(500, "restart"));
@@ -117,7 +119,7 @@ impl Server {
         self.tell(&[Deed::Restarted]);
     }
 
-    /// Has somebody told of everything that the machine does from now on, while it happens.
+    /// Sets an observer of all events of the machine from now on.
     pub fn witness(&mut self, witness: Witness) {
         self.witness = Some(witness);
     }
@@ -128,18 +130,18 @@ impl Server {
         }
     }
 
-    /// Whether the machine moves.
+    /// Returns true if the machine moves.
     pub fn moves(&self) -> bool {
         self.running.as_ref().is_some_and(|running| machine::moves(&running.command.name))
     }
 
-    /// When something is to be done next without a line having come.
+    /// Returns the time of the next action that needs no received line.
     pub fn due(&self) -> Option<Duration> {
         let running = self.running.as_ref().map(|running| running.next(self.speed));
         running.into_iter().chain(self.out.front().map(|out| out.at)).min()
     }
 
-    /// The stop circuit opens.
+    /// Opens the stop circuit.
     pub fn emergency_stop(&mut self, now: Duration) {
         self.abandon(now, &Error::new(500, "emergency"));
         self.tell(&[Deed::Stopped]);
@@ -147,7 +149,7 @@ impl Server {
         self.say(now, format!("E0000 ! {}", Error::new(500, "emergency")));
     }
 
-    /// Lets time pass and returns what is to be sent now.
+    /// Lets time pass, and returns the lines to send now.
     pub fn tick(&mut self, now: Duration) -> Vec<Outgoing> {
         self.pass(now);
         let mut due = Vec::new();
@@ -157,7 +159,7 @@ impl Server {
         due
     }
 
-    /// Lets time pass while nobody is there who could be sent anything.
+    /// Lets time pass without sending anything.
     pub fn pass(&mut self, now: Duration) {
         while self.running.as_ref().is_some_and(|running| running.next(self.speed) <= now) {
             if self.say_scanned() {
@@ -168,7 +170,7 @@ impl Server {
         }
     }
 
-    /// Takes a line, without its end.
+    /// Handles a received line, without its line end.
     pub fn receive(&mut self, text: &str, now: Duration) {
         match line::read(text) {
             Err((tag, error)) => {
@@ -211,7 +213,7 @@ impl Server {
         self.say(now, format!("{tag} %"));
     }
 
-    /// Gives up what runs and what waits, and says whether there was anything.
+    /// Aborts the running and the waiting commands; returns true if there were any.
     fn abandon(&mut self, now: Duration, error: &Error) -> bool {
         let running = self.running.take();
         if let Some(running) = running.as_ref().filter(|running| machine::moves(&running.command.name)) {
@@ -241,7 +243,7 @@ impl Server {
         self.running = Some(Running { tag, command, began: now, ends, done, unheard: false });
     }
 
-    /// What a command does; gates come first.
+    /// Carries out a command, after the checks that precede it.
     fn carry_out(&mut self, command: &Command) -> Result<Done, Error> {
         let name = command.name.as_str();
         let no = |number| Err(Error::new(number, name));
@@ -265,7 +267,7 @@ impl Server {
         Ok(Done::default())
     }
 
-    /// Says the next line of a scan; false where there is none.
+    /// Sends the next line of a scan; returns false if there is none.
     fn say_scanned(&mut self) -> bool {
         let Some(running) = &mut self.running else { return false };
         let at = running.next(self.speed);
@@ -329,7 +331,7 @@ impl Server {
         }
     }
 
-    /// Says data of a command, with what goes wrong with it.
+    /// Sends data of a command, with its fault.
     fn say_data(&mut self, tag: Tag, data: &[String], fault: Option<&Fault>, at: Duration) {
         let mut fields = data.to_vec();
         match fault {
@@ -357,7 +359,7 @@ impl Server {
     }
 
     fn say(&mut self, at: Duration, text: String) {
-        // Lines go out in the order in which they were said.
+        // Lines are sent in the order in which they were queued.
         let at = self.out.back().map_or(at, |last| last.at.max(at));
         let text = if text.is_empty() { text } else { text + "\r\n" };
         self.out.push_back(Outgoing { at, text, split: false, closes: false });

@@ -1,4 +1,4 @@
-//! Curves that are passed over in contact: the probe is pressed on the true part, and says where it is at each target while it goes on.
+//! Scans: the probe is pressed on the true part, and reports its position at each target while it moves on.
 
 use super::faults::Fault;
 use super::line::Argument;
@@ -6,22 +6,22 @@ use super::machine::{Done, Machine};
 use crate::Vec3;
 use crate::cmm::Touch;
 
-/// Points in a line.
+/// Number of points in a line.
 const IN_A_LINE: usize = 7;
 
-/// A line of a scan.
+/// Line of a scan.
 #[derive(Clone, Debug)]
 pub(super) struct Scanned {
-    /// When it is said, in the machine's time from the beginning on.
+    /// Time at which it is sent, in the machine's time from the beginning, in s.
     pub(super) seconds: f64,
-    /// Where the probe is then.
+    /// Position of the probe at that time.
     pub(super) at_mm: Vec3,
-    /// Its points, each by its fields.
+    /// Points, each as its fields.
     pub(super) points: Vec<Vec<String>>,
 }
 
 impl Machine {
-    /// Scans a curve as it is written; it ends where the surface is lost.
+    /// Scans a curve as programmed; the scan ends where the probe loses the surface.
     pub(super) fn scan(&mut self, closed: &Argument, format: &Argument, data: &Argument) -> Result<Done, u16> {
         let open = Argument::Name("Closed".into(), Some(vec![0.0]));
         let written =
@@ -31,7 +31,8 @@ impl Machine {
         if !self.scans {
             return Err(2002);
         }
-        // Curves that close, leave the surface, or are written otherwise: no client of this machine asks for them.
+        // Closed curves, curves that leave the surface, and other formats are refused: no client of this machine
+        // requests them.
         if *closed != open || *format != written || !whole || !self.at_nominals {
             return Err(506);
         }
@@ -89,7 +90,7 @@ fn distance(a: Vec3, b: Vec3) -> f64 {
     (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// The numbers of a line, with what goes wrong with them.
+/// Returns the numbers of a line, with its fault.
 pub(super) fn spoilt(mut line: Scanned, fault: Option<&Fault>) -> Vec<String> {
     match fault {
         Some(Fault::UnaskedQuality) => line.points.iter_mut().for_each(|point| point.insert(0, "0".to_owned())),

@@ -1,26 +1,26 @@
-//! What goes wrong with the lines of a machine that prints its hits.
+//! Faults of the lines of a machine that prints its hits.
 
-/// Something that goes wrong with a line.
+/// Fault of a line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Fault {
-    /// A character, by its place, is lost.
+    /// The character at this index is lost.
     Lost(usize),
-    /// A bit of a character is another, by its place: what a line without parity does not notice.
+    /// A bit of the character at this index is flipped; a line without parity does not detect it.
     Garbled(usize),
-    /// The end of the line is lost, so that it runs together with the next one.
+    /// The line end is lost, so that the line runs together with the next one.
     Merged,
-    /// It comes twice.
+    /// The line comes twice.
     Twice,
-    /// Something else comes before it.
+    /// This text comes before the line.
     Stranger(String),
-    /// It never comes.
+    /// The line never comes.
     Dropped,
-    /// The connection ends behind it.
+    /// The connection ends after the line.
     HangUp,
 }
 
 impl Fault {
-    /// Returns what comes of a line.
+    /// Returns the bytes of a line with this fault.
     pub fn spoil(&self, mut line: Vec<u8>) -> Vec<u8> {
         match self {
             Self::Lost(at) => drop(line.remove((*at).min(line.len() - 3))),
@@ -38,5 +38,5 @@ impl Fault {
     }
 }
 
-/// Faults of lines, by their numbers, from 1.
+/// Faults by the number of the line, from 1.
 pub type Faults = crate::faults::Faults<u64, Fault>;

@@ -1,32 +1,32 @@
-//! The list of what is to be touched, as a part program reads it: rows of `index,x,y,z,nx,ny,nz,what` under comments and a header.
+//! List of targets, as a part program reads it: rows of `index,x,y,z,nx,ny,nz,what` after comments and a header.
 
 use crate::Vec3;
 use crate::payload::Feature;
 
-/// Something to be touched.
+/// Target of a touch.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Target {
-    /// Its number.
+    /// Number of the target.
     pub index: u32,
-    /// Where.
+    /// Nominal point, in mm.
     pub point_mm: Vec3,
-    /// The outward unit normal there.
+    /// Outward unit normal at the point.
     pub normal: Vec3,
-    /// What it belongs to.
+    /// Feature that the target is on.
     pub feature: Feature,
 }
 
-/// A list.
+/// List of targets.
 #[derive(Clone, Debug, PartialEq)]
 pub struct List {
-    /// The comments above it, which tell one list from another.
+    /// Comments above the rows; they distinguish one list from another.
     pub about: Vec<String>,
-    /// The targets in their order.
+    /// Targets in their order.
     pub targets: Vec<Target>,
 }
 
 impl List {
-    /// Reads a list; none where a row is no target, or there is no row.
+    /// Reads a list; `None` if a row is not a target, or if there are no rows.
     pub fn read(text: &str) -> Option<Self> {
         let (about, rows): (Vec<&str>, Vec<&str>) = text.lines().partition(|line| line.starts_with('#'));
         let rows = rows.into_iter().filter(|row| !row.starts_with("index"));

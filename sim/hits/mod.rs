@@ -1,12 +1,13 @@
-//! A measuring machine that prints its hits: it leads its probe over a list of targets, and says each touch in a line. It hears nothing.
+//! Measuring machine that prints its hits: it moves its probe along a list of targets, and prints a line for each
+//! touch. It receives nothing.
 //!
 //! ```text
-//!  list     what is to be touched, by a reader of its own
-//!  print    how a touch is written, in eight formats
-//!  faults   what goes wrong with which line
+//!  list     list of targets, implemented independently
+//!  print    format of a touch, eight of them
+//!  faults   faults, by line
 //! ```
 //!
-//! No wire is in here; `wire/hits` has one.
+//! This module contains no wire; `wire/hits` has one.
 
 pub mod faults;
 pub mod list;
@@ -20,29 +21,29 @@ use faults::{Fault, Faults};
 use list::List;
 use print::Style;
 
-/// How this machine measures and writes.
+/// Options of measuring and printing.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// How a touch is written.
+    /// Format of the line of a touch.
     pub style: Style,
-    /// The probe's radius.
+    /// Radius of the probe, in mm.
     pub radius_mm: f64,
-    /// Contacts are written, and not centres.
+    /// True if contact points are printed instead of centres.
     pub contacts: bool,
-    /// How far before the point it begins to search, and how far beyond it ends.
+    /// Distances before and beyond the target at which the search begins and ends, in mm.
     pub search_mm: [f64; 2],
 }
 
-/// What goes out for a touch.
+/// Output of one touch.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Outgoing {
-    /// The bytes; nothing where the probe missed.
+    /// Bytes to send; empty if the probe missed.
     pub bytes: Vec<u8>,
-    /// The connection ends behind them.
+    /// True if the connection ends after the bytes.
     pub hangs_up: bool,
 }
 
-/// A part program, between its list and its printer.
+/// Part program with its probe, list and printer.
 pub struct Program {
     probe: Led,
     options: Options,
@@ -53,12 +54,12 @@ pub struct Program {
 }
 
 impl Program {
-    /// A program before a machine; it has no list yet.
+    /// Creates a program for a machine; it has no list yet.
     pub fn new(probe: Led, options: Options, faults: Faults) -> Self {
         Self { probe, options, faults, list: None, next: 0, printed: 0 }
     }
 
-    /// Begins anew with a list, unless it is the one that it has.
+    /// Restarts with a list, unless the program has this list already.
     pub fn begin(&mut self, text: &str) {
         let list = List::read(text);
         if list.is_some() && list != self.list {
@@ -66,12 +67,12 @@ impl Program {
         }
     }
 
-    /// How long a touch takes.
+    /// Returns the duration of a touch.
     pub fn per_touch(&self) -> Duration {
         Duration::from_secs_f64(self.probe.seconds_per_point())
     }
 
-    /// Touches the next target; nothing where none is left. Behind the last one the probe goes clear of the part.
+    /// Touches the next target; `None` if there is none left. After the last one, the probe moves clear of the part.
     pub fn touch_next(&mut self) -> Option<Outgoing> {
         let target = *self.list.as_ref()?.targets.get(self.next)?;
         self.next += 1;

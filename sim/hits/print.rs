@@ -1,25 +1,25 @@
-//! How a machine writes a touch.
+//! Formats in which a machine prints a touch.
 
 use crate::Vec3;
 
-/// The shape of a line.
+/// Format of a line.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Style {
-    /// The letters of the axes stand before the numbers.
+    /// True if the letter of the axis is in front of each number.
     pub letters: bool,
-    /// Whole micrometres, and tenths of a degree.
+    /// True if coordinates are whole micrometres, and angles whole tenths of a degree.
     pub whole: bool,
-    /// The angle of the rotary table, where it is written.
+    /// Angle of the rotary table, if it is printed.
     pub rotary_deg: Option<f64>,
-    /// Digits behind the mark.
+    /// Number of decimals.
     pub decimals: usize,
-    /// The decimal mark.
+    /// Decimal mark.
     pub mark: char,
-    /// What stands between two values.
+    /// Separator of two values.
     pub separator: char,
-    /// Millimetres of the unit.
+    /// Length of the unit, in mm.
     pub unit_mm: f64,
-    /// Which axis each value is.
+    /// Axis of each value.
     pub axes: [usize; 3],
 }
 
@@ -31,7 +31,7 @@ impl Default for Style {
 }
 
 impl Style {
-    /// Returns the line of a touch, its end too.
+    /// Returns the line of a touch, with its line end.
     pub fn line(&self, at_mm: Vec3) -> Vec<u8> {
         let value = |k: usize| match self.whole {
             true => format!("{}", (at_mm[self.axes[k]] * 1e3).round() as i64),

@@ -1,36 +1,36 @@
-//! What a controller did, in order, for a test to hold against what its client has on record.
+//! Events of a controller, in order. A test compares them with the record of the client.
 
-/// One thing that a controller did.
+/// Event of a controller.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Deed {
-    /// It has opened a program.
+    /// The controller has opened a program.
     Opened {
-        /// Its path.
+        /// Path of the program.
         path: String,
     },
-    /// It has begun to run a program.
+    /// The controller has begun to run a program.
     Began {
-        /// Its path.
+        /// Path of the program.
         path: String,
-        /// What it runs.
+        /// Text of the program.
         text: String,
     },
-    /// It moves.
+    /// The machine moves.
     Moves,
-    /// It stands.
+    /// The machine is at rest.
     Stands,
-    /// The program has come to its end.
+    /// The program has ended.
     Ended {
-        /// Its path.
+        /// Path of the program.
         path: String,
     },
-    /// A client has aborted it.
+    /// A client has aborted the program.
     Aborted,
-    /// Its stop circuit opened, or its drives went off.
+    /// The stop circuit opened, or the drives went off.
     Stopped,
-    /// It ended, and began anew with nothing.
+    /// The controller ended, and restarted without any state.
     Killed,
 }
 
-/// Who is told of everything as it happens.
+/// Observer that receives each event when it happens.
 pub type Witness = Box<dyn FnMut(&Deed) + Send>;

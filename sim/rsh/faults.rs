@@ -1,33 +1,33 @@
-//! What goes wrong at linuxcncrsh.
+//! Faults of linuxcncrsh.
 
 use std::time::Duration;
 
-/// Something that goes wrong with a line.
+/// Fault of a line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Fault {
-    /// Nothing is done, and nothing answered.
+    /// The line is not carried out and not answered.
     Lost,
-    /// It is done, and not answered.
+    /// The line is carried out, and not answered.
     Unanswered,
-    /// It is done, and answered late.
+    /// The line is carried out, and answered late.
     Late(Duration),
-    /// Nothing is done, and it is refused.
+    /// The line is not carried out, and is refused.
     Refused,
-    /// It is done, and refused.
+    /// The line is carried out, and is refused.
     DoneAndRefused,
-    /// Nothing is done, and it is acknowledged.
+    /// The line is not carried out, and is acknowledged.
     Ignored,
-    /// It is acknowledged, an error is reported, and what was there before stays.
+    /// The line is acknowledged, an error is reported, and the state before stays.
     Fails,
-    /// The connection ends, and nothing is done.
+    /// The connection ends, and the line is not carried out.
     CutBefore,
-    /// It is done, and the connection ends.
+    /// The line is carried out, and the connection ends.
     CutBehind,
-    /// Lines come before the answer that answer nothing.
+    /// Lines that answer nothing come before the answer.
     Aside,
-    /// What a program runs into a travel limit at that many thousandths of its lines.
+    /// The program reaches a travel limit at this share of its lines, in thousandths.
     Limit(u32),
 }
 
-/// Faults at lines, by how they begin.
+/// Faults by the beginning of the line.
 pub type Faults = crate::faults::Faults<String, Fault>;

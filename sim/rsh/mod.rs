@@ -1,14 +1,15 @@
-//! A controller by LinuxCNC behind linuxcncrsh: what it answers to each line, and what it runs. No wire is in here; `wire/rsh` has one.
+//! LinuxCNC controller with linuxcncrsh: its answer to each line, and the program that it runs. This module contains no
+//! wire; `wire/rsh` has one.
 //!
 //! ```text
 //!  program  a program as the interpreter reads it: ahead of the motion
-//!  faults   what goes wrong, at which line
-//!  deed     what the controller did
+//!  faults   faults, by line
+//!  deed     events of the controller
 //! ```
 //!
-//! A `set` that is acknowledged was heard, and nothing more: whether it succeeded is told by the errors that are read once, and by what is
-//! asked afterwards. One client has control, whoever took it last; a set takes a tenth of a second. A program that cannot be opened
-//! leaves the one before.
+//! The acknowledgement of a `set` means only that the line was received. Whether it succeeded follows from the errors,
+//! which can be read once, and from later queries. One client has control: the one that took it last. A set takes a
+//! tenth of a second. If a program cannot be opened, the one before stays open.
 
 pub mod deed;
 pub mod faults;
@@ -25,21 +26,21 @@ use deed::{Deed, Witness};
 use faults::{Fault, Faults};
 use program::{Program, Said, Step, says};
 
-/// A set takes so long, whatever it does.
+/// Duration of a set, whatever it does.
 const SET_TAKES: Duration = Duration::from_millis(100);
-/// The wheel is looked at at least this often along its way.
+/// Maximum distance between two samples of the wheel along its way, in mm.
 const STEP_MM: f64 = 0.5;
-/// Where the wheel's centre is when it is away from everything.
+/// Position of the wheel's centre when it is away from everything.
 const AWAY_MM: Vec3 = [0.0, 0.0, 100.0];
 
-/// A line that is to go out to a client.
+/// Line to send to a client.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Outgoing {
-    /// When, in the time of the caller.
+    /// Time to send it, in the caller's time.
     pub at: Duration,
-    /// The line, its end too.
+    /// Line, with its line end.
     pub text: String,
-    /// The connection is closed behind it.
+    /// True if the connection closes after the line.
     pub closes: bool,
 }
 
@@ -49,7 +50,7 @@ struct Client {
     verbose: bool,
     quiet: bool,
     lines: VecDeque<String>,
-    /// Its next line is looked at then.
+    /// Time at which its next line is handled.
     free_at: Duration,
     out: VecDeque<Outgoing>,
 }
@@ -61,7 +62,7 @@ enum Interpreter {
     Paused,
 }
 
-/// The controller, and the machine that it moves.
+/// Controller, and the machine that it moves.
 pub struct Controller {
     wheel: PlainWheel,
     faults: Faults,
@@ -76,9 +77,9 @@ pub struct Controller {
     interpreter: Interpreter,
     program: Option<Program>,
     steps: VecDeque<Step>,
-    /// The line that is carried out.
+    /// Line that is carried out.
     line: u32,
-    /// The line at which a limit is met.
+    /// Line at which a travel limit is reached.
     limit_at: Option<u32>,
     at_mm: Vec3,
     errors: VecDeque<String>,
@@ -89,7 +90,7 @@ pub struct Controller {
 }
 
 impl Controller {
-    /// A controller that is switched on and homed, with no program.
+    /// Creates a controller that is switched on and homed, with no program.
     pub fn new(wheel: PlainWheel, speed: f64, faults: Faults) -> Self {
         Self {
             wheel,
@@ -115,7 +116,7 @@ impl Controller {
         }
     }
 
-    /// Has somebody told of everything that it does from now on, while it happens.
+    /// Sets an observer of all events from now on.
     pub fn witness(&mut self, witness: Witness) {
         self.witness = Some(witness);
     }
@@ -126,52 +127,52 @@ impl Controller {
         }
     }
 
-    /// Whether the machine moves.
+    /// Returns true if the machine moves.
     pub fn moves(&self) -> bool {
         self.moving
     }
 
-    /// Whether a program is under way, paused or not.
+    /// Returns true if a program is active, paused or not.
     pub fn is_busy(&self) -> bool {
         self.interpreter != Interpreter::Idle
     }
 
     // ---- people at the machine ----------------------------------------------------------------------------------------------------
 
-    /// The stop circuit opens.
+    /// Opens the stop circuit.
     pub fn emergency_stop(&mut self) {
         (self.stopped, self.on) = (true, false);
         self.break_off();
         self.tell(Deed::Stopped);
     }
 
-    /// The drives go off.
+    /// Switches the drives off.
     pub fn switch_off(&mut self) {
         self.on = false;
         self.break_off();
         self.tell(Deed::Stopped);
     }
 
-    /// Somebody makes it ready again.
+    /// Makes the machine ready again, as a person would.
     pub fn make_ready(&mut self) {
         (self.stopped, self.on, self.homed) = (false, true, true);
     }
 
-    /// Somebody turns it to another mode, or back; what runs goes on.
+    /// Switches to another mode or back, as a person would; a running program continues.
     pub fn turn_to(&mut self, mode: &'static str) {
         if !self.is_busy() {
             self.mode = mode;
         }
     }
 
-    /// Somebody presses the button that has a paused program go on.
+    /// Presses the button that resumes a paused program.
     pub fn press_resume(&mut self) {
         if self.interpreter == Interpreter::Paused && self.program.is_some() {
             self.interpreter = Interpreter::Running;
         }
     }
 
-    /// Somebody has led it away from the part.
+    /// Moves the wheel away from the part, as a person would.
     pub fn lead_away(&mut self) {
         if !self.is_busy() {
             self.at_mm = AWAY_MM;
@@ -179,7 +180,7 @@ impl Controller {
         }
     }
 
-    /// Another client takes control, opens a program of its own where nothing runs, or ends what runs.
+    /// Lets another client take control; it opens a program of its own if nothing runs, or aborts what runs.
     pub fn steal(&mut self, program: Option<&str>, aborts: bool) {
         self.owner = Some(u64::MAX);
         if aborts {
@@ -190,7 +191,7 @@ impl Controller {
         }
     }
 
-    /// It ends, with all that it has, and begins anew.
+    /// Ends the controller with all its state, and starts it again.
     pub fn kill(&mut self) {
         self.break_off();
         (self.clients, self.owner, self.program, self.log) = (BTreeMap::new(), None, None, None);
@@ -202,29 +203,29 @@ impl Controller {
 
     // ---- lines --------------------------------------------------------------------------------------------------------------------
 
-    /// A client has connected.
+    /// Handles a new client.
     pub fn connected(&mut self, client: u64) {
         self.clients.insert(client, Client::default());
     }
 
-    /// A client is gone. What runs goes on.
+    /// Handles the loss of a client. A running program continues.
     pub fn hung_up(&mut self, client: u64) {
         self.clients.remove(&client);
     }
 
-    /// Whether a client is still served.
+    /// Returns true if a client is still served.
     pub fn serves(&self, client: u64) -> bool {
         self.clients.contains_key(&client)
     }
 
-    /// When something is to be done for a client next without a line having come.
+    /// Returns the time of the next action for a client that needs no received line.
     pub fn due(&self, client: u64) -> Option<Duration> {
         let client = self.clients.get(&client)?;
         let next = client.lines.front().map(|_| client.free_at);
         next.into_iter().chain(client.out.front().map(|out| out.at)).min()
     }
 
-    /// Takes a line of a client, without its end.
+    /// Handles a line of a client, without its line end.
     pub fn receive(&mut self, client: u64, line: &str, now: Duration) {
         if let Some(client) = self.clients.get_mut(&client) {
             client.lines.push_back(line.trim().to_owned());
@@ -232,7 +233,7 @@ impl Controller {
         self.attend(client, now);
     }
 
-    /// Lets time pass and returns what is to be sent to a client now.
+    /// Lets time pass, and returns the lines to send to a client now.
     pub fn tick(&mut self, client: u64, now: Duration) -> Vec<Outgoing> {
         self.attend(client, now);
         let Some(client) = self.clients.get_mut(&client) else { return Vec::new() };
@@ -243,7 +244,7 @@ impl Controller {
         due
     }
 
-    /// Looks at the lines of a client whose time has come.
+    /// Handles the lines of a client whose time has come.
     fn attend(&mut self, number: u64, now: Duration) {
         self.pass(now);
         loop {
@@ -294,7 +295,7 @@ impl Controller {
         }
     }
 
-    /// Does what a line says, and returns the answer; none where there is none.
+    /// Carries out a line, and returns the answer; `None` if there is none.
     fn obey(&mut self, number: u64, line: &str) -> Option<String> {
         let mut words = line.split_whitespace();
         let first = words.next().unwrap_or_default().to_ascii_lowercase();
@@ -353,7 +354,7 @@ impl Controller {
         })
     }
 
-    /// Whether a set is acknowledged; none where its client has no control.
+    /// Carries out a set, and returns whether it is acknowledged; `None` if its client has no control.
     fn set(&mut self, number: u64, what: &str, rest: &str) -> Option<bool> {
         let client = self.clients.get_mut(&number)?;
         match (what, rest.to_ascii_lowercase().as_str()) {
@@ -453,7 +454,7 @@ impl Controller {
         self.tell(Deed::Aborted);
     }
 
-    /// What runs is over where it is.
+    /// Ends the running program at its present position.
     fn break_off(&mut self) {
         self.interpreter = Interpreter::Idle;
         self.steps.clear();
@@ -468,7 +469,7 @@ impl Controller {
         }
     }
 
-    /// Lets time pass: the machine goes along its program.
+    /// Lets time pass: the machine moves along its program.
     pub fn pass(&mut self, now: Duration) {
         let mut left_s = now.saturating_sub(self.passed).as_secs_f64() * self.speed;
         self.passed = now;

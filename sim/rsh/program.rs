@@ -1,61 +1,61 @@
-//! A program as an interpreter reads it: ahead of the motion, which follows line by line.
+//! Program as the interpreter reads it: ahead of the motion, which follows line by line.
 
 use std::collections::VecDeque;
 
 use crate::Vec3;
 use crate::program::{Stop, Turn};
 
-/// So many motions are read ahead at most.
+/// Maximum number of motions that are read ahead.
 const AHEAD: usize = 200;
-/// Rapid travel.
+/// Speed of rapid travel, in mm/s.
 const RAPID_MM_S: f64 = 100.0;
-/// Chords that stand for an arc are no farther from it than this, in millimetres.
+/// Maximum distance of the chords of an arc from the arc, in mm.
 const CHORDS_MM: f64 = 1e-5;
-/// How far the radii at both ends of an arc may differ, in millimetres.
+/// Maximum difference of the radii at both ends of an arc, in mm.
 const RADII_MM: f64 = 0.005;
 
-/// What is carried out in its turn.
+/// Queued step, carried out in its turn.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Step {
-    /// Straight to a place.
+    /// Straight move to a place.
     Move { to_mm: Vec3, mm_s: f64, line: u32 },
-    /// An arc that cannot be gone along.
+    /// Arc that cannot be executed.
     Refused { why: String, line: u32 },
-    /// What is behind it is not read before the motion has come here.
+    /// Barrier: the lines after it are not read before the motion has come here.
     Wait { line: u32 },
-    /// The end.
+    /// End of the program.
     End { line: u32 },
 }
 
-/// What an interpreter does at once, as it reads it.
+/// Action that the interpreter carries out at once, when it reads it.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Said {
-    /// A log file is opened, anew or at its end.
+    /// Opens a log file, empty or at its end.
     Open { path: String, anew: bool },
-    /// A line goes into it.
+    /// Writes a line to the log file.
     Log(String),
-    /// It is closed.
+    /// Closes the log file.
     Close,
 }
 
-/// A program that is open.
+/// Open program.
 #[derive(Clone, Debug)]
 pub(super) struct Program {
     pub(super) path: String,
     pub(super) text: String,
     lines: Vec<String>,
-    /// The line that is read next.
+    /// Line that is read next.
     next: usize,
-    /// Where a loop began, and how often it is still to be gone through.
+    /// Line where a loop began, and the number of repetitions left.
     repeats: Option<(usize, u32)>,
     at_mm: Vec3,
-    /// 0 rapid, 1 at feed, 2 and 3 along an arc: clockwise and counter-clockwise.
+    /// Motion mode: 0 rapid, 1 at feed, 2 and 3 along an arc, clockwise and counter-clockwise.
     motion: u8,
     plane: [usize; 3],
-    /// Whether centres are places (G90.1) and not from the beginning of an arc (G91.1).
+    /// True if centres are absolute (G90.1), false if they are relative to the beginning of an arc (G91.1).
     centres_are_places: bool,
     mm_s: f64,
-    /// Nothing is read until this has been carried out.
+    /// True if nothing is read until the queued steps have been carried out.
     waits: bool,
 }
 
@@ -80,24 +80,24 @@ impl Program {
         }
     }
 
-    /// How many lines it has.
+    /// Returns the number of lines.
     pub(super) fn len(&self) -> usize {
         self.lines.len()
     }
 
-    /// Goes back to the beginning, from a place.
+    /// Goes back to the beginning of the program, from a place.
     pub(super) fn rewind(&mut self, at_mm: Vec3) {
         (self.next, self.repeats, self.waits) = (0, None, false);
         (self.at_mm, self.motion, self.mm_s) = (at_mm, 0, 0.0);
         (self.plane, self.centres_are_places) = ([0, 1, 2], false);
     }
 
-    /// What was waited for has been carried out.
+    /// Continues reading: the queued steps have been carried out.
     pub(super) fn go_on(&mut self) {
         self.waits = false;
     }
 
-    /// Reads ahead; says what is done at once.
+    /// Reads ahead; returns the actions that are carried out at once.
     pub(super) fn read_on(&mut self, steps: &mut VecDeque<Step>) -> Vec<Said> {
         let mut said = Vec::new();
         while !self.waits && steps.len() < AHEAD && self.next < self.lines.len() {
@@ -168,7 +168,7 @@ impl Program {
         }
     }
 
-    /// The way to a place: straight, or about a centre of which what is not told is 0.
+    /// Returns the way to a place: straight, or about a centre whose missing coordinates are 0.
     fn way(&self, to_mm: Vec3, centre: [Option<f64>; 3]) -> Result<Stop, String> {
         let turn = match self.motion {
             motion @ (2 | 3) => {
@@ -183,7 +183,7 @@ impl Program {
     }
 }
 
-/// What a comment has the interpreter do.
+/// Returns the action that a comment requests.
 pub(super) fn says(text: &str) -> Option<Said> {
     let comment = text.trim().strip_prefix('(')?.strip_suffix(')')?;
     let (word, rest) = comment.split_once(',').unwrap_or((comment, ""));
@@ -196,7 +196,7 @@ pub(super) fn says(text: &str) -> Option<Said> {
     })
 }
 
-/// Letters and the numbers behind them, without comments.
+/// Returns the letters with their numbers, without comments.
 fn words(text: &str) -> Vec<(char, f64)> {
     let code = text.split([';', '(']).next().unwrap_or_default();
     let starts: Vec<usize> = code.char_indices().filter(|(_, c)| c.is_ascii_alphabetic()).map(|(at, _)| at).collect();
@@ -235,7 +235,7 @@ mod tests {
         let text = "G91.1\nG0 X3Y1Z9\nG18 G3 X3Z5I0K-2F600\nG90.1 G2 X3Z9I3K7\nG91.1 X4Z5K-2\nM2\n";
         let (mut program, mut steps) = (Program::new("p", text.to_owned()), VecDeque::new());
         let mut ahead = VecDeque::new();
-        // It reads on when what it has read is gone along.
+        // It continues to read when the steps it has read are carried out.
         while steps.back() != Some(&Step::End { line: 6 }) {
             program.read_on(&mut ahead);
             steps.append(&mut ahead);
@@ -250,7 +250,7 @@ mod tests {
         for (line, ends) in [(3, [3.0, 1.0, 5.0]), (4, [3.0, 1.0, 9.0])] {
             let arc = along(line);
             assert_eq!(arc.last(), Some(&ends));
-            // There by the larger x, and the other way round back again.
+            // One way by the larger x, and the other way round back.
             assert!(
                 arc.iter().all(|[x, y, z]| *x >= 3.0 && *y == 1.0 && ((x - 3.0).hypot(z - 7.0) - 2.0).abs() < 1e-12)
             );

@@ -14,16 +14,16 @@ use tokio::time::{Instant, sleep_until};
 use super::executed::ExecutedPath;
 use crate::dme::{Outgoing, Server};
 
-/// The longest line, its end left out.
+/// Maximum length of a line, without its line end.
 const LONGEST_LINE: usize = 65_536;
 
-/// A server that its wire, its client and a test share.
+/// Server shared by its wire, its client and a test.
 #[derive(Clone)]
 pub struct SharedServer(Arc<Inner>);
 
 struct Inner {
     server: Mutex<Server>,
-    /// The server was changed from outside: it may have something to say.
+    /// Signal that the server was changed from outside and can have output.
     changed: Notify,
     began: Instant,
 }
@@ -35,14 +35,14 @@ impl From<Server> for SharedServer {
 }
 
 impl SharedServer {
-    /// Looks at the server, or changes it, while nobody else does.
+    /// Calls a function with exclusive access to the server.
     pub fn with<T>(&self, look: impl FnOnce(&mut Server) -> T) -> T {
         let looked = look(&mut self.locked());
         self.0.changed.notify_one();
         looked
     }
 
-    /// The time of the server.
+    /// Returns the time of the server.
     pub fn now(&self) -> Duration {
         self.0.began.elapsed()
     }
@@ -51,13 +51,13 @@ impl SharedServer {
         self.0.server.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Serves a client until it goes away or is sent away, which is the end of its session.
+    /// Serves a client until either side closes the connection, which ends its session.
     pub async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin) {
         self.serve_after(stream, None).await;
     }
 
     async fn serve_after(&self, stream: impl AsyncRead + AsyncWrite + Unpin, grinder: Option<&ExecutedPath>) {
-        // What goes wrong with a client is no other's concern.
+        // A failure of one client does not concern the others.
         let _ = self.converse(stream, grinder).await;
         let now = self.now();
         self.locked().hung_up(now);
@@ -79,7 +79,7 @@ impl SharedServer {
             while let Some(end) = unread.iter().position(|b| *b == b'\n') {
                 let line: Vec<u8> = unread.drain(..=end).collect();
                 let line = String::from_utf8_lossy(&line);
-                // Nothing delays an abort.
+                // An abort is never delayed.
                 if let Some(grinder) = grinder.filter(|_| !line.starts_with('E')) {
                     grinder.caught_up().await;
                 }
@@ -96,7 +96,7 @@ impl SharedServer {
     }
 }
 
-/// A server that is being served, until this is dropped.
+/// Running server; it stops when this is dropped.
 pub struct ServingDme {
     local_addr: SocketAddr,
     server: SharedServer,
@@ -104,7 +104,7 @@ pub struct ServingDme {
 }
 
 impl ServingDme {
-    /// Serves over TCP; port 0 takes any that is free.
+    /// Serves over TCP; port 0 takes any free port.
     ///
     /// # Errors
     /// The address cannot be bound.
@@ -112,7 +112,8 @@ impl ServingDme {
         Self::tcp_after(addr, server, None).await
     }
 
-    /// Serves over TCP a machine that gets its parts from a grinder outside: whatever it is told to do, it does after what that has done.
+    /// Serves over TCP a machine that gets its parts from an external grinder: it carries out each command after
+    /// everything that the grinder has done.
     ///
     /// # Errors
     /// The address cannot be bound.
@@ -129,12 +130,12 @@ impl ServingDme {
         Ok(Self { local_addr, server, _tasks: tasks })
     }
 
-    /// Where it is served.
+    /// Returns the address of the server.
     pub fn local_addr(&self) -> SocketAddr {
         self.local_addr
     }
 
-    /// Looks at the server, or changes it, while nobody else does.
+    /// Calls a function with exclusive access to the server.
     pub fn with<T>(&self, look: impl FnOnce(&mut Server) -> T) -> T {
         self.server.with(look)
     }
@@ -154,7 +155,7 @@ async fn serve(listener: TcpListener, server: SharedServer, grinder: Option<Exec
     }
 }
 
-/// Sends lines, several of them in one segment where nothing splits them, and says whether the connection is to be closed.
+/// Sends lines, several in one segment unless a line is to be split; returns true if the connection is to be closed.
 async fn send(stream: &mut (impl AsyncWrite + Unpin), outgoing: &[Outgoing]) -> io::Result<bool> {
     let mut together = Vec::new();
     for line in outgoing {

@@ -1,14 +1,15 @@
-//! The path that a controller outside executes, as a program beside it tells it.
+//! Path that an external controller executes, as a helper program reports it.
 //!
 //! The program prints a line for every servo cycle, oldest first, and none is left out:
 //!
 //! ```text
-//!  number  x  y  z  homed  mark        number of the cycle, place in millimetres in the frame of the part, 1 or 0, a whole number
+//!  number  x  y  z  homed  mark        number of the cycle, place in mm in the frame of the part, 1 or 0, an integer
 //! ```
 //!
-//! and takes lines with a number each, which it sees to come back as the mark of a cycle to come. Who has seen the mark of his question has
-//! seen everything that the controller had executed before. That is how a measuring machine knows that the part has come out of the grinder,
-//! however long lines lie in a pipe: [`ExecutedPath::caught_up`].
+//! The program also reads lines with a number each, and returns each number as the mark of a later cycle. A reader that
+//! has seen its mark has seen everything that the controller executed before it sent the number. In this way a
+//! measuring machine knows that the part has come out of the grinder, however long lines wait in a pipe:
+//! [`ExecutedPath::caught_up`].
 
 use std::io::{self, BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, Command, Stdio};
@@ -22,18 +23,18 @@ use tokio::time::timeout;
 
 use crate::executed::Wheel;
 
-/// A servo cycle.
+/// Duration of a servo cycle, in s.
 const CYCLE_S: f64 = 1e-3;
-/// What was asked so lately is not asked again: no pass is loaded, begun and ended within it.
+/// Time within which a question is not repeated: no pass can be loaded, begun and ended within it.
 const FRESH: Duration = Duration::from_millis(500);
-/// A program that does not bring a mark back within this is taken for gone.
+/// Time without a mark after which a program counts as gone.
 const LOST_AFTER: Duration = Duration::from_secs(30);
-/// Between two attempts to begin the program: at first, and at most where one after the other told nothing. A controller that is started again
-/// is followed before anybody has brought it to grind.
+/// Time between two attempts to start the program: at first, and at most, after several programs in a row that reported
+/// nothing. A restarted controller is followed before anybody can make it grind.
 const AGAIN_AFTER: Duration = Duration::from_millis(200);
 const AGAIN_AFTER_MOST: Duration = Duration::from_secs(2);
 
-/// A wheel that follows what a controller executes, until this is dropped.
+/// Wheel that follows the executed path of a controller, until this is dropped.
 pub struct ExecutedPath {
     shared: Arc<Shared>,
     asked: Mutex<(u32, Option<Instant>)>,
@@ -41,20 +42,20 @@ pub struct ExecutedPath {
 
 struct Shared {
     ended: AtomicBool,
-    /// The program, while it runs.
+    /// Program, while it runs.
     child: Mutex<Option<Child>>,
     input: Mutex<Option<ChildStdin>>,
     told: watch::Sender<Told>,
 }
 
-/// What the program has told last.
+/// Last report of the program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Told {
     /// There is no program.
     Gone,
-    /// It has begun, and nothing has come.
+    /// The program has started, and has reported nothing.
     Nothing,
-    /// A mark.
+    /// The program has returned this mark.
     Mark(u32),
 }
 
@@ -63,16 +64,16 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl ExecutedPath {
-    /// Begins the program, again whenever it ends, and moves the wheel as it tells.
+    /// Starts the program, restarts it whenever it ends, and moves the wheel along the reported path.
     ///
     /// # Errors
-    /// A program that cannot be begun at all.
+    /// The program cannot be started at all.
     pub fn follow(command: Command, wheel: Wheel) -> io::Result<Self> {
         let mut command = command;
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
         let mut first = command.spawn()?;
         let (ended, input) = (AtomicBool::new(false), Mutex::new(first.stdin.take()));
-        // Whoever asks from here on waits for an answer.
+        // From here on, a caller waits for an answer.
         let told = watch::Sender::new(Told::Nothing);
         let shared = Arc::new(Shared { ended, child: Mutex::default(), input, told });
         let following = Arc::clone(&shared);
@@ -80,8 +81,8 @@ impl ExecutedPath {
         Ok(Self { shared, asked: Mutex::new((rand::random(), None)) })
     }
 
-    /// Waits until the wheel has been moved along everything that the controller has executed before now. Where no program tells of it any
-    /// more, what it told is all there is.
+    /// Waits until the wheel has been moved along everything that the controller has executed before now. If no program
+    /// reports any more, the path reported so far is complete.
     pub async fn caught_up(&self) {
         let question = {
             let (question, when) = &mut *locked(&self.asked);
@@ -96,7 +97,7 @@ impl ExecutedPath {
         let asked = locked(&self.shared.input).as_mut().is_some_and(|input| writeln!(input, "{question}").is_ok());
         if asked {
             let seen = told.wait_for(|told| matches!(*told, Told::Gone) || *told == Told::Mark(question));
-            // Who has no answer by then has none.
+            // Without an answer by then, the wait ends.
             let _ = timeout(LOST_AFTER, seen).await;
         }
     }
@@ -105,7 +106,7 @@ impl ExecutedPath {
 impl Drop for ExecutedPath {
     fn drop(&mut self) {
         self.shared.ended.store(true, Ordering::SeqCst);
-        // The program ends when nobody can ask it any more, and is ended if it does not.
+        // The program ends when its input closes; otherwise it is killed.
         *locked(&self.shared.input) = None;
         if let Some(child) = &mut *locked(&self.shared.child) {
             let _ = child.kill();
@@ -116,7 +117,7 @@ impl Drop for ExecutedPath {
 /// Follows one program after another.
 fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel) {
     let mut next = Ok(first);
-    // Programs in a row that told nothing.
+    // Number of consecutive programs that reported nothing.
     let mut silent = 0;
     while !shared.ended.load(Ordering::SeqCst) {
         let mut has_told = false;
@@ -139,7 +140,7 @@ fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel
             }
         }
         silent = if has_told { 0 } else { silent + 1 };
-        // Why there is nothing to tell the first of them has said already.
+        // The first of these programs has already printed why it reports nothing.
         command.stderr(if silent > 0 { Stdio::null() } else { Stdio::inherit() });
         thread::sleep(pause_after(silent));
         next = command.spawn();
@@ -150,12 +151,12 @@ fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel
     }
 }
 
-/// How long to wait after so many programs in a row that told nothing.
+/// Returns the pause after a number of consecutive programs that reported nothing.
 fn pause_after(silent: u32) -> Duration {
     (AGAIN_AFTER * 2u32.pow(silent.min(8))).min(AGAIN_AFTER_MOST)
 }
 
-/// Moves the wheel line by line, until no more come. Returns whether any came.
+/// Moves the wheel line by line until the lines end. Returns true if any came.
 fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) -> bool {
     let mut expected = None;
     for line in lines.lines().map_while(Result::ok) {
@@ -179,7 +180,7 @@ fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) -> bool {
     expected.is_some()
 }
 
-/// What a line tells.
+/// Content of a line.
 #[derive(Debug, PartialEq)]
 struct Cycle {
     number: u64,
@@ -234,7 +235,7 @@ mod tests {
         command.stderr(std::fs::File::create(&said).unwrap());
         let world = World::new(WorldSpec::default()).unwrap();
         let _path = ExecutedPath::follow(command, world.wheel(12.5).unwrap()).unwrap();
-        // Each that begins writes a line here, and waits until it is read.
+        // Each started program writes a line here, and waits until it is read.
         for _ in 0..3 {
             assert_eq!(std::fs::read_to_string(&begun).unwrap(), "\n");
         }
@@ -244,7 +245,7 @@ mod tests {
     #[cfg(unix)]
     #[tokio::test]
     async fn who_has_caught_up_has_seen_what_was_before() {
-        // A controller whose lines come only when it is asked: then comes a motion, and behind it the mark.
+        // A controller that prints lines only when asked: first a motion, then the mark.
         let told = "n=0; while read mark; do for z in 90 80 70; do n=$((n+1)); echo $n 0 0 $z 1 0; done; n=$((n+1)); echo $n 0 0 60 1 $mark; done";
         let mut command = Command::new("sh");
         command.args(["-c", told]);
@@ -253,7 +254,7 @@ mod tests {
         path.caught_up().await;
         let question = locked(&path.asked).0;
         assert_eq!(*path.shared.told.borrow(), Told::Mark(question));
-        // What was asked so lately is not asked again.
+        // A question is not repeated within a short time.
         path.caught_up().await;
         assert_eq!(locked(&path.asked).0, question);
     }

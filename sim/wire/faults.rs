@@ -1,7 +1,7 @@
-//! What goes wrong on a wire, when, and as often as a test wants it.
+//! Faults of a wire, with their conditions and their number.
 //!
-//! A [`FaultPlan`] is a list of rules; each names the requests it is about and what happens to them. Chance comes from a seed,
-//! so a plan breaks the same requests in every run that asks them in the same order.
+//! A [`FaultPlan`] is a list of rules; each selects requests and gives their faults. Random choices come from a seed,
+//! so a plan breaks the same requests in every run with the same order of requests.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -11,97 +11,97 @@ use rand::RngExt;
 use crate::Rng;
 use crate::command::State;
 
-/// One thing that goes wrong with a request or with the answer to it.
+/// Fault of a request or of its answer.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Fault {
-    /// The request is lost: nothing is done, nothing answered.
+    /// The request is lost: it is not carried out and not answered.
     DropRequest,
-    /// It is carried out, and the answer is lost.
+    /// The request is carried out, and the answer is lost.
     DropReply,
-    /// The answer comes so much later; what is asked meanwhile waits.
+    /// The answer is late by this time; later requests wait.
     DelayReply(Duration),
     /// The answer comes twice.
     DuplicateReply,
-    /// Only so many bytes of the answer come.
+    /// Only this number of bytes of the answer comes.
     Truncate(usize),
-    /// The answer to a read has a register less than was asked for, in a frame without a flaw.
+    /// The answer to a read has one register less than requested, in a correct frame.
     Fewer,
     /// The answer is followed by more bytes.
     Extra(Vec<u8>),
     /// Other bytes come before the answer.
     Noise(Vec<u8>),
-    /// The answer bears another transaction id (TCP; nothing on RTU).
+    /// The answer has another transaction id (TCP; no effect on RTU).
     WrongTransaction,
-    /// The answer bears another unit.
+    /// The answer has another unit id.
     WrongUnit,
-    /// The answer bears another function.
+    /// The answer has another function code.
     WrongFunction,
-    /// The request is not carried out and answered by this exception.
+    /// The request is not carried out, and is answered by this exception.
     Exception(u8),
     /// The answer comes in single bytes with a pause between them.
     Split(Duration),
     /// The CRC of the answer is wrong (RTU); on TCP its protocol id is.
     FlipCrc,
-    /// One bit of the last register of the answer is wrong and every checksum of the wire right.
+    /// One bit of the last register of the answer is wrong, and every checksum of the wire is right.
     FlipData,
-    /// Some registers of the answer to a read, by their places in it, say something else, and every checksum of the wire is right.
+    /// Registers at these indices of the answer to a read have other values, and every checksum of the wire is right.
     Lie(Vec<(usize, u16)>),
-    /// Every two registers of an answer to a read are exchanged.
+    /// In the answer to a read, the two registers of each pair are exchanged.
     WordSwap,
-    /// So many bytes of the answer come, then the connection is closed (TCP; on RTU the rest is lost).
+    /// This number of bytes of the answer comes, then the connection is closed (TCP; on RTU the rest is lost).
     Disconnect(usize),
-    /// From here on the connection, or the whole line, takes every byte and gives none.
+    /// From here on, the connection or the whole line accepts every byte and returns none.
     Silence,
     /// The two snapshot numbers of the next status disagree.
     TornStatus,
-    /// The wire carries the request out once more, before that many requests later.
+    /// The wire carries the request out a second time, before the request that comes this many requests later.
     CarryOutAgain(u64),
-    /// The application stops before the request is carried out; the wire goes on.
+    /// The application freezes before the request is carried out; the wire continues.
     Freeze,
-    /// The application goes on.
+    /// The application continues.
     Thaw,
-    /// The application starts anew, with another boot id, before the request is carried out.
+    /// The application restarts, with another boot id, before the request is carried out.
     Reboot,
 }
 
-/// What a rule can know of a request.
+/// Properties of a request that a rule can use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Request {
-    /// Counted on this wire from 1.
+    /// Number of the request on this wire, from 1.
     pub number: u64,
-    /// The unit it is for.
+    /// Unit id of the request.
     pub unit: u8,
-    /// The Modbus function.
+    /// Modbus function code.
     pub function: u8,
-    /// The first register.
+    /// Address of the first register.
     pub address: u16,
-    /// How many registers.
+    /// Number of registers.
     pub count: u16,
-    /// The command, if it writes a whole command block.
+    /// Command, if the request writes a whole command block.
     pub command: Option<u16>,
-    /// The state of the machine before the request, if the unit is known.
+    /// State of the machine before the request, if the unit is known.
     pub state: Option<State>,
 }
 
-/// Which requests a rule is about.
+/// Condition that selects the requests of a rule.
 pub enum When {
-    /// All of them.
+    /// All requests.
     Any,
     /// The n-th request on this wire, from 1.
     Nth(u64),
     /// Every n-th request on this wire.
     Every(u64),
-    /// Each with this probability.
+    /// Each request with this probability.
     Chance(f64),
-    /// Those that write at this address first.
+    /// Requests that write from this address on.
     Writing(u16),
-    /// Those that read from this address first.
+    /// Requests that read from this address on.
     Reading(u16),
-    /// Those that write this command.
+    /// Requests that write this command.
     Commanding(u16),
-    /// Those that find the machine in this state.
+    /// Requests that find the machine in this state.
     InState(State),
-    /// Those that a test likes.
+    /// Requests for which this function returns true.
     Matching(Box<dyn FnMut(&Request) -> bool + Send>),
 }
 
@@ -123,15 +123,15 @@ impl When {
 
 struct Rule {
     when: When,
-    /// One of these happens, drawn if there are several.
+    /// Possible faults; one is drawn if there are several.
     faults: Vec<Fault>,
-    /// Requests it is about that are let through first.
+    /// Number of selected requests that pass first without a fault.
     skip: u64,
-    /// How often it may still happen.
+    /// Number of times that the fault can still happen.
     left: u64,
 }
 
-/// A list of rules, and what they have done.
+/// List of rules, and the faults that have happened.
 pub struct FaultPlan {
     rules: Vec<Rule>,
     rng: Rng,
@@ -141,36 +141,36 @@ pub struct FaultPlan {
 }
 
 impl FaultPlan {
-    /// Nothing goes wrong; chance, if a rule wants it, comes from the seed.
+    /// Creates a plan without faults; random choices of its rules use the seed.
     pub fn new(seed: u64) -> Self {
         Self { rules: Vec::new(), rng: crate::rng(seed), requests: 0, fired: Vec::new(), again: Vec::new() }
     }
 
-    /// Lets one of some faults happen to every request with a probability.
+    /// Creates a plan in which each request has one of the faults with a probability.
     pub fn seeded(seed: u64, share: f64, faults: Vec<Fault>) -> Self {
         let mut plan = Self::new(seed);
         plan.rules.push(Rule { when: When::Chance(share), faults, skip: 0, left: u64::MAX });
         plan
     }
 
-    /// Adds a fault of the first request that the rule is about.
+    /// Adds a fault for the first request that the rule selects.
     pub fn once(self, when: When, fault: Fault) -> Self {
         self.times(1, 1, when, fault)
     }
 
-    /// Adds a fault of every request that the rule is about.
+    /// Adds a fault for every request that the rule selects.
     pub fn always(self, when: When, fault: Fault) -> Self {
         self.times(1, u64::MAX, when, fault)
     }
 
-    /// Adds a fault of `count` requests that the rule is about, beginning with the `first` of them, from 1.
+    /// Adds a fault for `count` requests that the rule selects, beginning with the `first` of them, from 1.
     pub fn times(mut self, first: u64, count: u64, when: When, fault: Fault) -> Self {
         self.rules.push(Rule { when, faults: vec![fault], skip: first.saturating_sub(1), left: count });
         self
     }
 }
 
-/// A fault plan that a wire and a test share.
+/// Fault plan shared by a wire and a test.
 #[derive(Clone)]
 pub struct Faults(Arc<Mutex<FaultPlan>>);
 
@@ -187,27 +187,27 @@ impl From<FaultPlan> for Faults {
 }
 
 impl Faults {
-    /// Nothing goes wrong.
+    /// Creates a plan without faults.
     pub fn none() -> Self {
         Self::default()
     }
 
-    /// Replaces the rules; the count of requests begins anew, and what is to be carried out again is forgotten.
+    /// Replaces the rules; the count of requests restarts, and requests to be repeated are dropped.
     pub fn set(&self, plan: FaultPlan) {
         *self.lock() = plan;
     }
 
-    /// Returns what has happened to which requests.
+    /// Returns the faults that have happened, with their requests.
     pub fn fired(&self) -> Vec<(Request, Fault)> {
         self.lock().fired.clone()
     }
 
-    /// Returns how many requests have come.
+    /// Returns the number of requests so far.
     pub fn requests(&self) -> u64 {
         self.lock().requests
     }
 
-    /// Returns what happens to a request, after giving it its number.
+    /// Numbers a request, and returns its faults.
     pub(crate) fn meet(&self, request: &mut Request) -> Vec<Fault> {
         let mut plan = self.lock();
         let FaultPlan { rules, rng, requests, fired, .. } = &mut *plan;
@@ -230,7 +230,7 @@ impl Faults {
         met
     }
 
-    /// Keeps a request to be carried out again.
+    /// Stores a request that is to be carried out again.
     pub(crate) fn keep(&self, before: u64, unit: u8, pdu: &[u8]) {
         self.lock().again.push((before, unit, pdu.to_vec()));
     }

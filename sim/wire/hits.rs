@@ -1,4 +1,4 @@
-//! Lines of hits on a serial line without hardware, or over TCP as a terminal server carries them.
+//! Lines of hits on a pseudo-terminal, or over TCP as a terminal server transmits them.
 
 use std::io;
 use std::net::SocketAddr;
@@ -14,19 +14,19 @@ use tokio::time::sleep;
 use super::pty::Pty;
 use crate::hits::Program;
 
-/// How often a part program looks whether there is another list.
+/// Interval at which a part program checks for a new list.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// Shorter times are slept together.
+/// Minimum sleep; shorter times are accumulated.
 const SHORTEST: Duration = Duration::from_millis(5);
 
-/// What is put on the line next.
+/// Next action on the line.
 enum Put {
     Bytes(Vec<u8>, Option<oneshot::Sender<()>>),
     HangUp,
 }
 
-/// A printer of hits at the far end of a line, until this is dropped.
+/// Printer of hits at the far end of a line; it stops when this is dropped.
 pub struct ServingHits {
     path: Option<PathBuf>,
     local_addr: Option<SocketAddr>,
@@ -35,7 +35,7 @@ pub struct ServingHits {
 }
 
 impl ServingHits {
-    /// Prints on a serial line without hardware.
+    /// Prints on a pseudo-terminal.
     ///
     /// # Errors
     /// The system has none left.
@@ -45,13 +45,13 @@ impl ServingHits {
         let (lines, mut inbox) = mpsc::channel(64);
         let mut tasks = JoinSet::new();
         tasks.spawn(async move {
-            // A line that hangs up is pulled out.
+            // A line that hangs up is closed for good.
             let _ = print(pty, &mut inbox).await;
         });
         Ok(Self { path, local_addr: None, lines, tasks })
     }
 
-    /// Prints to one client after another over TCP; port 0 takes any that is free.
+    /// Prints to one client after another over TCP; port 0 takes any free port.
     ///
     /// # Errors
     /// The address cannot be bound.
@@ -71,17 +71,17 @@ impl ServingHits {
         Ok(Self { path: None, local_addr, lines, tasks })
     }
 
-    /// The path of the serial line.
+    /// Returns the path of the serial line.
     pub fn path(&self) -> Option<&Path> {
         self.path.as_deref()
     }
 
-    /// Where it is served over TCP.
+    /// Returns the address of the TCP server.
     pub fn local_addr(&self) -> Option<SocketAddr> {
         self.local_addr
     }
 
-    /// Puts bytes on the line, and returns when they are on it, or nobody is there to hear them.
+    /// Sends bytes, and returns after they are on the line or when there is no client.
     pub async fn send(&self, bytes: &[u8]) {
         let (written, are_written) = oneshot::channel();
         if self.lines.send(Put::Bytes(bytes.to_vec(), Some(written))).await.is_ok() {
@@ -94,7 +94,8 @@ impl ServingHits {
         let _ = self.lines.send(Put::HangUp).await;
     }
 
-    /// Has a part program measure whatever list appears as `plan.csv` in a folder, so many times faster than it would.
+    /// Runs a part program that measures every list that appears as `plan.csv` in a folder, faster than real time by
+    /// the factor `speed`.
     pub fn run(&mut self, mut program: Program, folder: &Path, speed: f64) {
         let (list, lines) = (folder.join("plan.csv"), self.lines.clone());
         self.tasks.spawn(async move {
@@ -102,7 +103,7 @@ impl ServingHits {
                 if let Ok(text) = std::fs::read_to_string(&list) {
                     program.begin(&text);
                 }
-                // A timer is coarser than the touches of a fast machine.
+                // A timer is coarser than the touches of a fast machine, so the waiting times are accumulated.
                 let mut owed = Duration::ZERO;
                 while let Some(out) = program.touch_next() {
                     owed += program.per_touch().div_f64(speed);
@@ -122,7 +123,7 @@ impl ServingHits {
     }
 }
 
-/// Prints what is put on the line until the far side is gone or it is hung up.
+/// Prints the queued bytes until the other side is gone or the line is hung up.
 async fn print(mut stream: impl AsyncRead + AsyncWrite + Unpin, inbox: &mut mpsc::Receiver<Put>) -> io::Result<()> {
     let mut heard = [0; 256];
     loop {
@@ -135,7 +136,7 @@ async fn print(mut stream: impl AsyncRead + AsyncWrite + Unpin, inbox: &mut mpsc
                 }
                 Some(Put::HangUp) | None => return stream.shutdown().await,
             },
-            // It hears nothing; what is said to it is read away.
+            // The printer ignores its input: it reads and discards it.
             read = stream.read(&mut heard) => if read? == 0 { return Ok(()) },
         }
     }

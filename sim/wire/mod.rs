@@ -4,14 +4,14 @@
 //!  tcp      any number of clients, several units behind one port
 //!  rtu      a serial line, real or not, that takes as long as its baud rate says
 //!  pty      a serial line without hardware, opened by its path
-//!  faults   what goes wrong on Modbus, when
+//!  faults   faults on Modbus, with their conditions
 //!  dme      I++ DME over TCP, one client at a time
 //!  rsh      the lines of linuxcncrsh, any number of clients
-//!  executed the path that a controller outside executes, a line for each servo cycle
+//!  executed the path that an external controller executes, a line for each servo cycle
 //!  hits     a line for each touch, on a serial line or over TCP
 //! ```
 //!
-//! [`Serving`] is all that most callers need: it binds, serves, lets the machines' time pass, and stops.
+//! Most callers need only [`Serving`]: it binds, serves, lets the machines' time pass, and stops.
 
 pub mod dme;
 pub mod executed;
@@ -41,15 +41,15 @@ use crate::registers::{Exception, Machine};
 use crate::words::{bytes_of, crc16, registers_of};
 use faults::{Fault, Faults, Request};
 
-/// How often the machines' time passes.
+/// Interval at which the machines' time advances.
 const TICK: Duration = Duration::from_millis(10);
-/// The most time that one tick lets pass. A simulator that was not given the processor has not lived meanwhile.
+/// Maximum time that one tick lets pass. If the simulator gets no processor time, the machines' time stops too.
 const LONGEST_TICK: Duration = Duration::from_millis(100);
 
-/// Time that passes at a machine in one go.
+/// Time step of a machine between two requests.
 const PIECE: Duration = Duration::from_millis(1);
 
-/// A machine that wires, tests and time share.
+/// Machine shared by wires, tests and time.
 #[derive(Clone)]
 pub struct SharedMachine(Arc<Mutex<Living>>);
 
@@ -65,17 +65,17 @@ impl From<Machine> for SharedMachine {
 }
 
 impl SharedMachine {
-    /// Looks at the machine, or changes it, while nobody else does.
+    /// Calls a function with exclusive access to the machine.
     pub fn with<T>(&self, look: impl FnOnce(&mut Machine) -> T) -> T {
         look(&mut self.lock().machine)
     }
 
-    /// Lets pass what time has passed since the last call.
+    /// Lets the time since the last call pass at the machine.
     fn live(&self) {
         let now = Instant::now();
         let last = self.lock().ticked.replace(now).unwrap_or(now);
         let mut left = now.saturating_duration_since(last).min(LONGEST_TICK);
-        // The physics of a fast machine takes its time to compute; a request must not wait for more than a piece of it.
+        // The physics of a fast machine takes time to compute; a request must wait for at most one step of it.
         while !left.is_zero() {
             let piece = left.min(PIECE);
             left -= piece;
@@ -88,10 +88,10 @@ impl SharedMachine {
     }
 }
 
-/// The machines of a wire with their unit ids.
+/// Machines of a wire with their unit ids.
 pub type Units = Vec<(u8, SharedMachine)>;
 
-/// Lets real time pass at some machines until it is dropped.
+/// Lets real time pass at the machines until it is dropped.
 pub async fn live(machines: Vec<SharedMachine>) {
     let mut ticks = tokio::time::interval(TICK);
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -101,7 +101,7 @@ pub async fn live(machines: Vec<SharedMachine>) {
     }
 }
 
-/// How an answer is put on the wire.
+/// Framing of an answer on the wire.
 #[derive(Clone, Copy)]
 enum Framing {
     Tcp { transaction: u16 },
@@ -130,7 +130,7 @@ impl Framing {
     }
 }
 
-/// What is left of the connection after an answer.
+/// State of the connection after an answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum After {
     Open,
@@ -138,7 +138,7 @@ enum After {
     Silent,
 }
 
-/// An answer with all that goes wrong with it.
+/// Answer with all its faults.
 struct Delivery {
     delay: Duration,
     bytes: Vec<u8>,
@@ -164,7 +164,7 @@ impl Delivery {
     }
 }
 
-/// Carries out a request and returns what the wire makes of the answer.
+/// Carries out a request, and returns the answer as the wire delivers it.
 fn answer(units: &Units, faults: &Faults, framing: Framing, unit: u8, pdu: &[u8]) -> Delivery {
     let machine = units.iter().find(|(id, _)| *id == unit).map(|(_, machine)| machine);
     let mut request = describe(machine, unit, pdu);
@@ -262,7 +262,7 @@ fn refusal(function: u8, exception: Exception) -> Vec<u8> {
     vec![function | 0x80, exception as u8]
 }
 
-/// Carries out functions 3, 6 and 16 and returns the answer's protocol data unit.
+/// Carries out functions 3, 6 and 16, and returns the protocol data unit of the answer.
 fn carry_out(machine: &SharedMachine, pdu: &[u8]) -> Vec<u8> {
     let word = |at: usize| u16::from_be_bytes([pdu[at], pdu[at + 1]]);
     let done = match (pdu[0], pdu.len()) {
@@ -281,14 +281,14 @@ fn carry_out(machine: &SharedMachine, pdu: &[u8]) -> Vec<u8> {
     done.unwrap_or_else(|exception| refusal(pdu[0], exception))
 }
 
-/// Machines that are being served, until this is stopped or dropped.
+/// Machines that are served until this is stopped or dropped.
 pub struct Serving {
     local_addr: Option<SocketAddr>,
     path: Option<PathBuf>,
     machines: Units,
     faults: Faults,
     tasks: JoinSet<io::Result<()>>,
-    /// A link to a pseudo-terminal, and where that is.
+    /// Link to a pseudo-terminal, and its target.
     linked: Option<(PathBuf, PathBuf)>,
 }
 
@@ -297,14 +297,14 @@ impl Drop for Serving {
         if let Some((link, port)) = self.linked.take()
             && std::fs::read_link(&link).is_ok_and(|to| to == port)
         {
-            // Nobody is left to be told; a link that stays is replaced by the next simulator.
+            // There is nobody to report an error to; the next simulator replaces a link that stays.
             let _ = std::fs::remove_file(link);
         }
     }
 }
 
 impl Serving {
-    /// Serves machines over Modbus TCP; port 0 takes any that is free.
+    /// Serves machines over Modbus TCP; port 0 takes any free port.
     ///
     /// # Errors
     /// The address cannot be bound.
@@ -312,7 +312,7 @@ impl Serving {
         Self::tcp_with(addr, units, Faults::none()).await
     }
 
-    /// Serves machines over a Modbus TCP on which things go wrong.
+    /// Serves machines over Modbus TCP with faults.
     ///
     /// # Errors
     /// The address cannot be bound.
@@ -332,7 +332,7 @@ impl Serving {
     /// Serves machines over Modbus RTU on a new pseudo-terminal, whose path a client opens like that of a serial port.
     ///
     /// # Errors
-    /// No pseudo-terminal can be had.
+    /// No pseudo-terminal is available.
     pub fn rtu<M: Into<SharedMachine>>(units: Vec<(u8, M)>, line: rtu::Line, faults: Faults) -> io::Result<Self> {
         let port = pty::Pty::open()?;
         let mut serving = Self::of(units, faults);
@@ -341,10 +341,10 @@ impl Serving {
         Ok(serving)
     }
 
-    /// Gives the serial port another path, that which a client's configuration names, for as long as it is served.
+    /// Links the serial port to another path, the one in a client's configuration, for as long as it is served.
     ///
     /// # Errors
-    /// Something that is not a link is there already, or the link cannot be made, or this is not a serial port.
+    /// Something that is not a link exists there, the link cannot be made, or this is not a serial port.
     pub fn link(&mut self, at: impl AsRef<Path>) -> io::Result<()> {
         let at = at.as_ref();
         let port = self.path.clone().ok_or(io::ErrorKind::Unsupported)?;
@@ -395,7 +395,7 @@ impl Serving {
         self.tasks.spawn(async move { rtu::serve_rtu(port, machines, line, faults).await });
     }
 
-    /// Returns the address that is served, if it is TCP.
+    /// Returns the address of the server, if it is TCP.
     pub fn local_addr(&self) -> Option<SocketAddr> {
         self.local_addr
     }
@@ -415,15 +415,15 @@ impl Serving {
         self.machines.iter().find(|(id, _)| *id == unit).map(|(_, machine)| machine)
     }
 
-    /// Returns what goes wrong on this wire, to be changed at any time.
+    /// Returns the faults of this wire; they can be changed at any time.
     pub fn faults(&self) -> &Faults {
         &self.faults
     }
 
-    /// Waits until the wire fails, as a serial port does that is pulled out; a TCP port does not.
+    /// Waits until the wire fails, as a serial port does when it is unplugged; a TCP port does not fail.
     ///
     /// # Errors
-    /// Why it failed.
+    /// Returns the failure of the wire.
     pub async fn failed(&mut self) -> io::Result<()> {
         loop {
             match self.tasks.join_next().await {
@@ -435,7 +435,8 @@ impl Serving {
         }
     }
 
-    /// Closes every connection and waits until all is quiet. The machines stay as they are and can be served again.
+    /// Closes every connection and waits until all tasks have ended. The machines keep their state and can be served
+    /// again.
     pub async fn stop(mut self) {
         self.tasks.shutdown().await;
     }

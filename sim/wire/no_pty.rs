@@ -1,4 +1,4 @@
-//! What stands in for a pseudo-terminal where the system has none.
+//! Replacement of the pseudo-terminal on systems that have none.
 
 use std::io;
 use std::path::Path;
@@ -7,12 +7,12 @@ use std::task::{Context, Poll};
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 
-/// Nobody ever has one.
+/// Pseudo-terminal that cannot exist.
 #[derive(Debug)]
 pub enum Pty {}
 
 impl Pty {
-    /// Says that there is none.
+    /// Returns the error that there is no pseudo-terminal.
     ///
     /// # Errors
     /// Always.

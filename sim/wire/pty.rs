@@ -13,9 +13,9 @@ use rustix::termios::{OptionalActions, ioctl_tiocnxcl, tcgetattr, tcsetattr};
 use tokio::io::unix::AsyncFd;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 
-/// The near end of a pseudo-terminal.
+/// Near end of a pseudo-terminal.
 ///
-/// It holds the far end open too: a client that closes the port, or dies, leaves a line that another can open.
+/// It keeps the far end open too: after a client closes the port or dies, another client can open the line.
 #[derive(Debug)]
 pub struct Pty {
     near: AsyncFd<OwnedFd>,
@@ -24,7 +24,7 @@ pub struct Pty {
 }
 
 impl Pty {
-    /// Opens a pseudo-terminal that changes no byte on its way.
+    /// Opens a pseudo-terminal that changes no byte.
     ///
     /// # Errors
     /// The system has none left. Panics outside a tokio runtime, as all its sockets do.
@@ -38,7 +38,8 @@ impl Pty {
         settings.make_raw();
         tcsetattr(&far, OptionalActions::Now, &settings)?;
         rustix::io::ioctl_fionbio(&near, true)?;
-        // Its successor is unsafe to call, for descriptors that others may close; this one is owned here alone.
+        // The successor of this function is unsafe because others could close the descriptor; this one is owned only
+        // here.
         #[allow(deprecated)]
         let near = AsyncFd::new(near)?;
         Ok(Self { near, far, path })
@@ -50,7 +51,7 @@ impl Pty {
     }
 }
 
-/// Gives a terminal another path.
+/// Links a terminal to another path.
 pub(super) fn link(terminal: &Path, at: &Path) -> io::Result<()> {
     std::os::unix::fs::symlink(terminal, at)
 }
@@ -61,7 +62,7 @@ impl AsyncRead for Pty {
             let mut ready = ready!(self.near.poll_read_ready(cx))?;
             let read = ready.try_io(|near| Ok(rustix::io::read(near.get_ref(), buf.initialize_unfilled())?));
             let Ok(read) = read else { continue };
-            // A client that is killed leaves the line locked for everybody but root, since it stays open here.
+            // A killed client leaves the line locked for everybody except root, since it stays open here.
             let _ = ioctl_tiocnxcl(&self.far);
             return Poll::Ready(read.map(|count| buf.advance(count)));
         }

@@ -10,16 +10,16 @@ use tokio::time::{Instant, sleep_until};
 
 use crate::rsh::Controller;
 
-/// The longest line, its end left out.
+/// Maximum length of a line, without its line end.
 const LONGEST_LINE: usize = 4096;
 
-/// A controller that its wires, its clients and a test share.
+/// Controller shared by its wires, its clients and a test.
 #[derive(Clone)]
 pub struct SharedController(Arc<Inner>);
 
 struct Inner {
     controller: Mutex<Controller>,
-    /// The controller was changed from outside, so often: it may have something to say. The number of the last client.
+    /// Count of changes from outside, after which the controller can have output; then the number of the last client.
     changed: watch::Sender<u64>,
     clients: Mutex<u64>,
     began: Instant,
@@ -33,7 +33,7 @@ impl From<Controller> for SharedController {
 }
 
 impl SharedController {
-    /// Looks at the controller, or changes it, while nobody else does.
+    /// Calls a function with exclusive access to the controller.
     pub fn with<T>(&self, look: impl FnOnce(&mut Controller) -> T) -> T {
         let looked = look(&mut self.locked());
         self.0.changed.send_modify(|times| *times += 1);
@@ -45,7 +45,7 @@ impl SharedController {
         self.locked().pass(self.now());
     }
 
-    /// The time of the controller.
+    /// Returns the time of the controller.
     pub fn now(&self) -> Duration {
         self.0.began.elapsed()
     }
@@ -54,7 +54,7 @@ impl SharedController {
         self.0.controller.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Serves a client until it goes away or is sent away. What runs goes on.
+    /// Serves a client until either side closes the connection. A running program continues.
     pub async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin) {
         let client = {
             let mut clients = self.0.clients.lock().unwrap_or_else(PoisonError::into_inner);
@@ -62,7 +62,7 @@ impl SharedController {
             *clients
         };
         self.locked().connected(client);
-        // What goes wrong with a client is no other's concern.
+        // A failure of one client does not concern the others.
         let _ = self.converse(client, stream).await;
         self.locked().hung_up(client);
     }

@@ -1,7 +1,8 @@
-//! Modbus RTU: frames that silence parts, a CRC at the end, and a line that takes its time.
+//! Modbus RTU: frames separated by silence, a CRC at the end, and a line with limited speed.
 //!
-//! A pseudo-terminal carries any number of bytes at once, whatever its baud rate. A paced line therefore lets as much time pass
-//! as the bytes of request and answer would take on a wire, so that what a client measures is what a real line would give.
+//! A pseudo-terminal transmits any number of bytes at once, whatever its baud rate. A paced line therefore waits for
+//! the time that the bytes of request and answer would take on a wire, so that a client measures the same times as on a
+//! real line.
 
 use std::io;
 use std::time::Duration;
@@ -12,31 +13,31 @@ use super::faults::Faults;
 use super::{After, Framing, Units, answer};
 use crate::words::crc16;
 
-/// Silence after which a frame that is not whole is given up: far longer than 3.5 characters, since a computer that
-/// has other things to do pauses between bytes where a wire does not.
+/// Silence after which an incomplete frame is dropped. It is far longer than 3.5 characters, since a busy computer
+/// pauses between bytes where a wire does not.
 const GIVE_UP: Duration = Duration::from_millis(50);
 
-/// How fast a serial line is.
+/// Speed of a serial line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Line {
-    /// Bits a second; a character has 11.
+    /// Bits per second; a character has 11 bits.
     pub baud: u32,
-    /// Lets the time pass that the bytes take; false for a port that takes it by itself.
+    /// True if the line waits for the time of its bytes; false for a port that is slow by itself.
     pub paced: bool,
 }
 
 impl Line {
-    /// A line without hardware that takes the time of its baud rate.
+    /// Returns a line without hardware that takes the time of its baud rate.
     pub fn paced(baud: u32) -> Self {
         Self { baud, paced: true }
     }
 
-    /// A line that takes the time it takes.
+    /// Returns a line without added delays.
     pub fn unpaced(baud: u32) -> Self {
         Self { baud, paced: false }
     }
 
-    /// Returns how long some characters take.
+    /// Returns the duration of a number of characters.
     pub fn characters(&self, count: usize) -> Duration {
         Duration::from_secs_f64(11.0 * count as f64 / f64::from(self.baud.max(1)))
     }
@@ -73,7 +74,7 @@ where
     }
 }
 
-/// Returns the next frame whose CRC is right; what is not a frame is dropped at the next silence.
+/// Returns the next frame with a correct CRC; other bytes are dropped at the next silence.
 async fn next_frame<P: AsyncRead + Unpin>(port: &mut P, heard: &mut Vec<u8>) -> io::Result<Vec<u8>> {
     let mut broken = false;
     loop {
@@ -111,7 +112,7 @@ async fn next_frame<P: AsyncRead + Unpin>(port: &mut P, heard: &mut Vec<u8>) -> 
     }
 }
 
-/// Returns how long the frame that begins here is, if that can be told.
+/// Returns the length of the frame that begins here, if it is known.
 fn length(heard: &[u8]) -> Option<usize> {
     match heard.get(1)? {
         1..=6 | 8 => Some(8),

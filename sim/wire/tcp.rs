@@ -1,4 +1,4 @@
-//! Modbus TCP: the header of seven bytes, and nothing between clients but the machines.
+//! Modbus TCP: a header of seven bytes; clients share nothing but the machines.
 
 use std::io;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use tokio::task::JoinSet;
 use super::faults::Faults;
 use super::{After, Framing, Units, answer};
 
-/// Serves machines to any number of clients until it is dropped, and closes every connection then.
+/// Serves machines to any number of clients until it is dropped; it then closes every connection.
 ///
 /// # Errors
 /// None; the type is that of the other wires.
@@ -26,7 +26,8 @@ pub async fn serve_tcp(listener: TcpListener, units: Units, faults: Faults) -> i
                         serve_client(stream, &units, &faults).await
                     });
                 }
-                // Out of descriptors, or a client that was gone at once: neither concerns the others.
+                // The process has no descriptors left, or a client was gone at once: neither concerns the other
+                // clients.
                 Err(_) => tokio::time::sleep(Duration::from_millis(20)).await,
             },
             Some(_) = clients.join_next() => {}
@@ -34,7 +35,7 @@ pub async fn serve_tcp(listener: TcpListener, units: Units, faults: Faults) -> i
     }
 }
 
-/// Answers one client, request after request, until it goes away or sends what is not Modbus.
+/// Answers the requests of one client until it disconnects or sends something that is not Modbus.
 ///
 /// # Errors
 /// The stream cannot be read or written any more.

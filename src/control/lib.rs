@@ -1,12 +1,13 @@
-//! The door of a running cell: how it is told to people and programs, what they can ask of it, and the socket between.
+//! Control interface of a running cell: the state that it publishes, the requests that it accepts, and the socket
+//! between it and its clients.
 //!
 //! ```text
 //!  drive --> Snapshot --> Control ===socket in the run folder=== ask, watch --> terminal, page
 //!        <-- Ordered <---/                                  Request -->
 //! ```
 //!
-//! Everybody comes through this one door, so an order is recorded alike whoever gave it: the operating system says who is at the
-//! other end, and a program that speaks for others says for whom.
+//! All clients use this one interface, so an order is recorded in the same way whoever gave it. The operating system
+//! identifies the user of the client. A program that acts for other people names the person.
 
 mod door;
 mod request;

@@ -1,4 +1,4 @@
-//! What can be asked of a running cell, and what it answers.
+//! Requests to a running cell, and its replies.
 
 use std::path::PathBuf;
 
@@ -8,91 +8,94 @@ use serde::{Deserialize, Serialize};
 
 use super::snapshot::Snapshot;
 
-/// What can be asked of a running cell: which machine it is about, and why, which may be empty.
+/// Request to a running cell: the order, with the machine that it concerns and a reason, which can be empty.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[expect(missing_docs, reason = "the fields are told above them")]
 #[serde(tag = "order", rename_all = "snake_case")]
 pub enum Request {
-    /// Come to the next safe place and wait.
+    /// Order to move to the next safe place and wait.
     Hold {
         #[serde(default)]
         reason: String,
     },
-    /// Go on.
+    /// Order to continue.
     Resume {
         #[serde(default)]
         reason: String,
-        /// The state that the person saw, by [`Snapshot::number`]: an order that was meant for another one is refused.
+        /// Number of the state that the person saw, [`Snapshot::number`]. An order that was meant for another state is
+        /// refused.
         #[serde(default)]
         seen: Option<u64>,
     },
-    /// End in order.
+    /// Order to end in an orderly way.
     Stop {
         #[serde(default)]
         reason: String,
     },
-    /// End at once: the safe sequence only.
+    /// Order to end at once, with only the safe sequence.
     Abort {
         #[serde(default)]
         reason: String,
     },
-    /// The right part is loaded and clamped, and no machine touches it.
+    /// Confirmation that the right part is loaded and clamped, and that no machine touches it.
     Loaded,
-    /// A machine that cannot tell it was looked at: it is clear of the part.
+    /// Confirmation of a person who checked a machine that cannot report it: the machine is clear of the part.
     Clear { device: Device },
-    /// A machine that cannot tell what became of its job was looked at: it stands, clear of the part, and so it was seen.
+    /// Confirmation of a person who checked a machine that cannot report the result of its job: the machine is at rest
+    /// and clear of the part. `evidence` is what the person saw.
     Over { device: Device, evidence: String },
-    /// The machine that a person serves has begun its job.
+    /// Confirmation that the machine that a person operates has started its job.
     Started {
-        /// Identity of the map that it works by: its first 8 hexadecimal digits, or more.
+        /// Identity of the map that the machine uses: its first 8 hexadecimal digits, or more.
         #[serde(default)]
         map: Option<String>,
     },
-    /// It has ended that job, and is clear of the part; a measurement came as a file.
+    /// Confirmation that this machine has ended its job and is clear of the part. A measurement is given as a file.
     Done {
-        /// Identity of the map that it worked by: its first 8 hexadecimal digits, or more.
+        /// Identity of the map that the machine used: its first 8 hexadecimal digits, or more.
         #[serde(default)]
         map: Option<String>,
         #[serde(default)]
         file: Option<PathBuf>,
     },
-    /// A machine that was to hold or to stop was looked at: it stands still. Not named, it is that of the job under way.
+    /// Confirmation of a person who checked a machine that was to hold or to stop: the machine is at rest. Without a
+    /// device, it is the machine of the current job.
     Still {
         #[serde(default)]
         device: Option<Device>,
     },
-    /// A program that speaks for people wants something on record: who took control, what was refused.
+    /// Remark for the record, from a program that acts for people: who took control, or what was refused.
     Remark { what: String },
-    /// How is it?
+    /// Request for the state of the cell once.
     Status,
-    /// How is it, now and after every change, until either end goes away.
+    /// Request for the state of the cell now and after every change, until either end closes the connection.
     Watch,
 }
 
-/// What a running cell answers.
+/// Reply of a running cell.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Reply {
-    /// Whether the order was taken; of the part it says nothing.
+    /// True if the order was accepted. It is not a verdict on the part.
     #[serde(alias = "accepted")]
     pub taken: bool,
-    /// Why not, or what follows, for the person who asked.
+    /// Reason of a refusal, or what follows, for the person who asked.
     #[serde(rename = "words")]
     pub message: String,
-    /// How the cell is after it.
+    /// State of the cell after the request.
     pub status: Snapshot,
 }
 
-/// For whom a program speaks that gives the orders of others.
+/// Person for whom a program gives an order.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct OnBehalf {
-    /// Who the person is, where the program knows it.
+    /// Name of the person, if the program knows it.
     #[serde(default)]
     pub name: Option<String>,
-    /// Where they are.
+    /// Place of the person.
     pub station: String,
 }
 
-/// A line as it comes over the socket.
+/// Line of text as it is sent over the socket.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Line {
     #[serde(flatten)]
@@ -102,7 +105,8 @@ pub(super) struct Line {
 }
 
 impl Line {
-    /// Whether a text in it reads otherwise than it is: it would be on record so, for years.
+    /// Returns true if a text in the request displays differently from its characters. It would be on record in that
+    /// form for years.
     pub(super) fn misleads(&self) -> bool {
         let text = match &self.request {
             Request::Hold { reason }

@@ -1,85 +1,85 @@
-//! How a running cell is: where it stands, what it waits for, and what a person does next.
+//! State of a running cell: its phase, what it waits for, and the next step of a person.
 
 use std::fmt;
 
 use regrind_cell::{Alarm, Device, Phase, StateName, Tolerance};
 use serde::{Deserialize, Serialize};
 
-/// How a running cell is.
+/// State of a running cell at one time.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Snapshot {
-    /// Whether any machine of it is simulated.
+    /// True if any machine of the cell is simulated.
     pub simulation: bool,
-    /// What the part is called.
+    /// Name of the part.
     #[serde(default)]
     pub part: String,
-    /// Its serial number; empty where nobody knows.
+    /// Serial number of the part; empty if unknown.
     #[serde(default)]
     pub serial: String,
-    /// The state, by PackML's name.
+    /// State, by its PackML name.
     pub state: StateName,
-    /// The phase in which it is or will go on, and the step of a machine's job in it.
+    /// Phase in which the cell is or will continue, and the step of a machine's job in it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase: Option<Phase>,
-    /// The machines that have not confirmed that they stand, in a state that is taken for standing still.
+    /// Machines that have not confirmed that they are at rest, in a state where the cell is considered to be at rest.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub unconfirmed: Vec<Device>,
     /// State and phase, for people.
     #[serde(rename = "words")]
     pub message: String,
-    /// The verdict on the part by now: an order that is taken says nothing of it.
+    /// Current verdict on the part. The acceptance of an order has no effect on it.
     #[serde(default)]
     pub verdict: PartVerdict,
-    /// Counts the states since the run began, so that an order can say which one it is meant for.
+    /// Counter of the states since the run began, so that an order can name the state it is meant for.
     #[serde(default)]
     pub number: u64,
-    /// The number of the cycle; 0 before the first.
+    /// Number of the cycle; 0 before the first.
     pub cycle: u32,
-    /// How many cycles there are at most.
+    /// Maximum number of cycles.
     #[serde(default)]
     pub max_cycles: u32,
-    /// Time since the run began.
+    /// Time since the run began, in seconds.
     pub seconds: f64,
-    /// How far the job under way is.
+    /// Progress of the current job.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<JobProgress>,
-    /// What the touches of the measurement under way say so far, where the CMM gives them before its end.
+    /// Preliminary result of the current measurement, if the CMM reports touches before the end.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub so_far: Option<SoFar>,
-    /// What the figures of a cycle are judged by.
+    /// Tolerance against which the figures of a cycle are judged.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tolerance: Option<Tolerance>,
-    /// What is known of each cycle.
+    /// Results of each cycle.
     pub cycles: Vec<CycleRow>,
-    /// The alarms that stand.
+    /// Active alarms.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub alarms: Vec<Alarm>,
-    /// What a machine waits for that a person or another program has to bring.
+    /// Items that a machine waits for, which a person or another program must provide.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub waits_for: Vec<String>,
-    /// What a person does next.
+    /// Next step of a person.
     #[serde(default)]
     pub next_step: Next,
-    /// The same as a sentence, with the commands of the terminal.
+    /// The next step as a sentence, with the commands of the terminal.
     #[serde(default)]
     pub next: String,
 }
 
-/// The verdict on a part.
+/// Verdict on a part.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PartVerdict {
-    /// The run goes on.
+    /// No verdict yet: the run continues.
     #[default]
     Open,
-    /// It is accepted.
+    /// The part is accepted.
     Accepted,
-    /// The run has ended without.
+    /// The run has ended and the part is not accepted.
     NotAccepted,
 }
 
 impl PartVerdict {
-    /// Only a part that is accepted completes a run.
+    /// Returns the verdict that belongs to a state. Only an accepted part completes a run.
     pub fn at(state: StateName) -> Self {
         match state {
             StateName::Complete => Self::Accepted,
@@ -89,34 +89,34 @@ impl PartVerdict {
     }
 }
 
-/// What a person does next.
+/// Next step of a person.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "step", rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Next {
-    /// Nothing: the cell works by itself.
+    /// No action needed.
     #[default]
     Nothing,
     /// Load the part, and confirm it.
     Load,
-    /// See that a machine is clear of the part, and confirm it.
+    /// Check that a machine is clear of the part, and confirm it.
     #[expect(missing_docs, reason = "named for what it is")]
     SeeClear { device: Device },
-    /// Bring what a machine waits for.
+    /// Provide the item that a machine waits for.
     #[expect(missing_docs, reason = "named for what it is")]
     Bring { what: String },
-    /// See to what an alarm says; the cell goes on by itself then.
+    /// Remove the cause of an alarm; the cell then continues by itself.
     SeeToAlarm,
-    /// Do what an alarm says, then resume, or stop.
+    /// Do what the alarm requires, then resume or stop.
     ClearAlarm,
-    /// Resume, or stop.
+    /// Resume or stop.
     ResumeOrStop,
-    /// See whether a machine stands, which has not confirmed it.
+    /// Check that a machine is at rest that has not confirmed it.
     #[expect(missing_docs, reason = "named for what it is")]
     SeeWhetherItStands { device: Device },
     /// Keep away from both machines: they run their safe sequence.
     KeepAway,
-    /// Use the emergency circuit of each machine that has not confirmed that it stands.
+    /// Use the emergency circuit of each machine that has not confirmed that it is at rest.
     EmergencyCircuit,
     /// Read the report: the run is over.
     ReadReport,
@@ -155,58 +155,59 @@ impl fmt::Display for Next {
     }
 }
 
-/// How far a job is.
+/// Progress of a job.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct JobProgress {
-    /// The machine that is at it.
+    /// Machine that performs the job.
     pub device: Device,
-    /// Points of a measurement; of a pass, as many parts of the path as the machine counts.
+    /// Completed points of a measurement, or completed parts of the path of a pass, in the unit in which the machine
+    /// counts.
     pub done: u32,
-    /// How many there are.
+    /// Total number of points or parts.
     pub total: u32,
-    /// Least and most time that it will still take, in seconds: at the pace since it began to move, and at that of late. None before
-    /// there is a pace, and while it stands.
+    /// Minimum and maximum remaining time, in seconds. The bounds come from the average pace since the machine began to
+    /// move and from the recent pace. `None` before a pace is known, and while the machine is at rest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub left_s: Option<[f64; 2]>,
 }
 
-/// What the touches of a measurement say that still runs: preliminary. They are counted from where the plan has the part, so that its place
-/// on the table is in them; no gate has seen them, and nothing is judged by them.
+/// Preliminary statistics of the touches of a measurement that still runs. Deviations refer to the planned position of
+/// the part, so they include its placement error on the table. No gate has checked them, and no verdict uses them.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SoFar {
-    /// How many touches of the part have come.
+    /// Number of touches of the part so far.
     pub touched: u32,
-    /// The quadratic mean of their deviations, along the normals; positive where material stands proud.
+    /// Root mean square of their deviations along the normals, in µm.
     pub rms_um: f64,
-    /// The least deviation.
+    /// Minimum deviation, in µm; positive if material is above the surface.
     pub least_um: f64,
-    /// The largest.
+    /// Maximum deviation, in µm; positive if material is above the surface.
     pub most_um: f64,
 }
 
-/// A cycle in the table at the end of a run.
+/// Row of a cycle in the table at the end of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[allow(missing_docs)]
 pub struct CycleRow {
     pub cycle: u32,
-    /// Of all points that were used.
+    /// PV of all used points, in µm.
     pub pv_um: f64,
-    /// As it is judged.
+    /// PV that is judged, in µm.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub judged_pv_um: Option<f64>,
-    /// Of all points that were used.
+    /// RMS of all used points, in µm.
     pub rms_um: f64,
-    /// As it is judged.
+    /// RMS that is judged, in µm.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub judged_rms_um: Option<f64>,
     pub points: u32,
     pub outliers: u32,
-    /// Height of the surface that was wanted over the nominal one.
+    /// Height of the target surface above the nominal one, in µm.
     pub level_um: f64,
 }
 
 impl CycleRow {
-    /// Returns PV and RMS as they are judged; those of the points where nobody said which.
+    /// Returns the judged PV and RMS, in µm. Returns those of all used points if no judged values are given.
     pub fn judged_um(&self) -> [f64; 2] {
         [self.judged_pv_um.unwrap_or(self.pv_um), self.judged_rms_um.unwrap_or(self.rms_um)]
     }

@@ -1,7 +1,9 @@
-//! The control socket of a running cell: a person at another terminal holds, resumes, stops or aborts it, or asks how it is.
+//! Control socket of a running cell: a person at another terminal holds, resumes, stops or aborts the cell, or asks for
+//! its state.
 //!
-//! One line of JSON in, one line out; for who watches, one line after another. The operating system says who is at the other end;
-//! that is what is recorded, and for whom a program speaks beside it.
+//! The client sends one line of JSON and gets one line back; a client that watches gets one line after another. The
+//! operating system identifies the user of the client. That identity is recorded, together with the person for whom the
+//! program acts.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -16,46 +18,49 @@ use super::door::{self, Caller, CellSays, Door, TellCaller, TellCell};
 use super::request::{Line, OnBehalf, Reply, Request};
 use super::snapshot::Snapshot;
 
-/// Longest line that is read.
+/// Maximum length of a line from a client, in bytes.
 const LONGEST_LINE: u64 = 4096;
-/// A client that says nothing for so long is gone.
+/// Timeout of a read or write. A client that sends nothing for this time is considered gone.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// An order that has no answer by then gets one that says so, while who gave it still listens.
+/// Timeout of an order in the cell. The client then gets a reply that says so, while it still listens.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(8);
-/// Most clients that watch at a time: each has a descriptor for as long as it likes, and orders need theirs.
+/// Maximum number of clients that watch at the same time. Each keeps a file descriptor, and orders also need
+/// descriptors.
 const WATCHERS: usize = 16;
-/// Between two tries to let a client in.
+/// Pause after a failed attempt to accept a client.
 const BETWEEN_TRIES: Duration = Duration::from_millis(50);
-/// Between two lines to who watches: no eye follows more of them, and a cell that says nothing for longer than this is not there.
+/// Minimum and maximum time between two lines to a client that watches. A person cannot follow more lines. A cell that
+/// is silent for longer than the maximum is gone.
 const LEAST_BETWEEN_LINES: Duration = Duration::from_millis(100);
 const MOST_BETWEEN_LINES: Duration = Duration::from_secs(1);
-/// Longest time without a line after which who watches takes the cell for gone.
+/// Maximum silence after which a client that watches considers the cell gone.
 const SILENCE: Duration = Duration::from_millis(2500);
 
-/// An order on its way to the loop.
+/// Order on its way to the loop of the cell.
 pub struct Ordered {
-    /// What is asked.
+    /// The request.
     pub request: Request,
-    /// Who asks.
+    /// Person or program that asks.
     pub actor: Actor,
-    /// Where the answer goes; none for orders of this process itself.
+    /// Channel for the answer; `None` for orders of this process itself.
     pub answer: Option<oneshot::Sender<Reply>>,
 }
 
-/// Between two looks whether the door in the run folder is still there.
+/// Time between two checks that the door in the run folder still exists.
 const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
 
-/// What became of the door in the run folder.
+/// Change of the door in the run folder.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum DoorChange {
-    /// It is gone or exchanged, and who gives orders may not find the cell; and why it could not be made again, where it could not.
+    /// The door is missing or was replaced, so clients may not find the cell. Contains the reason if it could not be
+    /// made again; otherwise empty.
     Lost(String),
-    /// It was made again.
+    /// The door was made again, or is back in its place.
     MadeAgain,
 }
 
-/// What is needed to serve those who come in.
+/// Channels and limits for serving the clients.
 #[derive(Clone)]
 struct Desk {
     orders: mpsc::Sender<Ordered>,
@@ -63,7 +68,7 @@ struct Desk {
     places: Arc<Semaphore>,
 }
 
-/// The doors of a cell, which go away with their owner.
+/// Doors of a cell. Dropping this closes and removes them.
 pub struct Control {
     folder: PathBuf,
     beside: Option<PathBuf>,
@@ -73,10 +78,11 @@ pub struct Control {
 }
 
 impl Control {
-    /// Listens in a run folder. Where it is `watched`, a door that somebody takes away is told and made again.
+    /// Listens in a run folder. If `watched`, reports a door that was removed or replaced, and makes it again.
     ///
     /// # Errors
-    /// A folder in which no socket can be made, such as one with a name too long for the operating system; a pipe that another program has.
+    /// The folder cannot hold a socket, for example because its path is too long for the operating system; or another
+    /// program has the pipe.
     pub fn listen(
         folder: &Path,
         orders: mpsc::Sender<Ordered>,
@@ -96,10 +102,10 @@ impl Control {
         Ok(Self { folder: folder.to_owned(), beside: None, desk, changes, tasks })
     }
 
-    /// Listens at another place too, for the user of this program and root alone.
+    /// Listens also at a second place, for the user of this program and root only.
     ///
     /// # Errors
-    /// A place where no socket can be made.
+    /// No socket can be made at that place.
     pub fn listen_beside(&mut self, place: &Path) -> io::Result<()> {
         let Some(door) = Door::open_for_user(place)? else { return Ok(()) };
         self.beside = Some(place.to_owned());
@@ -108,11 +114,11 @@ impl Control {
         Ok(())
     }
 
-    /// Waits until the door in the run folder is gone, or made again.
+    /// Waits until the door in the run folder is lost or made again, and returns the change.
     pub async fn changed(&mut self) -> DoorChange {
         match self.changes.recv().await {
             Some(change) => change,
-            // Nobody watches it.
+            // The door is not watched.
             None => std::future::pending().await,
         }
     }
@@ -128,7 +134,7 @@ impl Drop for Control {
     }
 }
 
-/// Lets in who comes to a door, and to the one that is made in its place.
+/// Accepts the clients of a door, and of the door that replaces it.
 async fn attend(mut door: Door, mut made_again: mpsc::Receiver<Door>, desk: Desk) {
     loop {
         let caller = tokio::select! {
@@ -139,18 +145,19 @@ async fn attend(mut door: Door, mut made_again: mpsc::Receiver<Door>, desk: Desk
             }
         };
         let Ok(caller) = caller else {
-            // No descriptor is left, or the client has gone: that passes, and orders must get through when it has.
+            // No descriptor is left, or the client has gone. Both conditions pass, and orders must get through
+            // afterwards.
             tokio::time::sleep(BETWEEN_TRIES).await;
             continue;
         };
         let desk = desk.clone();
-        // A client that misbehaves hurts itself only.
+        // A client that misbehaves affects only its own task.
         tokio::spawn(async move { drop(serve(caller, desk).await) });
     }
 }
 
-/// Looks whether a door is still there, and makes it again where it is not. Disks are asked on a thread of their own: one that does not answer keeps
-/// nobody from an order.
+/// Checks periodically that a door still exists, and makes it again if not. Disk access runs on a thread of its own: a
+/// disk that does not answer blocks no order.
 async fn keep_in_place(mut mark: door::Mark, tell: mpsc::UnboundedSender<DoorChange>, hand_over: mpsc::Sender<Door>) {
     let mut looks = tokio::time::interval(BETWEEN_LOOKS);
     let mut is_lost = false;
@@ -163,7 +170,7 @@ async fn keep_in_place(mut mark: door::Mark, tell: mpsc::UnboundedSender<DoorCha
         let Ok((same, made)) = looked.await else { return };
         mark = same;
         let Some(made) = made else {
-            // It was moved away, and back.
+            // The door was moved away and back.
             if std::mem::take(&mut is_lost) {
                 let _ = tell.send(DoorChange::MadeAgain);
             }
@@ -182,7 +189,7 @@ async fn keep_in_place(mut mark: door::Mark, tell: mpsc::UnboundedSender<DoorCha
     }
 }
 
-/// Lets a client say what it wants, and gives it that.
+/// Reads the request of a client, and answers it.
 async fn serve(caller: Caller, desk: Desk) -> io::Result<()> {
     let Desk { orders, mut status, places } = desk;
     let peer = caller.actor()?;
@@ -191,7 +198,7 @@ async fn serve(caller: Caller, desk: Desk) -> io::Result<()> {
     let mut read = BufReader::new(read).take(LONGEST_LINE);
     tokio::time::timeout(PATIENCE, read.read_line(&mut text)).await??;
     if door::has_gone(read.get_ref().get_ref()) {
-        // This process stood still, and who asked has given up: an order that nobody waits for any more is not carried out.
+        // This process was suspended, and the client has given up. An order that nobody waits for is not executed.
         return Ok(());
     }
     let reply = match serde_json::from_str(&text) {
@@ -208,7 +215,7 @@ async fn serve(caller: Caller, desk: Desk) -> io::Result<()> {
     tell(&mut write, &reply).await
 }
 
-/// Hands an order over, and waits for what the cell says to it.
+/// Passes an order to the cell, and waits for its reply.
 async fn answer(
     request: Request,
     actor: Actor,
@@ -234,13 +241,14 @@ fn refusal(message: String, status: &watch::Receiver<Snapshot>) -> Reply {
     Reply { taken: false, message, status: status.borrow().clone() }
 }
 
-/// Tells how the cell is after every change, and at least so often that silence means that nobody is there.
+/// Sends the state of the cell after every change, and repeats it after [`MOST_BETWEEN_LINES`] without a change, so
+/// that silence means that the cell is gone.
 async fn told_on(write: &mut TellCaller, status: &mut watch::Receiver<Snapshot>) -> io::Result<()> {
     loop {
         let now = status.borrow_and_update().clone();
         tell(write, &Reply { taken: true, message: String::new(), status: now }).await?;
         tokio::time::sleep(LEAST_BETWEEN_LINES).await;
-        // Silence is as good a reason to tell it again as a change.
+        // A timeout sends the state again, as a change does.
         if let Ok(Err(_)) = tokio::time::timeout(MOST_BETWEEN_LINES, status.changed()).await {
             return Ok(());
         }
@@ -253,32 +261,33 @@ async fn tell(write: &mut TellCaller, reply: &Reply) -> io::Result<()> {
     tokio::time::timeout(PATIENCE, write.write_all(&text)).await?
 }
 
-/// Names the person for whom a program speaks; what that program says of them is told as its word.
+/// Returns the person for whom a program acts. The result also names the user of the program, because the name of the
+/// person is only that program's claim.
 fn on_behalf(peer: Actor, by: Option<OnBehalf>) -> Actor {
     let Some(by) = by else { return peer };
     let name = by.name.map_or(peer.name.clone(), |name| format!("{name}, by a program of {}", peer.name));
     Actor { name, station: format!("{} ({})", by.station, peer.station) }
 }
 
-/// Whether a run goes on in a folder: somebody listens to its orders.
+/// Returns true if a run is active in a folder: a cell listens for its orders.
 pub fn is_live(folder: &Path) -> bool {
     door::is_open(folder)
 }
 
-/// Whether a cell listens behind a door that does not lie in a run folder.
+/// Returns true if a cell listens on a door outside a run folder.
 pub fn is_live_at(place: &Path) -> bool {
     door::is_open_at(place)
 }
 
-/// Asks a running cell; blocks for its answer.
+/// Sends a request to a running cell, and blocks until its reply.
 ///
 /// # Errors
-/// No cell that runs in that folder, and one that does not answer.
+/// No cell runs in that folder, or it does not answer.
 pub fn ask(folder: &Path, request: &Request) -> io::Result<Reply> {
     ask_for(folder, request, None)
 }
 
-/// Asks a running cell on behalf of somebody else; blocks for its answer.
+/// Sends a request to a running cell on behalf of another person, and blocks until its reply.
 ///
 /// # Errors
 /// Those of [`ask`].
@@ -287,10 +296,10 @@ pub fn ask_for(folder: &Path, request: &Request, by: Option<OnBehalf>) -> io::Re
     Ok(serde_json::from_str(&text)?)
 }
 
-/// Asks the cell behind a door that does not lie in a run folder; blocks for its answer.
+/// Sends a request to the cell of a door outside a run folder, and blocks until its reply.
 ///
 /// # Errors
-/// No cell behind it, one of another user, and one that does not answer.
+/// No cell listens there, the door belongs to another user, or the cell does not answer.
 pub fn ask_at(place: &Path, request: &Request) -> io::Result<Reply> {
     let text = door::ask_at(place, &line(request, None)?, PATIENCE)?;
     Ok(serde_json::from_str(&text)?)
@@ -302,17 +311,17 @@ fn line(request: &Request, by: Option<OnBehalf>) -> io::Result<Vec<u8>> {
     Ok(text)
 }
 
-/// A running cell that is watched.
+/// Connection that watches a running cell.
 pub struct Watch {
     lines: Lines<BufReader<CellSays>>,
-    /// Held open: a cell that is no longer listened to stops telling.
+    /// Kept open: the cell stops sending when the client closes its end.
     _write: TellCell,
 }
 
-/// Begins to watch a running cell.
+/// Starts to watch a running cell.
 ///
 /// # Errors
-/// No cell that runs in that folder.
+/// No cell runs in that folder.
 pub async fn watch(folder: &Path) -> io::Result<Watch> {
     let (read, mut write) = door::knock(folder).await?;
     write.write_all(&line(&Request::Watch, None)?).await?;
@@ -320,10 +329,10 @@ pub async fn watch(folder: &Path) -> io::Result<Watch> {
 }
 
 impl Watch {
-    /// Waits for the next thing that the cell tells of itself; none where it has gone.
+    /// Waits for the next state of the cell, and returns it; `None` if the cell has closed the connection.
     ///
     /// # Errors
-    /// A cell that says nothing for too long, what nobody understands, or that it is watched by too many.
+    /// The cell is silent for too long, its line cannot be parsed, or too many clients watch already.
     pub async fn next(&mut self) -> io::Result<Option<Snapshot>> {
         let Some(text) = tokio::time::timeout(SILENCE, self.lines.next_line()).await?? else { return Ok(None) };
         let Reply { taken, message, status } = serde_json::from_str(&text)?;

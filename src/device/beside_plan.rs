@@ -1,47 +1,51 @@
-//! A measurement beside its plan: points that nobody can have touched by it.
+//! Comparison of a measurement with its plan: rejects points that the probe cannot have touched by this plan.
 
 use thiserror::Error;
 
 use crate::{Coordinates, Measurement, Plan, PointStatus, TargetKind};
 use regrind_core::geometry::{Point, Vector, fit_rigid};
 
-/// Why a measurement cannot be one by the plan.
+/// Reason why a measurement does not belong to the plan.
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum BesidePlan {
-    /// The points are those of the plan.
+    /// The points equal the points of the plan.
     #[error("it is the plan itself, to its last digit, and no measurement; export what was measured")]
     GivenBack,
-    /// Points that lie elsewhere than their targets, whatever pose the part has in its fixture.
+    /// Points that are too far from their targets, for every pose of the part in its fixture.
     #[error(
         "touched point {number} lies {off_mm:.3} mm from its target when all are laid on the plan, turned by {turned_deg:.1} degrees; at most {limit_mm:.1} mm \
          and {MOST_TURNED_DEG:.0} degrees can be: are the rows in the order of the plan, and is it the plan of this part?"
     )]
     Elsewhere {
-        /// Which of the touched points of the part, from 1.
+        /// Position of the worst point among the touched points of the part, from 1.
         number: usize,
-        /// How far it is from its target.
+        /// Distance of this point from its target after the rigid fit, in mm.
         off_mm: f64,
-        /// The most that can be.
+        /// Largest distance that is possible, in mm.
         limit_mm: f64,
-        /// The turn by which the plan fits the points best.
+        /// Rotation angle of the rigid motion that fits the points best, in degrees.
         turned_deg: f64,
     },
 }
 
-/// The part lies in its fixture: a plan that fits only when it is turned farther than this was measured in another order.
+/// Largest rotation that is plausible, because the part lies in its fixture. If the plan fits only with a larger
+/// rotation, the points were measured in another order.
 const MOST_TURNED_DEG: f64 = 30.0;
-/// Allowance beside approach and search for where a touch ends, in millimetres.
+/// Allowance in addition to approach and search for the place where a touch ends, in mm.
 const ASIDE_MM: f64 = 1.0;
-/// Points in another order have the size of the plan.
+/// Largest relative difference in size. A larger difference is not caused by the order of the points: points in another
+/// order have the size of the plan.
 const OTHER_SIZE: f64 = 0.02;
 
 impl Plan {
-    /// Holds a measurement by this plan against it, point by point.
+    /// Compares a measurement with this plan, point by point.
     ///
-    /// The points are laid on the plan by the rigid motion that fits best, so that it does not matter where the part lies.
+    /// A rigid best fit first moves the points onto the plan, so the position of the part does not matter. Only touched
+    /// points of the part are compared.
     ///
     /// # Errors
-    /// Points that are the planned ones to the last digit that they have, and points that are not where their targets are.
+    /// * [`BesidePlan::GivenBack`]: the points equal the planned points, to the last digit that they have.
+    /// * [`BesidePlan::Elsewhere`]: a point is too far from its target, or the fit needs too large a rotation.
     pub fn check(&self, measurement: &Measurement) -> Result<(), BesidePlan> {
         let pairs = measurement.points.iter().zip(&self.targets);
         let part = pairs.filter(|(p, t)| p.status == PointStatus::Touched && t.what == TargetKind::Part);
@@ -55,16 +59,16 @@ impl Plan {
         if is_given_back(&found, &contacts) || is_given_back(&found, &wanted) {
             return Err(BesidePlan::GivenBack);
         }
-        // Points of another size are in another unit or of another part, which others tell better.
+        // Points of another size have another unit or belong to another part. Other checks report that better.
         if (size(&found) / size(&wanted) - 1.0).abs() > OTHER_SIZE {
             return Ok(());
         }
-        // Fewer points, or points on a line, fix no pose.
+        // Fewer than three points, or points on a line, determine no pose.
         let Ok(fit) = fit_rigid(&wanted, &found) else { return Ok(()) };
         let off_mm = fit.residuals_mm.iter().map(Vector::norm).enumerate();
         let Some((worst, off_mm)) = off_mm.max_by(|a, b| a.1.total_cmp(&b.1)) else { return Ok(()) };
         let limit_mm = self.search_mm + self.approach_mm + ASIDE_MM;
-        // Points almost on a line turn about it by their scatter alone.
+        // If the points are almost on a line, noise alone can cause a rotation about this line.
         let turned_deg = if is_strip(&wanted) { 0.0 } else { fit.pose.angle_rad().to_degrees() };
         if off_mm <= limit_mm && turned_deg <= MOST_TURNED_DEG {
             return Ok(());
@@ -73,14 +77,15 @@ impl Plan {
     }
 }
 
-/// How far points lie from their middle, by root mean square.
+/// Returns the root mean square distance of points from their centroid, in mm.
 fn size(points: &[Point]) -> f64 {
     let count = points.len().max(1) as f64;
     let middle = points.iter().map(|p| p.coords).sum::<Vector>() / count;
     (points.iter().map(|p| (p.coords - middle).norm_squared()).sum::<f64>() / count).sqrt()
 }
 
-/// Whether points lie almost on a line: to one side of it they spread by less than a tenth of what they do along it.
+/// Returns true if points lie almost on a line: their largest distance from it is at most a tenth of the longest
+/// distance from their centroid.
 fn is_strip(points: &[Point]) -> bool {
     const LEAST_SHARE: f64 = 0.1;
     let count = points.len().max(1) as f64;
@@ -93,15 +98,17 @@ fn is_strip(points: &[Point]) -> bool {
     aside2 <= LEAST_SHARE * LEAST_SHARE * longest2
 }
 
-/// Whether points are the planned ones, rounded to the digits that they have: no touch ends where it was planned in all of them.
+/// Returns true if points equal the planned points, rounded to the digits that they have. In a real measurement at
+/// least one touch ends somewhere else than planned.
 fn is_given_back(found: &[Point], planned: &[Point]) -> bool {
-    /// Fewer may be alike by chance.
+    /// Minimum number of points; fewer can agree by chance.
     const LEAST: usize = 3;
     let is_same = |(p, q): (&Point, &Point)| p.iter().zip(q.iter()).all(|(p, q)| (p - q).abs() <= rounding_mm(*p));
     found.len() >= LEAST && found.iter().zip(planned).all(is_same)
 }
 
-/// By how much a coordinate may have been rounded, by its decimals: a file of so many significant digits has more of them in small values.
+/// Returns the largest rounding error of a coordinate in mm, from its number of decimals. A file with a fixed number of
+/// significant digits has more decimals in small values.
 fn rounding_mm(value_mm: f64) -> f64 {
     const DECIMALS: std::ops::RangeInclusive<i32> = 3..=9;
     let has = |decimals: &i32| {
@@ -117,7 +124,7 @@ mod tests {
     use super::*;
     use crate::{MeasuredPoint, Target};
 
-    /// 5 by 4 targets of a bowl, 8 mm apart.
+    /// Returns a plan of 5 by 4 targets on a bowl, 8 mm apart.
     fn plan() -> Plan {
         let target = |k: u32| {
             let (x, y) = (8.0 * f64::from(k % 5) - 16.0, 8.0 * f64::from(k / 5) - 12.0);
@@ -151,7 +158,7 @@ mod tests {
         }
     }
 
-    /// Touches at a plan's targets, `error_mm` off along the normal, in another order.
+    /// Returns touches at the targets of a plan, in the given order. Each is `error_mm` off along the normal.
     fn measured(
         plan: &Plan,
         digits: i32,
@@ -173,7 +180,7 @@ mod tests {
         let plan = plan();
         for digits in [3, 4, 6, 9] {
             assert_eq!(plan.check(&measured(&plan, digits, |_| 0.0, |k| k)), Err(BesidePlan::GivenBack), "{digits}");
-            // A part that is off by a few of its digits somewhere was touched.
+            // If a point is off by a few units of its last digit, the part was measured.
             let part = |k: usize| if k == 7 { 5.0 * 10f64.powi(-digits) } else { 0.0 };
             assert_eq!(plan.check(&measured(&plan, digits, part, |k| k)), Ok(()), "{digits}");
         }
@@ -185,7 +192,7 @@ mod tests {
         };
         let given_back = measurement(plan.targets.iter().map(contacts).collect(), Coordinates::Contacts);
         assert_eq!(plan.check(&given_back), Err(BesidePlan::GivenBack));
-        // To seven significant digits, as many programs print: five decimals beside six.
+        // Seven significant digits, as many programs print: some values have five decimals, others six.
         let significant = |v: f64| -> f64 {
             let decimals = 6 - v.abs().max(1e-6).log10().floor() as i32;
             (v * 10f64.powi(decimals)).round() / 10f64.powi(decimals)
@@ -202,7 +209,7 @@ mod tests {
         let plan = plan();
         let form = |k: usize| 1e-3 * (k as f64).sin();
         assert_eq!(plan.check(&measured(&plan, 6, form, |k| k)), Ok(()));
-        // A row that is missing moves all behind it, a file that was turned over has the last point first, and two rows were exchanged.
+        // A missing row shifts all rows after it, a reversed file has the last point first, and two rows are exchanged.
         let orders: [&dyn Fn(usize) -> usize; 3] = [&|k| (k + 1) % 20, &|k| 19 - k, &|k| {
             if k == 3 {
                 12
@@ -216,12 +223,13 @@ mod tests {
             let found = plan.check(&measured(&plan, 6, form, order));
             assert!(matches!(found, Err(BesidePlan::Elsewhere { .. })), "{found:?}");
         }
-        // Three in a row that are touched again, the middle one on a burr higher than the row is bent: about their line they turn over.
+        // Three points in a row are touched again. The middle one has a burr that is higher than the row is bent, so
+        // the fit rotates the row about its own line.
         let mut row = plan.clone();
         row.targets = row.targets[5..8].to_vec();
         let burr = |k: usize| if k == 1 { 0.6 } else { 1e-3 * k as f64 };
         assert_eq!(row.check(&measured(&row, 6, burr, |k| k)), Ok(()));
-        // Inches are told by what is measured of a sphere or by the fit.
+        // Inches are reported by the measurement of a sphere or by the fit.
         let mut inches = measured(&plan, 6, form, |k| k);
         inches.points.iter_mut().for_each(|point| point.at_mm = point.at_mm.map(|v| v / 25.4));
         assert_eq!(plan.check(&inches), Ok(()));

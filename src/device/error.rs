@@ -1,116 +1,121 @@
-//! What can go wrong with a machine: could not talk, or was told no.
+//! Errors of a machine: the communication failed, or the machine refused.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use super::{Answer, Command, Fault, Job, MachineKind, State};
 
-/// What a machine answered, or why there is no answer.
+/// Answer of a machine, or the reason why there is no answer.
 pub(super) type Answered<T> = Result<T, DeviceError>;
 
-/// Why a machine could not be asked, or what it refused.
+/// Error of the communication with a machine, or refusal by the machine.
 ///
-/// [`DeviceError::is_link`] parts the two layers. Nothing here ever means "the job was not begun", save where a variant says so.
+/// [`DeviceError::is_link`] separates the two layers. No error means "the job was not begun", except where a variant
+/// says so.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[expect(missing_docs, reason = "the message of each tells what its fields are")]
 #[non_exhaustive]
 pub enum DeviceError {
-    // ---- could not talk ----------------------------------------------------------------------------------------------------------
-    /// There is no connection, and none could be made in time.
+    // ---- communication failed
+    // ----------------------------------------------------------------------------------------------------
+    /// There is no connection, and none could be made within the time limit.
     #[error(
         "{machine} cannot be reached ({}) within {} ms: check that it is switched on, its cable, and address and port in the cell file",
         kind_in_words(*.why), .limit.as_millis()
     )]
     Unreachable { machine: Arc<str>, why: std::io::ErrorKind, limit: Duration },
-    /// The connection is there, but no answer came.
+    /// The connection exists, but no answer arrived in time.
     #[error(
         "{machine} did not answer ({what}) within {} ms: check the line and its load, unit number and, on a serial line, baud rate and \
          parity",
         .limit.as_millis()
     )]
     TimedOut { machine: Arc<str>, what: &'static str, limit: Duration },
-    /// The machine or something between closed the connection.
+    /// The machine, or a device between, closed the connection.
     #[error(
         "{machine} closed the connection ({what}): another client may have taken its only place, or it was restarted"
     )]
     Disconnected { machine: Arc<str>, what: &'static str },
-    /// What came does not add up: wrong length, echo, check number, or page.
+    /// The received data are inconsistent: wrong length, echo, checksum or page.
     #[error(
         "{machine} sent a {what} that does not hold: expected {expected:#x}, found {found:#x}; nothing of it was used. If it happens \
          again check cable, shielding and end resistors, and that no second client is on the line"
     )]
     Corrupt { machine: Arc<str>, what: &'static str, expected: u64, found: u64 },
-    /// The connection is alive, the machine's application is not.
+    /// The connection works, but the machine's application has stopped.
     #[error(
         "{machine} answers, but its application stands: its beat has been {beat} for {} ms (limit {} ms). Look at the machine; what it \
          says cannot be relied on",
         .still.as_millis(), .limit.as_millis()
     )]
     Frozen { machine: Arc<str>, beat: u16, still: Duration, limit: Duration },
-    /// A command was written several times and never acknowledged, and it is known that the machine did not act upon it later than this.
+    /// A command was written several times and never acknowledged. The driver knows that the machine did not act upon
+    /// it later.
     #[error(
         "{machine} did not acknowledge {command} number {sequence} (its last is {acknowledged}) after {tries} tries: its application may \
          stand, or its program does not follow docs/modbus.md"
     )]
     NotAcknowledged { machine: Arc<str>, command: Command, sequence: u32, acknowledged: u32, tries: u32 },
-    /// It cannot be told whether the job was begun. Never repeated; see [`Machine::reconcile`](super::Machine::reconcile).
+    /// It is unknown whether the job was begun. The start is never repeated; see
+    /// [`Machine::reconcile`](super::Machine::reconcile).
     #[error(
         "{machine}: it is not known whether {job} was begun by START number {sequence} ({why}). It is not sent again; the machine has to \
          be asked, or looked at"
     )]
     StartUnknown { machine: Arc<str>, job: Job, sequence: u32, why: Box<DeviceError> },
-    /// The transfer was broken off by its [`Interrupt`](super::Interrupt).
+    /// The transfer was interrupted by its [`Interrupt`](super::Interrupt).
     #[error(
         "{machine}: the transfer of the {what} was broken off after {done} of {of} pages, as asked; nothing of it is in force"
     )]
     Interrupted { machine: Arc<str>, what: &'static str, done: u32, of: u32 },
-    /// The driver was asked before [`Machine::connect`](super::Machine::connect).
+    /// The driver was used before [`Machine::connect`](super::Machine::connect).
     #[error("{machine} was asked ({what}) before it was connected")]
     NotConnected { machine: Arc<str>, what: &'static str },
 
-    /// The right kind of machine, but not the one that the cell file names.
+    /// The machine is of the right kind, but it is not the one that the cell file names.
     #[error(
         "{machine} calls itself {found:?}, and the cell file expects {expected:?}: check address and port, or correct expected_name"
     )]
     WrongName { machine: Arc<str>, expected: String, found: String },
-    /// A simulation where the cell file has a real machine, or the other way round.
+    /// The machine is a simulation and the cell file has a real machine, or the reverse.
     #[error(
         "{machine} says that it is {}, and the cell file says simulated = {}: nothing was sent to it. Check address and port, or correct \
          cell.simulated",
         if *.simulation { "a simulation" } else { "a real machine" }, !.simulation
     )]
     WrongReality { machine: Arc<str>, simulation: bool },
-    /// A person's word was given for a machine that needs none.
+    /// An operator confirmation was given for a machine that needs none.
     #[error("{machine} tells itself when a job begins and ends; nothing is confirmed by hand")]
     TellsItself { machine: Arc<str> },
-    /// A person's word did not say which map the machine works by.
+    /// An operator confirmation did not name the map with which the machine works.
     #[error("{machine} takes a word only with the map that it is about: --map and the first 8 digits of it, or more")]
     MapUnnamed { machine: Arc<str> },
-    /// A file that a person named is not the measurement that was asked for, or could not be kept.
+    /// A file that the operator named is not the requested measurement, or it could not be stored.
     #[error("{machine}: {why}")]
     NotTaken { machine: Arc<str>, why: String },
 
-    /// A line came that means nothing, or belongs to nothing.
+    /// The machine sent a line that has no meaning, or that belongs to no request.
     #[error(
         "{machine} sent a line that cannot be used ({why}): {line:?}; nothing of it was used and the connection was given up. If it happens \
          again compare the server's version of I++ DME with docs/ippdme.md"
     )]
     Unreadable { machine: Arc<str>, line: String, why: &'static str },
 
-    /// A line would not be one plain line of the machine's protocol.
+    /// A line to send would not be one plain line of the protocol of the machine.
     #[error("{machine}: {what} would hold what is no plain character, and was not sent: correct the cell file")]
     Unsendable { machine: Arc<str>, what: &'static str },
-    /// Another client has taken control; the machine does not tell which.
+    /// Another client has taken control; the machine does not say which client.
     #[error(
         "{machine} is controlled by another client now: find out who commands it, and have that one let it go. It is not taken back but by an          abort, or by a run that is taken up again"
     )]
     ControlTaken { machine: Arc<str> },
 
-    /// The folders that stand for the machine cannot be read or written, or hold something that must not be touched.
+    /// The folders of a machine cannot be read or written, or they contain something that must not be changed.
     #[error("{machine}: {why}")]
     Folder { machine: Arc<str>, why: String },
 
-    // ---- was told no, or the wrong thing -----------------------------------------------------------------------------------------
+    // ---- refused, or wrong content
+    // -----------------------------------------------------------------------------------------------
     /// The machine refused a command.
     #[error("{machine} refused {command} in {state}: {answer}")]
     Refused { machine: Arc<str>, command: Command, answer: Answer, state: State },
@@ -120,36 +125,36 @@ pub enum DeviceError {
     /// The machine refused a payload.
     #[error("{machine} refused the {what}: {answer}")]
     PayloadRefused { machine: Arc<str>, what: &'static str, answer: Answer },
-    /// A Modbus exception; addresses count from 0.
+    /// The machine answered with a Modbus exception. Addresses count from 0.
     #[error(
         "{machine} is there and answered exception {code} ({}) to {what} at register {address}: {}",
         exception_in_words(*.code), exception_remedy(*.code)
     )]
     Exception { machine: Arc<str>, what: &'static str, address: u16, code: u8 },
-    /// Something answers that is not a machine of this kind; the register at this address, counted from 0, gave it away.
+    /// The device that answers is not a machine of this kind. The register at this address, counted from 0, shows it.
     #[error(
         "{machine} is not a {expected} of a Regrind cell: register {address} holds {found:#06x}, {required:#06x} was expected. Check \
          address, port and unit number in the cell file, and the base of the identity block; nothing was written to it"
     )]
     WrongDevice { machine: Arc<str>, expected: MachineKind, address: u16, required: u16, found: u16 },
-    /// The identity block of the map, found otherwise than it must be: bytes exchanged, or addresses off by one.
+    /// The identity block of the map has a wrong layout: exchanged bytes, or addresses off by one.
     #[error("{machine} answers with the identity block of this map, {how}; nothing was written to it")]
     OtherLayout { machine: Arc<str>, how: std::borrow::Cow<'static, str> },
-    /// The cell file names the machine as one kind, and it is the other.
+    /// The cell file names one kind of machine, and this is the other kind.
     #[error(
         "{machine} is a {found}, and the cell file has it as the {expected}: the two addresses may be exchanged; nothing was written to it"
     )]
     WrongKind { machine: Arc<str>, expected: MachineKind, found: MachineKind },
-    /// The sentinels read right in the other word order, or in none.
+    /// The sentinels are correct in the other word order, or in none.
     #[error(
         "{machine} sends its words in another order than the cell file says (word_order = \"{configured}\"): {}; nothing was written to it",
         match .fits { Some(order) => format!("write word_order = \"{order}\""), None => "neither \"big\" nor \"little\" fits its sentinels".into() }
     )]
     WrongWordOrder { machine: Arc<str>, configured: &'static str, fits: Option<&'static str> },
-    /// The machine speaks another version of the map.
+    /// The machine uses another version of the map.
     #[error("{machine} speaks version {found} of the register map, this program version {required}: {}; nothing was written to it", version_in_words(*.found, *.required))]
     WrongVersion { machine: Arc<str>, required: u16, found: u16 },
-    /// The machine has another owner than this client, or none (0).
+    /// Another client than this one owns the machine, or no client does (0).
     #[error(
         "{machine} belongs to {}",
         match .owner {
@@ -158,31 +163,31 @@ pub enum DeviceError {
         }
     )]
     Taken { machine: Arc<str>, ours: u32, owner: u32 },
-    /// The machine works in inches (unit code 2), or does not say what it works in (1 is mm).
+    /// The machine works in inches (unit code 2), or gives no known unit (1 is mm).
     #[error("{machine} gives lengths in {}, and this program takes millimetres only: set the machine to millimetres", if *.unit == 2 { "inches" } else { "an unknown unit" })]
     Inches { machine: Arc<str>, unit: u16 },
-    /// The machine was restarted behind our back.
+    /// The machine was restarted without our knowledge.
     #[error(
         "{machine} was restarted (boot id {was:08x}, now {is:08x}): what it was doing is not known; look at the machine, then connect anew"
     )]
     Restarted { machine: Arc<str>, was: u32, is: u32 },
-    /// A number came that is none.
+    /// A received value is not a finite number.
     #[error(
         "{machine}: {field} is {value}, which is not a finite number; refused. The machine's program has not filled it in, or has put its words \
          in another order than the one of its sentinels (docs/modbus.md)"
     )]
     NotFinite { machine: Arc<str>, field: String, value: f64 },
-    /// A number came that cannot be.
+    /// A received value is outside its possible range.
     #[error(
         "{machine}: {field} is {value} {unit}, allowed is {least} to {most} {unit}: check scale, type and word order in the cell file, and the sensor"
     )]
     OutOfRange { machine: Arc<str>, field: String, value: f64, least: f64, most: f64, unit: String },
-    /// A code came that the contract does not have.
+    /// A received code is not in the contract.
     #[error(
         "{machine}: {field} is {found}, which docs/modbus.md does not list: the machine's program does not follow it"
     )]
     Unlisted { machine: Arc<str>, field: &'static str, found: u32 },
-    /// There are more or fewer than there should be.
+    /// The number of elements is not the expected one.
     #[error("{machine}: {found} {what}, {expected} were expected; nothing of it was used")]
     Count { machine: Arc<str>, what: &'static str, expected: u64, found: u64 },
     /// The machine holds something else than was sent, or something of another job.
@@ -190,32 +195,32 @@ pub enum DeviceError {
         "{machine}: {field} is {held:#x} at the machine, {sent:#x} here: it would work on something else than was meant. Load it again"
     )]
     Mismatch { machine: Arc<str>, field: &'static str, sent: u64, held: u64 },
-    /// A result was asked for when there is none.
+    /// A result was requested, but there is none.
     #[error(
         "{machine} is in {state} and has no finished result of {job}: a result stands from COMPLETE until it is acknowledged"
     )]
     NoResult { machine: Arc<str>, job: Job, state: State },
-    /// A server of I++ DME refused a method by its number.
+    /// An I++ DME server refused a method with an error number.
     #[error("{machine} refused {method} with {error}; look at the machine's own panel, then clear")]
     MethodRefused { machine: Arc<str>, method: &'static str, error: crate::ippdme::ServerError },
-    /// A server of I++ DME did not tell what it was asked.
+    /// An I++ DME server did not return the requested value.
     #[error("{machine} was asked {method} and did not tell {missing}: nothing is taken in its place")]
     Untold { machine: Arc<str>, method: &'static str, missing: &'static str },
-    /// A server of I++ DME does not know the tool of the cell file.
+    /// An I++ DME server does not know the tool that the cell file names.
     #[error("{machine} has no tool {tool:?}; it has {known}: correct cmm.wire.tool")]
     NoTool { machine: Arc<str>, tool: String, known: String },
-    /// The machine's probe is another than the plan's.
+    /// The probe of the machine is not the probe of the plan.
     #[error(
         "{machine} says that the tool {tool:?} has a radius of {told_mm} mm, the plan is made for {plan_mm} mm; they may differ by {limit_mm} mm: \
          qualify the probe, or correct the tool in the cell file or the radius in the recipe"
     )]
     ProbeRadius { machine: Arc<str>, tool: String, told_mm: f64, plan_mm: f64, limit_mm: f64 },
-    /// A property was set, and another value is in force.
+    /// A property was set, but another value is in force.
     #[error(
         "{machine} was told to keep {property} at {wanted} and says that it is {told}: correct the recipe or the cell file"
     )]
     NotSet { machine: Arc<str>, property: String, wanted: f64, told: f64 },
-    /// A plan leads the probe out of the machine's volume; told before anything moves.
+    /// A plan moves the probe out of the volume of the machine. This is checked before anything moves.
     #[error(
         "{machine}: the {what} target {target} leads the probe's centre to {axis} = {value_mm} mm, and [cmm.travel] allows {least_mm} to {most_mm} \
          mm; nothing was moved. Move the part in [cmm.fixture], lower measure.safe_height_mm, or correct [cmm.travel]"
@@ -237,22 +242,23 @@ pub enum DeviceError {
     /// A controller refused a password.
     #[error("{machine} refused the password: correct grinder.wire.{key}, or the options of linuxcncrsh (-w, -e)")]
     Password { machine: Arc<str>, key: &'static str },
-    /// A machine that is not ready for a job, and that only a person can make ready.
+    /// The machine is not ready for a job, and only a person can make it ready.
     #[error("{machine} is not ready: {why}")]
     Unready { machine: Arc<str>, why: &'static str },
     /// A controller reported errors.
     #[error("{machine} reports, when {what}: {errors}")]
     Reports { machine: Arc<str>, what: &'static str, errors: String },
-    /// A payload was given to the driver that no machine could take.
+    /// The driver was given a payload that no machine could accept.
     #[error("{machine}: the {what} cannot be sent: {field} is {value}, allowed is {limit}")]
     BadPayload { machine: Arc<str>, what: &'static str, field: String, value: f64, limit: &'static str },
 }
 
-/// Modbus exceptions of a machine that is busy, of a gateway that finds nobody, of a memory error.
+/// Modbus exception codes: the machine is busy, the gateway finds no machine, memory error.
 const BUSY: [u8; 6] = [4, 5, 6, 8, 10, 11];
 
 impl DeviceError {
-    /// Whether it is the talking that failed, so that the machine itself may be as well as before. The other layer is a clear *no*.
+    /// Returns true if the communication failed, so that the machine itself may be unaffected. Any other error is a
+    /// clear refusal.
     pub fn is_link(&self) -> bool {
         self.is_busy()
             || matches!(
@@ -271,13 +277,14 @@ impl DeviceError {
             )
     }
 
-    /// Whether the machine, or what stands between, answers that it cannot do it just now: asked again it may go well.
+    /// Returns true if the machine, or a device between, answers that it cannot do the request now. A retry may
+    /// succeed.
     pub(super) fn is_busy(&self) -> bool {
         matches!(self, Self::Exception { code, .. } if BUSY.contains(code))
     }
 }
 
-/// Says what a machine of another version lacks, and what is to be done.
+/// Returns in words which functions a machine of another version lacks, and how to correct it.
 fn version_in_words(found: u16, required: u16) -> String {
     if found > required {
         return "this program is the older one: bring it up to date, for what the newer map means is not known here"
@@ -300,7 +307,7 @@ fn kind_in_words(kind: std::io::ErrorKind) -> String {
     kind.to_string()
 }
 
-/// Says what is to be done about a Modbus exception.
+/// Returns in words how to correct the cause of a Modbus exception.
 fn exception_remedy(code: u8) -> &'static str {
     match code {
         1..=3 => {

@@ -1,19 +1,19 @@
-//! What a driver keeps of jobs for a machine that knows of none, and that loses them with this program.
+//! Job memory of a driver, for a machine that has no memory of jobs. The memory ends with this program.
 
 use std::sync::Arc;
 
 use crate::words::{Armed, Job};
 
-/// The jobs of such a machine; `Load` is what lies ready for the next one.
+/// Job memory; `Load` is the type of the payload that is loaded for the next job.
 #[derive(Debug)]
 pub(crate) struct Kept<Load> {
-    /// What lies ready, and its digest.
+    /// Loaded payload and its digest.
     pub(crate) loaded: Option<(Arc<Load>, u32)>,
-    /// The job of an interrupted run, of which nothing is here but its number.
+    /// Unresolved job of an interrupted run with its start number. Nothing else is known of it.
     pub(crate) untold: Option<(Job, u32)>,
-    /// The last job that was begun.
+    /// Number of the last start.
     pub(crate) begun: u32,
-    /// Points of the present job that were told before its end.
+    /// Number of points of the present job that were reported before its end.
     pub(crate) told_ahead: usize,
 }
 
@@ -22,19 +22,21 @@ impl<Load> Kept<Load> {
         Self { loaded: None, untold: None, begun: 0, told_ahead: 0 }
     }
 
-    /// Takes in what an interrupted run had begun: it is not begun again, and nobody has told what became of it.
+    /// Restores a job that an interrupted run had begun. It is not begun again, and its outcome is not reported yet.
     pub(crate) fn restore(&mut self, intended: &Armed) {
         self.untold = Some((intended.job, intended.start_sequence));
         self.begun = self.begun.max(intended.start_sequence);
     }
 
-    /// Returns what lies ready for a job. The cell prepares another only behind the end of what was untold.
+    /// Returns the payload that is loaded for a job and forgets the unresolved job. The cell prepares another job only
+    /// after it has resolved that one.
     pub(crate) fn ready_for(&mut self, job: Job) -> Option<Arc<Load>> {
         self.untold = None;
         self.loaded.as_ref().filter(|(_, digest)| *digest == job.digest).map(|(load, _)| Arc::clone(load))
     }
 
-    /// Numbers a job that is prepared. Such a machine has neither a word of a preparation nor a number of its own.
+    /// Returns the armed start of a prepared job, with the next start number. The machine has no token and no boot id,
+    /// so both are 0.
     pub(crate) fn prepared(&mut self, job: Job) -> Armed {
         self.told_ahead = 0;
         Armed { job, start_sequence: self.begun + 1, token: 0, boot_id: 0 }

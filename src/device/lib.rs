@@ -1,26 +1,28 @@
-//! Bytes and machines: the two traits behind which a measuring machine and a grinder stand, and the words spoken across them.
+//! Machine drivers: the two traits of a measuring machine and of a grinder, and the types that they exchange.
 //!
-//! The cell decides, this room acts. A driver knows one wire: it proves that the right machine is at the far end, carries payloads there
-//! and reads them back, gives commands that are values and not pulses, and tells the two kinds of failure apart: *could not talk* and
-//! *was told no*. A driver never guesses. When it cannot tell whether a motion was begun it says [`DeviceError::StartUnknown`], and
-//! [`Machine::reconcile`] later asks the machine itself.
+//! The cell decides, this crate acts. A driver knows one wire. It proves that the right machine is at the far end,
+//! carries payloads there and reads them back, and gives commands that are values and not pulses. It distinguishes two
+//! kinds of failure: *the communication failed* and *the machine refused*. A driver never guesses. If it cannot
+//! determine whether a motion was begun, it returns [`DeviceError::StartUnknown`], and [`Machine::reconcile`] later
+//! asks the machine itself.
 //!
-//! A job runs like this, whatever the wire:
+//! A job runs as follows, whatever the wire:
 //!
 //! ```text
-//! connect -> claim -> load_plan / load_pass -> prepare -> (journal the Armed, synced) -> start -> status ... -> collect
-//!         -> (journal the result) -> acknowledge
+//! connect -> claim -> load_plan / load_pass -> prepare -> (journal the Armed, synced) -> start -> status ...
+//!         -> collect -> (journal the result) -> acknowledge
 //! ```
 //!
-//! Everything is in millimetres, seconds and degrees Celsius, and no number that is not finite comes through. This room knows nothing of
-//! recipes, cells, surfaces or journals. What a machine cannot tell is unknown, and is never filled in here.
+//! All values are in millimetres, seconds and degrees Celsius. No number that is not finite passes. This crate knows
+//! nothing of recipes, cells, surfaces or journals. A value that a machine cannot report is unknown, and is never
+//! filled in here.
 //!
-//! A driver is a folder of this room and a line in [`table`](self::Wire): the folder owns what a cell file says of it ([`Wired`]), how
-//! that is checked, and the machines that are made of it.
+//! A driver is a folder of this crate and a line in [`table`](self::Wire). The folder owns the table `wire` of a cell
+//! file ([`Wired`]), its checks, and the machines that are made from it.
 //!
-//! One value of a driver is used by one task. Its futures may be dropped at any `.await`: a request that is on its way is finished and
-//! its answer forgotten, the connection stays in order (but a `start` that is dropped has to be reconciled). To break off a long transfer
-//! politely raise its [`Interrupt`].
+//! One value of a driver is used by one task. Its futures may be dropped at any `.await`: a request that is under way
+//! is completed, its answer is discarded, and the connection stays valid. A `start` that is dropped has to be
+//! reconciled. To interrupt a long transfer in order, raise its [`Interrupt`].
 
 mod beside_plan;
 mod error;

@@ -1,4 +1,4 @@
-//! The two traits, and what both machines have in common.
+//! The traits of the two machines, and their common part.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -8,93 +8,98 @@ use super::error::DeviceError;
 use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan, Preliminary};
 use super::words::{Armed, Identity, Job, Reconciled, Started, Status, Word};
 
-/// What every machine of a cell can be asked, whatever its wire.
+/// Operations of every machine of a cell, whatever its wire.
 ///
-/// The commands come back when the machine has *acknowledged* them, with the status that says so; where they lead (HOLDING to HELD,
-/// ABORTING to ABORTED) is seen by asking [`Machine::status`] again.
+/// A command returns when the machine has *acknowledged* it, with the status that shows this. The state that follows
+/// (HOLDING to HELD, ABORTING to ABORTED) is seen by calling [`Machine::status`] again.
 pub trait Machine: Send {
-    /// The name by which messages call this machine, for example `cmm at 10.0.0.5:502, unit 1`.
+    /// Returns the name of this machine in messages, for example `cmm at 10.0.0.5:502, unit 1`.
     fn name(&self) -> &str;
 
-    /// What a person should know of this machine now, beyond its status: what is waited for, which files were left alone and why.
-    /// Nothing for a machine that tells everything by its status.
+    /// Returns notes for a person in addition to the status: which files are awaited, which files were ignored and why.
+    /// Empty for a machine that reports everything in its status.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// Opens the wire and proves that the machine at its far end is the one that is meant, before anything is written to it.
+    /// Opens the wire and proves that the machine at its far end is the intended one, before anything is written to it.
     fn connect(&mut self) -> impl Future<Output = Result<Identity, DeviceError>> + Send;
 
-    /// What the machine says of itself now. Asking also tells the machine that its client is alive, so ask twice a second or more.
+    /// Returns the present status of the machine. The request also shows the machine that its client is alive, so call
+    /// it twice a second or more.
     fn status(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Takes in what an interrupted run had prepared and may have started. For machines that keep no memory of their own: until somebody has
-    /// told what became of it they are taken as ones that may move.
+    /// Restores a start that an interrupted run had prepared and may have given. For machines that have no memory of
+    /// their own: until a person confirms the outcome, such a machine counts as one that may move.
     fn restore(&mut self, _intended: &Armed) {}
 
     /// Makes this client the owner of the machine.
     fn claim(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Has the machine check its payloads and interlocks for a job. Nothing moves. Journal what comes back before giving it to
-    /// [`Machine::start`].
+    /// Lets the machine check its payloads and interlocks for a job. Nothing moves. Journal the returned `Armed` before
+    /// you pass it to [`Machine::start`].
     fn prepare(&mut self, job: Job) -> impl Future<Output = Result<Armed, DeviceError>> + Send;
 
-    /// Begins the job, at most once. An `Armed` is used up by this, however it ends.
+    /// Begins the job, at most once. The call uses the `Armed` up, whatever its result.
     ///
-    /// * `Ok`: the machine says that this very START has begun the job.
-    /// * [`DeviceError::Refused`]: the machine, or its state before anything was sent, said no; the job was not begun by it. Prepare anew.
-    /// * [`DeviceError::StartUnknown`], or the future dropped: nobody knows. Only [`Machine::reconcile`] can tell what became of it.
-    /// * Anything else comes from before the START: for an `Armed` that is used for the first time nothing was begun.
+    /// * `Ok`: the machine confirms that this START has begun the job.
+    /// * [`DeviceError::Refused`]: the machine refused, or its state before anything was sent did not allow a start.
+    ///   This START did not begin the job. Prepare again.
+    /// * [`DeviceError::StartUnknown`], or the future was dropped: the outcome is unknown. Only [`Machine::reconcile`]
+    ///   can determine it.
+    /// * Any other error occurs before the START is sent: if the `Armed` is used for the first time, nothing was begun.
     fn start(&mut self, armed: Armed) -> impl Future<Output = Result<Started, DeviceError>> + Send;
 
-    /// Stops at the next safe place, wheel or probe clear.
+    /// Stops at the next safe place, with the wheel or probe clear of the part.
     fn hold(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Goes on after a hold.
+    /// Continues after a hold.
     fn resume(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
     /// Ends the job in order, clear of the part.
     fn stop(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Ends at once; only the safe sequence is run. Needs no ownership.
+    /// Ends the job at once; only the safe sequence runs. Needs no ownership.
     fn abort(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
     /// Leaves ABORTED or FAULTED for IDLE.
     fn clear(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Says that the result with this `done` number is safe with the client and may be forgotten.
+    /// Reports to the machine that the client has stored the result with this `done` number, so that the machine may
+    /// forget it.
     fn acknowledge(&mut self, done: u32) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Gives the machine back.
+    /// Gives up the ownership of the machine.
     fn release(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
-    /// Asks the machine what became of a start whose outcome is not known: after a lost connection, or after this client was restarted
-    /// and has found the intent in its journal. Moves nothing. Takes a second or more when the answer is "not started", for that has to
-    /// be seen twice.
+    /// Determines from the machine the outcome of a start that is unknown: after a lost connection, or after a restart
+    /// of this client that found the intent in its journal. Moves nothing. Takes a second or more if the answer is "not
+    /// started", because that must be seen twice.
     fn reconcile(&mut self, intended: &Armed) -> impl Future<Output = Result<Reconciled, DeviceError>> + Send;
 
-    /// Takes a person's word about a machine that cannot tell itself; any other refuses. Returns what of it was kept, by its path in the
-    /// folder of the run.
+    /// Accepts an operator confirmation for a machine that cannot report the fact itself. Every other machine refuses.
+    /// Returns the paths of the files that were kept, relative to the folder of the run.
     fn confirm(&mut self, _word: Word) -> impl Future<Output = Result<Vec<String>, DeviceError>> + Send {
         let machine: Arc<str> = Arc::from(self.name());
         async move { Err(DeviceError::TellsItself { machine }) }
     }
 }
 
-/// A machine that measures.
+/// Measuring machine.
 pub trait Cmm: Machine {
-    /// Carries the plan to the machine and proves that it is what the machine would use.
+    /// Transfers the plan to the machine and proves that the machine would use it.
     fn load_plan(&mut self, plan: &Plan, interrupt: &Interrupt)
     -> impl Future<Output = Result<(), DeviceError>> + Send;
 
-    /// Reads on a little in what the machine gives of the points of this job while it still runs, where it gives that. Ask after a look at
-    /// the status, when nothing else is to be asked: it takes a moment, at most one step between two looks, and breaks off where the
-    /// flag is raised. Returns the points that are new, if there are any; what goes wrong is seen by the next look.
+    /// Reads a few preliminary points of this job while it still runs, if the machine offers them. Call it after a
+    /// status, when no other request is due. It is short: at most one step between two calls of the status, and it
+    /// stops if the flag is raised. Returns the new points, if there are any. An error is not returned; the next status
+    /// shows it.
     fn read_ahead(&mut self, _job: Job, _interrupt: &Interrupt) -> impl Future<Output = Option<Preliminary>> + Send {
         std::future::ready(None)
     }
 
-    /// Fetches the points of this job, which has to be complete. Fetching twice gives the same, until it is acknowledged.
+    /// Fetches the points of this job, which must be complete. Idempotent until the result is acknowledged.
     fn collect(
         &mut self,
         job: Job,
@@ -102,10 +107,10 @@ pub trait Cmm: Machine {
     ) -> impl Future<Output = Result<Measurement, DeviceError>> + Send;
 }
 
-/// A machine that grinds.
+/// Grinder.
 pub trait Grinder: Machine {
-    /// Carries map and pass to the machine and proves that they are what the machine would use. The map is absolute: loading it twice
-    /// changes nothing.
+    /// Transfers map and pass to the machine and proves that the machine would use them. The map is absolute: loading
+    /// it twice changes nothing.
     fn load_pass(
         &mut self,
         map: &CorrectionMap,
@@ -113,7 +118,7 @@ pub trait Grinder: Machine {
         interrupt: &Interrupt,
     ) -> impl Future<Output = Result<(), DeviceError>> + Send;
 
-    /// Fetches the record of this job, which has to be complete. Fetching twice gives the same, until it is acknowledged.
+    /// Fetches the record of this job, which must be complete. Idempotent until the result is acknowledged.
     fn collect(
         &mut self,
         job: Job,
@@ -121,29 +126,30 @@ pub trait Grinder: Machine {
     ) -> impl Future<Output = Result<PassRecord, DeviceError>> + Send;
 }
 
-/// A flag that breaks off a long transfer between two requests, so that a hold or an abort can reach the wire at once.
+/// Flag that interrupts a long transfer between two requests, so that a hold or an abort can be sent at once.
 ///
-/// Clones share the flag. The transfer answers [`DeviceError::Interrupted`] and can be begun again from its start; nothing moves by it.
+/// Clones share the flag. The transfer returns [`DeviceError::Interrupted`] and can be repeated from its start. The
+/// flag moves nothing.
 #[derive(Debug, Clone, Default)]
 pub struct Interrupt(Arc<AtomicBool>);
 
 impl Interrupt {
-    /// A flag that is not raised.
+    /// Creates a flag that is not raised.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Asks whoever looks at the flag to break off.
+    /// Raises the flag: every transfer that checks it stops.
     pub fn raise(&self) {
         self.0.store(true, Ordering::Release);
     }
 
-    /// Takes the flag down again.
+    /// Lowers the flag.
     pub fn lower(&self) {
         self.0.store(false, Ordering::Release);
     }
 
-    /// Whether the flag is up.
+    /// Returns true if the flag is raised.
     pub fn is_raised(&self) -> bool {
         self.0.load(Ordering::Acquire)
     }

@@ -1,11 +1,12 @@
-//! The machine that there is none of: some wires are for measuring machines only, others for grinders only.
+//! Placeholder for a machine that a wire does not support: some wires are for measuring machines only, others for
+//! grinders only.
 
 use super::error::Answered;
 use super::machine::{Cmm, Grinder, Interrupt, Machine};
 use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan};
 use super::words::{Armed, Identity, Job, Reconciled, Started, Status};
 
-/// The type of a machine that cannot be had by a wire: there is no value of it.
+/// Type of a machine that a wire does not support. It has no values.
 #[derive(Debug)]
 pub enum NoMachine {}
 

@@ -1,15 +1,15 @@
-//! What is carried to a machine and what comes back.
+//! Payloads that are sent to a machine, and results that it returns.
 
 use regrind_core::geometry::Grid;
 use regrind_formats::result::Coordinates;
 
-/// Something that is carried as one string of bytes and known by the SHA-256 of it.
+/// Payload that is sent as one string of bytes and identified by its SHA-256.
 pub trait Identified {
-    /// The SHA-256 of the payload's bytes, high words first, whatever the order on the wire.
+    /// Returns the SHA-256 of the bytes of the payload, with the high words first, whatever the word order on the wire.
     fn identity(&self) -> [u8; 32];
 }
 
-/// What a target belongs to.
+/// Object to which a target belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u16)]
 pub enum TargetKind {
@@ -19,175 +19,179 @@ pub enum TargetKind {
     ReferenceSphere = 2,
 }
 
-/// One point to be probed, in the CMM's frame.
+/// Point to be probed, in the frame of the CMM.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Target {
-    /// Its number, which comes back with the measured point.
+    /// Number of the target, which the measured point repeats.
     pub index: u32,
-    /// What it belongs to.
+    /// Object to which it belongs.
     pub what: TargetKind,
-    /// The nominal contact point.
+    /// Nominal contact point, in mm.
     pub point_mm: [f64; 3],
-    /// The outward unit normal there.
+    /// Outward unit normal at this point.
     pub normal: [f64; 3],
 }
 
-/// A measuring plan: what a CMM is to probe, and how.
+/// Measuring plan: the targets that a CMM probes, and the way it probes them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
-    /// The targets, in the order in which they are probed.
+    /// Targets, in the order in which they are probed.
     pub targets: Vec<Target>,
-    /// The radius of the probe the plan is made for.
+    /// Radius of the probe for which the plan is made, in mm.
     pub probe_radius_mm: f64,
-    /// How far from the point, ball surface, the probe turns into the normal.
+    /// Distance from the point to the surface of the ball at which the probe turns into the normal, in mm.
     pub approach_mm: f64,
-    /// How far beyond the point it searches.
+    /// Search distance beyond the point, in mm.
     pub search_mm: f64,
-    /// The probing speed.
+    /// Probing speed, in mm/s.
     pub speed_mm_s: f64,
-    /// How far above the highest target, along z of the CMM, the probe travels.
+    /// Height above the highest target, along z of the CMM, at which the probe travels, in mm.
     pub safe_height_mm: f64,
-    /// How the plan begins where the part may lie elsewhere than it should; none where it lies as it was found before.
+    /// Careful beginning of the plan, if the part may not lie where it should. `None` if the part lies where it was
+    /// found before.
     pub careful: Option<Careful>,
 }
 
-/// A careful beginning of a plan: few targets, and slowly.
+/// Careful beginning of a plan: a few targets at low speed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Careful {
-    /// So many of the first targets are touched slowly.
+    /// Number of first targets that are probed slowly.
     pub targets: u32,
-    /// The probing speed for them, and that of every way to them and between them.
+    /// Speed in mm/s for probing these targets and for all travel to them and between them.
     pub speed_mm_s: f64,
 }
 
-/// A correction map: by how much the ground surface is wanted displaced along the outward normal of the nominal surface. Positive leaves
-/// material. It is absolute: it replaces the one before.
+/// Correction map: desired displacement of the ground surface along the outward normal of the nominal surface. Positive
+/// values leave material. The map is absolute: it replaces the previous map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CorrectionMap {
-    /// Where its nodes are, in the model frame.
+    /// Grid of the nodes, in the model frame.
     pub grid: Grid,
-    /// One for each node.
+    /// Displacement at each node, in mm.
     pub values_mm: Vec<f64>,
-    /// The identity of the part's nominal surface.
+    /// Identity of the nominal surface of the part.
     pub part_identity: [u8; 32],
 }
 
-/// How a pass is ground.
+/// Parameters of a pass.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pass {
-    /// Passes without in-feed at the end.
+    /// Number of passes without in-feed at the end.
     pub spark_out_passes: u16,
-    /// The radius of the wheel.
+    /// Radius of the wheel, in mm.
     pub wheel_radius_mm: f64,
-    /// The feed.
+    /// Feed, in mm/min.
     pub feed_mm_min: f64,
-    /// From track to track.
+    /// Distance from track to track, in mm.
     pub track_spacing_mm: f64,
-    /// The height of the surface wanted, over the nominal, along the normal.
+    /// Height of the target surface above the nominal surface, along the normal, in mm.
     pub level_mm: f64,
-    /// The most that may be taken off anywhere.
+    /// Maximum depth of cut anywhere, in mm.
     pub depth_of_cut_mm: f64,
-    /// Least and most x of the part, in the model frame.
+    /// Minimum and maximum x of the part, in the model frame, in mm.
     pub x_mm: [f64; 2],
-    /// Least and most y of the part, in the model frame.
+    /// Minimum and maximum y of the part, in the model frame, in mm.
     pub y_mm: [f64; 2],
-    /// The identity of the part's nominal surface.
+    /// Identity of the nominal surface of the part.
     pub part_identity: [u8; 32],
 }
 
-/// What became of a target.
+/// Result of probing a target.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum PointStatus {
-    /// The probe touched; the coordinates hold.
+    /// The probe touched; the coordinates are valid.
     Touched,
     /// The probe searched and touched nothing.
     NotFound,
-    /// The probe could not get there.
+    /// The probe could not reach the target.
     NotReached,
 }
 
-/// One measured point.
+/// Measured point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasuredPoint {
-    /// The number of its target.
+    /// Number of its target.
     pub index: u32,
-    /// What became of it.
+    /// Result of probing the target.
     pub status: PointStatus,
-    /// 0 good to 100 bad.
+    /// Quality from 0 (good) to 100 (bad).
     pub quality: u16,
-    /// In the CMM's frame; of the probe's centre or of the contact, as the measurement says. Means nothing unless touched.
+    /// Position in the frame of the CMM, in mm: centre of the probe or contact point, as the measurement says.
+    /// Meaningless unless touched.
     pub at_mm: [f64; 3],
 }
 
-/// What a CMM measured: a point for every target, in the order of the plan.
+/// Measurement of a CMM: one point for every target, in the order of the plan.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Measurement {
-    /// The points.
+    /// Measured points.
     pub points: Vec<MeasuredPoint>,
-    /// What their coordinates are.
+    /// Meaning of the coordinates: probe centres or contact points.
     pub coordinates: Coordinates,
-    /// The radius of the probe that was used, where that is told.
+    /// Radius of the probe that was used in mm, if reported.
     pub probe_radius_mm: Option<f64>,
-    /// Mean temperature of the part during the job, where that is told.
+    /// Mean temperature of the part during the job in °C, if reported.
     pub temperature_c: Option<f64>,
-    /// How long the job took, where that is told.
+    /// Duration of the job in s, if reported.
     pub duration_s: Option<f64>,
-    /// The identity of the plan that was used.
+    /// Identity of the plan that was used.
     pub plan_identity: [u8; 32],
-    /// The job it belongs to.
+    /// Job to which it belongs.
     pub job: u32,
-    /// The cycle it belongs to.
+    /// Cycle to which it belongs.
     pub cycle: u16,
-    /// The number to acknowledge it by.
+    /// Number with which to acknowledge it.
     pub done: u32,
 }
 
-/// Points that a CMM gives while it still measures: to be looked at, and never judged by. What counts is the [`Measurement`] at the end.
+/// Preliminary points that a CMM reports while it still measures. They are for display and never for judgement; only
+/// the final [`Measurement`] counts.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Preliminary {
-    /// Whose they are.
+    /// Job to which they belong.
     pub job: super::Job,
-    /// How many points of the job were told before these; 0 where it begins anew, and what was told before is to be forgotten.
+    /// Number of points of the job that were reported before these. 0 if the report starts again; then discard all
+    /// earlier points.
     pub from: usize,
-    /// The points, in the order of the plan.
+    /// Points, in the order of the plan.
     pub points: Vec<MeasuredPoint>,
-    /// What their coordinates are.
+    /// Meaning of the coordinates: probe centres or contact points.
     pub coordinates: Coordinates,
 }
 
-/// What a grinder, or the person who serves it, says of a pass; `None` is what nobody told.
+/// Record of a pass, from the grinder or from its operator. `None` marks a value that nobody reported.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PassRecord {
-    /// How the job ended.
+    /// Outcome of the job.
     pub outcome: super::Outcome,
-    /// Path travelled.
+    /// Path travelled, in mm.
     pub path_mm: Option<f64>,
-    /// Volume removed.
+    /// Volume removed, in mm³.
     pub removed_mm3: Option<f64>,
-    /// Largest depth taken off.
+    /// Largest depth removed, in mm.
     pub deepest_mm: Option<f64>,
-    /// Share of the path that cut nothing, 0 to 1.
+    /// Fraction of the path that cut nothing, from 0 to 1.
     pub idle_share: Option<f64>,
-    /// Mean spindle load, 1 is full.
+    /// Mean spindle load; 1 is full load.
     pub spindle_load: Option<f64>,
-    /// Radius of the wheel in use.
+    /// Radius of the wheel in use, in mm.
     pub wheel_radius_mm: Option<f64>,
-    /// Mean temperature of the part during the job.
+    /// Mean temperature of the part during the job, in °C.
     pub temperature_c: Option<f64>,
-    /// How long the job took.
+    /// Duration of the job, in s.
     pub duration_s: Option<f64>,
-    /// The identity of the map that was used.
+    /// Identity of the map that was used.
     pub map_identity: [u8; 32],
-    /// The job it belongs to.
+    /// Job to which it belongs.
     pub job: u32,
-    /// The cycle it belongs to.
+    /// Cycle to which it belongs.
     pub cycle: u16,
-    /// The number to acknowledge it by.
+    /// Number with which to acknowledge it.
     pub done: u32,
 }
 
 impl PassRecord {
-    /// The record of a pass of which nobody measured anything.
+    /// Returns the record of a pass of which nobody measured anything.
     pub(super) fn unmeasured(outcome: super::Outcome, map_identity: [u8; 32], job: super::Job, done: u32) -> Self {
         Self {
             outcome,

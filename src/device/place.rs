@@ -1,16 +1,16 @@
-//! Where a machine stands in a cell file, for messages about it.
+//! Position of a machine in a cell file, for messages about it.
 
-/// Where a machine stands in a cell file.
+/// Position of a machine in a cell file.
 #[derive(Clone, Copy, Debug)]
 pub struct Place<'a> {
-    /// Its table: `cmm` or `grinder`.
+    /// Table of the machine: `cmm` or `grinder`.
     pub table: &'a str,
-    /// Whether the cell is simulated, where the file says it.
+    /// True if the cell is simulated; `None` if the file does not say it.
     pub simulated: Option<bool>,
 }
 
 impl Place<'_> {
-    /// Returns a key of the machine's table as messages call it.
+    /// Returns a key in the table of the machine, in the form that messages use.
     pub fn key(&self, rest: &str) -> String {
         format!("{}.{rest}", self.table)
     }

@@ -1,20 +1,20 @@
-//! The range of each figure that a machine tells of itself, of a measurement or of a pass, in one table. A figure outside of its range
-//! is refused, by whatever wire it came and whatever it is used for.
+//! Table of the possible range of each value that a machine reports of itself, of a measurement or of a pass. A value
+//! outside its range is refused, on every wire and for every use.
 
 use std::sync::Arc;
 
 use super::{DeviceError, Measurement, PassRecord, PointStatus, SignalValue};
 
-/// The least and the most that a figure can be.
+/// Possible range of a value.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Range {
-    /// The figure, as messages and docs/modbus.md call it.
+    /// Name of the value, as in messages and docs/modbus.md.
     pub figure: &'static str,
-    /// The least that it can be.
+    /// Minimum possible value.
     pub least: f64,
-    /// The most that it can be.
+    /// Maximum possible value.
     pub most: f64,
-    /// Its unit.
+    /// Unit of the value.
     pub unit: &'static str,
 }
 
@@ -31,7 +31,8 @@ const COUNT: Range = range("the scale of counts", 1e-9, 0.1, "mm");
 const SPINDLE_LOAD: Range = range("the spindle load", 0.0, 10.0, "");
 const IDLE_SHARE: Range = range("the share of the path that cut nothing", 0.0, 1.0, "");
 
-/// Every range that holds for all machines. Those of a pass that depend on what was commanded are in `drive/pass_record.rs`.
+/// All ranges that apply to every machine. The ranges of a pass that depend on the command are in
+/// `drive/pass_record.rs`.
 pub const RANGES: [Range; 8] =
     [TEMPERATURE, DURATION, PROBE_RADIUS, COORDINATE, QUALITY, COUNT, SPINDLE_LOAD, IDLE_SHARE];
 
@@ -40,7 +41,7 @@ impl Range {
         (self.least..=self.most).contains(&value)
     }
 
-    /// Says that a value is not in it; none where it is, or was not told.
+    /// Returns in words why a value is outside the range. Returns `None` if it is inside, or was not reported.
     fn flaw(&self, value: Option<f64>) -> Option<String> {
         let value = value.filter(|value| !self.has(*value))?;
         let Self { figure, least, most, unit } = self;
@@ -58,8 +59,9 @@ impl Range {
     }
 }
 
-/// Returns a temperature, and a progress in steps of a total, where they can be, and what is wrong with one that cannot: a status that has one
-/// is still told, since what the machine is at and what it has acknowledged is in it too.
+/// Returns the temperature in °C and the progress `(done, total)`, each only if possible, and a signal for each
+/// impossible value. The status is reported all the same, because it also contains the state of the machine and the
+/// command that it acknowledged.
 pub(super) fn of_status(
     temperature_c: Option<f64>,
     progress: (u32, u32),
@@ -77,13 +79,14 @@ pub(super) fn of_status(
     (told.0, told.1, temperature.into_iter().chain(steps).collect())
 }
 
-/// Refuses a scale of counts that cannot be.
+/// Rejects an impossible scale of counts, in mm per count.
 pub(super) fn of_counts(machine: &Arc<str>, scale_mm: f64) -> Result<(), DeviceError> {
     COUNT.refuse(machine, scale_mm)
 }
 
 impl Measurement {
-    /// Names the first figure of a measurement that cannot be, with its range; what was not told is not judged.
+    /// Returns the first impossible value of a measurement with its range, in words. Values that were not reported are
+    /// not checked.
     pub fn flaw(&self) -> Option<String> {
         let of_whole = TEMPERATURE
             .flaw(self.temperature_c)
@@ -101,7 +104,8 @@ impl Measurement {
 }
 
 impl PassRecord {
-    /// Names the first figure of a pass record that no pass can have, with its range; what was not told is not judged.
+    /// Returns the first impossible value of a pass record with its range, in words. Values that were not reported are
+    /// not checked.
     pub fn flaw(&self) -> Option<String> {
         TEMPERATURE
             .flaw(self.temperature_c)

@@ -1,4 +1,4 @@
-//! Every driver, one line each: what a cell file calls it, and the folder that owns the rest.
+//! Table of the drivers, one line each: the name in a cell file, and the folder that owns the rest.
 
 use schemars::JsonSchema;
 use serde::Deserialize;
@@ -28,15 +28,15 @@ macro_rules! drivers {
             $($(#[$doc])* $wire($table)),+
         }
 
-        /// A measuring machine by whatever wire.
+        /// Measuring machine on any wire.
         #[derive(Debug)]
-        // There are two of these in a program; nothing is gained by a box.
+        // A program has two of these; boxing would gain nothing.
         #[allow(clippy::large_enum_variant)]
         pub enum AnyCmm {
             $($(#[$doc])* $wire(<$table as Wired>::Cmm)),+
         }
 
-        /// A grinder by whatever wire.
+        /// Grinder on any wire.
         #[derive(Debug)]
         #[allow(clippy::large_enum_variant)]
         pub enum AnyGrinder {
@@ -44,12 +44,13 @@ macro_rules! drivers {
         }
 
         impl Wire {
-            /// Tells what is wrong with it beyond what the schema holds it to.
+            /// Reports to the document the errors of this wire that the schema does not detect.
             pub fn check(&self, place: &Place<'_>, document: &mut Document) {
                 match self { $(Self::$wire(wire) => Wired::check(wire, place, document)),+ }
             }
 
-            /// Tells what is wrong with this wire, the CMM's, beside that of the grinder.
+            /// Reports to the document the conflicts between this wire, which is the CMM's, and the wire of the
+            /// grinder.
             pub fn check_beside(&self, grinder: &Self, document: &mut Document) {
                 match (self, grinder) {
                     $((Self::$wire(cmm), Self::$wire(grinder)) => Wired::check_beside(cmm, grinder, document),)+
@@ -57,75 +58,75 @@ macro_rules! drivers {
                 }
             }
 
-            /// What a person should know of it on this computer.
+            /// Returns notes for a person about this wire on this computer.
             pub fn notes(&self) -> Vec<String> {
                 match self { $(Self::$wire(wire) => wire.notes()),+ }
             }
 
-            /// Whether a person serves the machine.
+            /// Returns true if a person operates the machine.
             pub fn is_by_person(&self) -> bool {
                 match self { $(Self::$wire(_) => <$table>::BY_PERSON),+ }
             }
 
-            /// Whether its results may state their temperature.
+            /// Returns true if its results may contain their temperature.
             pub fn tells_temperature(&self) -> bool {
                 match self { $(Self::$wire(_) => <$table>::TELLS_TEMPERATURE),+ }
             }
 
-            /// Whether the tables `registers` and `signals` say something of it.
+            /// Returns true if the tables `registers` and `signals` apply to it.
             pub fn has_registers(&self) -> bool {
                 match self { $(Self::$wire(_) => <$table>::HAS_REGISTERS),+ }
             }
 
-            /// Whether its grinder works by what lies in the folder of the run.
+            /// Returns true if its grinder works from the files in the folder of the run.
             pub fn works_from_run(&self) -> bool {
                 match self { $(Self::$wire(_) => <$table>::WORKS_FROM_RUN),+ }
             }
 
-            /// What the coordinates of a measurement are; none where each result says so itself.
+            /// Returns the meaning of the coordinates of a measurement; `None` if each result states it itself.
             pub fn coordinates(&self) -> Option<Coordinates> {
                 match self { $(Self::$wire(wire) => wire.coordinates()),+ }
             }
 
-            /// The Modbus line and the unit on it, where it is one.
+            /// Returns the Modbus line and the unit on it, if this is a Modbus wire.
             pub fn line(&self) -> Option<(Line, u8)> {
                 match self { $(Self::$wire(wire) => Wired::line(wire)),+ }
             }
 
-            /// Host and port of a server of I++ DME, where it is one.
+            /// Returns host and port of the I++ DME server, if this is an I++ DME wire.
             pub fn dme(&self) -> Option<(String, u16)> {
                 match self { $(Self::$wire(wire) => Wired::dme(wire)),+ }
             }
 
-            /// Where lines of hits are heard, where it is such a wire.
+            /// Returns the source of the hit lines, if this is a wire for them.
             pub fn hit_line(&self) -> Option<HitLine> {
                 match self { $(Self::$wire(wire) => Wired::hit_line(wire)),+ }
             }
 
-            /// Host and port of linuxcncrsh, where it is one.
+            /// Returns host and port of linuxcncrsh, if this is a wire to it.
             pub fn rsh(&self) -> Option<(String, u16)> {
                 match self { $(Self::$wire(wire) => Wired::rsh(wire)),+ }
             }
 
-            /// Makes the driver of a measuring machine; nothing is asked of the machine yet.
+            /// Creates the driver of a measuring machine. Sends nothing to the machine yet.
             ///
             /// # Errors
-            /// Those of [`Wired::cmm`].
+            /// The errors of [`Wired::cmm`].
             pub fn cmm(&self, making: &Making<'_>) -> Result<AnyCmm, MakingError> {
                 Ok(match self { $(Self::$wire(wire) => AnyCmm::$wire(wire.cmm(making)?)),+ })
             }
 
-            /// Makes the driver of a grinder; nothing is asked of the machine yet.
+            /// Creates the driver of a grinder. Sends nothing to the machine yet.
             ///
             /// # Errors
-            /// Those of [`Wired::grinder`].
+            /// The errors of [`Wired::grinder`].
             pub fn grinder(&self, making: &Making<'_>) -> Result<AnyGrinder, MakingError> {
                 Ok(match self { $(Self::$wire(wire) => AnyGrinder::$wire(wire.grinder(making)?)),+ })
             }
         }
 
         impl AnyCmm {
-            /// The line that another machine may share.
+            /// Returns the line that another machine may share.
             pub fn link(&self) -> Option<&Link> {
                 match self { $(Self::$wire(cmm) => <$table>::link(cmm)),+ }
             }
@@ -162,7 +163,7 @@ macro_rules! drivers {
     };
 }
 
-/// A choice between drivers, which answers as the one that was chosen.
+/// Implements [`Machine`] for an enum of drivers: each call goes to the chosen driver.
 macro_rules! machine {
     ($any:ident: $($wire:ident),+) => {
         impl Machine for $any {

@@ -1,4 +1,4 @@
-//! What a driver owns of a cell file: its table `wire`, how that is checked, and how machines are made of it.
+//! Part of a cell file that a driver owns: its table `wire`, the checks of it, and the machines that are made from it.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -14,153 +14,155 @@ use regrind_document::Document;
 use regrind_formats::FormatError;
 use regrind_formats::result::Coordinates;
 
-/// How long to wait for what.
+/// Timing of the communication with a machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Timing {
-    /// For the answer to one request.
+    /// Timeout for the answer to one request.
     pub request_timeout: Duration,
-    /// How often a request is repeated after the first time.
+    /// Number of retries of a request after the first attempt.
     pub retries: u8,
-    /// Between two looks at the status.
+    /// Interval between two reads of the status.
     pub poll: Duration,
-    /// Between two beats.
+    /// Interval between two heartbeats.
     pub heartbeat: Duration,
-    /// Without an answer, after which the machine is lost.
+    /// Time without an answer after which the machine is lost.
     pub lost_after: Duration,
-    /// Of silence after a broken answer, so that late bytes die out.
+    /// Silence after a corrupt answer, in which late bytes may still arrive.
     pub quarantine: Duration,
 }
 
-/// What a machine is made of besides its wire.
+/// Data in addition to its wire from which a machine is made.
 #[derive(Clone, Copy, Debug)]
 pub struct Making<'a> {
-    /// The part, as files and prompts call it.
+    /// Name of the part in files and prompts.
     pub part: &'a str,
-    /// The folder of the cell file, to which its paths are relative.
+    /// Folder of the cell file, to which its paths are relative.
     pub cell_folder: &'a Path,
-    /// The folder of the run.
+    /// Folder of the run.
     pub run_folder: &'a Path,
-    /// Whether the machines of the cell are simulations.
+    /// True if the machines of the cell are simulations.
     pub simulated: bool,
-    /// The number of this client, for machines that more than one can reach.
+    /// Number of this client, for machines that several clients can reach.
     pub owner: u32,
-    /// Rises with each start of this client.
+    /// Epoch of this client; it increases with each start.
     pub epoch: u32,
-    /// Where any number of points will do, and not one for each target of a plan: the least of them.
+    /// Minimum number of points, if any number of points is allowed; `None` if each target of a plan needs one point.
     pub free_points: Option<usize>,
-    /// The share of a plan's targets of which a measurement must have a point.
+    /// Minimum fraction of the targets of a plan that need a point in a measurement.
     pub least_found: f64,
-    /// Whether people only play the machines: the plan itself may come back as what was measured.
+    /// True if people only act as the machines: the plan itself may be returned as the measurement.
     pub rehearsal: bool,
-    /// How long to wait for what.
+    /// Timing of the communication.
     pub timing: &'a Timing,
-    /// Where the blocks of its Modbus map stand.
+    /// Addresses of the blocks of its Modbus map.
     pub registers: &'a RegisterMap,
-    /// Further values that are read and recorded.
+    /// Additional values that are read and recorded.
     pub signals: &'a [Signal],
-    /// The name that it must give of itself.
+    /// Name that the machine must report.
     pub expected_name: Option<&'a str>,
-    /// The box that a probe's centre must not leave, its least and its largest corner.
+    /// Box that the centre of the probe must not leave: its minimum and maximum corner, in mm.
     pub volume_mm: Option<[[f64; 3]; 2]>,
-    /// The line of the other machine, which may be its own too.
+    /// Line of the other machine, which may also be the line of this one.
     pub beside: Option<&'a Link>,
 }
 
-/// The table `wire` of a cell file, and the driver that goes with it.
+/// Table `wire` of a cell file, with the driver that belongs to it.
 pub trait Wired {
-    /// The measuring machine at the end of such a wire.
+    /// Measuring machine on this wire.
     type Cmm: Cmm + std::fmt::Debug;
-    /// The grinder at the end of such a wire.
+    /// Grinder on this wire.
     type Grinder: Grinder + std::fmt::Debug;
 
-    /// Whether a person serves the machine: then it takes as long as people take, and nothing simulates it.
+    /// True if a person operates the machine. Then a job takes as long as the person needs, and nothing simulates the
+    /// machine.
     const BY_PERSON: bool = false;
-    /// Whether its results may state their temperature.
+    /// True if its results may contain their temperature.
     const TELLS_TEMPERATURE: bool = true;
-    /// Whether the tables `registers` and `signals` say something of it.
+    /// True if the tables `registers` and `signals` apply to it.
     const HAS_REGISTERS: bool = false;
-    /// Whether the grinder works by the program and the map that lie in the folder of the run, the first of a run too.
+    /// True if the grinder works from the program and the map in the folder of the run, also for the first pass of a
+    /// run.
     const WORKS_FROM_RUN: bool = false;
 
-    /// Tells what is wrong with the table beyond what the schema holds it to.
+    /// Reports to the document the errors of the table that the schema does not detect.
     fn check(&self, _place: &Place<'_>, _document: &mut Document) {}
 
-    /// Tells what is wrong with this wire, the CMM's, beside that of the grinder.
+    /// Reports to the document the conflicts between this wire, which is the CMM's, and the wire of the grinder.
     fn check_beside(&self, _grinder: &Self, _document: &mut Document) {}
 
-    /// What a person should know of it on this computer, which makes the cell file no worse.
+    /// Returns notes for a person about this wire on this computer. They are no errors of the cell file.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// What the coordinates of a measurement are; none where each result says so itself.
+    /// Returns the meaning of the coordinates of a measurement; `None` if each result states it itself.
     fn coordinates(&self) -> Option<Coordinates> {
         Some(Coordinates::Centres)
     }
 
-    /// Makes the driver of a measuring machine; nothing is asked of the machine yet.
+    /// Creates the driver of a measuring machine. Sends nothing to the machine yet.
     ///
     /// # Errors
-    /// A wire that cannot be opened, a folder that is not there, a file that cannot be read.
+    /// The wire cannot be opened, a folder does not exist, or a file cannot be read.
     fn cmm(&self, making: &Making<'_>) -> Result<Self::Cmm, MakingError>;
 
-    /// Makes the driver of a grinder; nothing is asked of the machine yet.
+    /// Creates the driver of a grinder. Sends nothing to the machine yet.
     ///
     /// # Errors
-    /// Those of [`Wired::cmm`].
+    /// The errors of [`Wired::cmm`].
     fn grinder(&self, making: &Making<'_>) -> Result<Self::Grinder, MakingError>;
 
-    /// The line that another machine may share.
+    /// Returns the line that another machine may share.
     fn link(_cmm: &Self::Cmm) -> Option<&Link> {
         None
     }
 
-    /// Host and port of a server of I++ DME, where it is one.
+    /// Returns host and port of the I++ DME server, if this is an I++ DME wire.
     fn dme(&self) -> Option<(String, u16)> {
         None
     }
 
-    /// Where lines of hits are heard, where it is such a wire.
+    /// Returns the source of the hit lines, if this is a wire for them.
     fn hit_line(&self) -> Option<HitLine> {
         None
     }
 
-    /// Host and port of linuxcncrsh, where it is one.
+    /// Returns host and port of linuxcncrsh, if this is a wire to it.
     fn rsh(&self) -> Option<(String, u16)> {
         None
     }
 
-    /// The Modbus line and the unit on it, where it is one: what a simulated machine is served on.
+    /// Returns the Modbus line and the unit on it, if this is a Modbus wire: a simulated machine is served there.
     fn line(&self) -> Option<(Line, u8)> {
         None
     }
 }
 
-/// Why a machine cannot be made of what a cell file says.
+/// Reason why a machine cannot be made from the cell file.
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the message of each tells what its fields are")]
 #[non_exhaustive]
 pub enum MakingError {
-    /// A folder that must be there.
+    /// A required folder does not exist.
     #[error(
         "{key}: the folder {path} is not there; make it where the {machine} finds it (mkdir -p {path}), or correct the cell file"
     )]
     Folder { key: String, path: PathBuf, machine: MachineKind },
-    /// A file of reference points that is not good.
+    /// The file of reference points is not valid.
     #[error("cmm.wire.reference_points: {source}")]
     References { source: Box<FormatError> },
-    /// A serial port that is not there.
+    /// A serial port does not exist.
     #[error("{missing}; connect it, or name one of these in the cell file")]
     NoPort { missing: String },
-    /// A machine whose positions are to be held against its volume, and nobody says what that is.
+    /// The positions of the machine must be checked against its volume, but the cell file gives no volume.
     #[error(
         "cmm.travel is missing: every position is held against it before {machine} moves; add the box that its probe must not leave"
     )]
     NoVolume { machine: String },
-    /// A machine that this wire has no driver for.
+    /// This wire has no driver for this machine.
     #[error("{table}.wire: kind = {kind:?} is for the other machine of a cell; name another wire")]
     NoDriver { table: &'static str, kind: &'static str },
-    /// A line that cannot be opened.
+    /// The line cannot be opened.
     #[error("{line} cannot be opened: {source}; check the cell file and the machine")]
     Line { line: String, source: std::io::Error },
 }

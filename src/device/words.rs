@@ -1,19 +1,19 @@
-//! The words of a machine's handshake: who it is, what it is doing, what it answers.
+//! Types of the handshake with a machine: its identity, its status and its answers.
 
 use std::fmt;
 use std::path::PathBuf;
 
-/// What a machine is for.
+/// Kind of a machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum MachineKind {
-    /// A coordinate measuring machine.
+    /// Coordinate measuring machine.
     Cmm,
-    /// A grinder.
+    /// Grinder.
     Grinder,
 }
 
 impl MachineKind {
-    /// Returns its table in a cell file, and its name in commands.
+    /// Returns the name of its table in a cell file, which is also its name in commands.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Cmm => "cmm",
@@ -31,41 +31,41 @@ impl fmt::Display for MachineKind {
     }
 }
 
-/// Who answers at the far end of the wire.
+/// Identity of the machine at the far end of the wire.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Identity {
-    /// What it is for.
+    /// Kind of the machine.
     pub kind: MachineKind,
-    /// Its name and serial number, as it gives them.
+    /// Name and serial number, as the machine reports them.
     pub name: String,
-    /// A number that changes whenever the machine's application starts; 0 where the wire has no such number.
+    /// Number that changes each time the application of the machine starts; 0 if the wire has no boot id.
     pub boot_id: u32,
-    /// Whether it is a simulation. Has to be said wherever its results are shown or stored.
+    /// True if it is a simulation. This must be shown wherever its results are shown or stored.
     pub simulation: bool,
-    /// After how many seconds of silence the machine takes its client for lost and holds.
+    /// Silence in s after which the machine regards its client as lost and holds.
     pub silence_limit_s: Option<f64>,
 }
 
 impl Identity {
-    /// A machine whose wire is a person, who is never lost by silence.
+    /// Returns the identity of a machine that a person operates. Silence never makes its client lost.
     pub(super) fn by_person(kind: MachineKind, name: &str) -> Self {
         Self { kind, name: name.to_owned(), boot_id: 0, simulation: false, silence_limit_s: None }
     }
 }
 
-/// One run of one machine: the part's run, the cycle in it, and a check number of the payloads it is about.
+/// Job of one machine: the run of the part, the cycle in it, and a checksum of its payloads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Job {
-    /// The number of the part's run; not 0.
+    /// Number of the run of the part; not 0.
     pub job: u32,
-    /// The cycle.
+    /// Cycle with its batch, in the encoding of [`Number::seen`].
     pub cycle: u16,
     /// [`digest`] of the identities of the payloads, in the order plan, or map and pass.
     pub digest: u32,
 }
 
 impl Job {
-    /// Returns which batch of touches of which cycle it is.
+    /// Returns the cycle and the batch of touches to which it belongs.
     pub fn number(&self) -> Number {
         Number::of(self.cycle)
     }
@@ -77,29 +77,29 @@ impl fmt::Display for Job {
     }
 }
 
-/// A cycle, and which batch of touches of it where a measurement is taken batch by batch: the batches before it. A machine sees one number of
-/// 16 bits: the cycle, and 1024 for each batch before.
+/// Cycle, and batch of touches in it if a measurement is taken batch by batch. The batch is the number of batches
+/// before it. A machine sees one number of 16 bits: the cycle plus 1024 for each earlier batch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Number {
-    /// The cycle.
+    /// Cycle.
     pub cycle: u32,
-    /// The batches before.
+    /// Number of earlier batches.
     pub batch: u32,
 }
 
 impl Number {
-    /// The cycles of a run, and the batches of a measurement, are fewer.
+    /// Number of cycles that the encoding can distinguish; a run has fewer.
     pub const CYCLES: u32 = 1024;
-    /// The batches of a measurement.
+    /// Number of batches that the encoding can distinguish; a measurement has fewer.
     pub const BATCHES: u32 = 64;
 
-    /// Takes apart what a machine sees.
+    /// Decodes the number that a machine sees.
     pub fn of(seen: u16) -> Self {
         let seen = u32::from(seen);
         Self { cycle: seen % Self::CYCLES, batch: seen / Self::CYCLES }
     }
 
-    /// Returns what a machine sees, which is another for every batch as long as the limits are kept.
+    /// Returns the number that a machine sees. It is unique for every batch as long as the limits are kept.
     pub fn seen(self) -> u16 {
         (self.cycle % Self::CYCLES + Self::CYCLES * (self.batch % Self::BATCHES)) as u16
     }
@@ -114,7 +114,8 @@ impl fmt::Display for Number {
     }
 }
 
-/// The check number of payloads: the CRC-32 over their identities, in rising order of their kinds (plan; or map, pass).
+/// Returns the checksum of payloads: the CRC-32 over their identities, in increasing order of their kinds (plan; or
+/// map, pass).
 pub fn digest(identities: &[[u8; 32]]) -> u32 {
     let mut crc = crc32fast::Hasher::new();
     for identity in identities {
@@ -128,50 +129,51 @@ pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
-/// A job that the machine has checked and would begin: the intent, to be journaled before [`start`](super::Machine::start).
+/// Job that the machine has checked and would begin. It is the intent that is journaled before
+/// [`start`](super::Machine::start).
 ///
-/// After a restart it is put together again from the journal and given to [`reconcile`](super::Machine::reconcile).
+/// After a restart it is rebuilt from the journal and passed to [`reconcile`](super::Machine::reconcile).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Armed {
-    /// What was prepared.
+    /// Prepared job.
     pub job: Job,
-    /// The number that the START will carry, and no other command.
+    /// Sequence number of the START; no other command carries it.
     pub start_sequence: u32,
-    /// The machine's one-time word for this start; 0 where the wire has none.
+    /// One-time token of the machine for this start; 0 if the wire has none.
     pub token: u32,
-    /// The machine's boot id when it was prepared.
+    /// Boot id of the machine when the job was prepared.
     pub boot_id: u32,
 }
 
-/// A job that the machine has begun.
+/// Job that the machine has begun.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Started {
-    /// What was begun.
+    /// Job that was begun.
     pub job: Job,
-    /// The START that began it.
+    /// Sequence number of the START that began it.
     pub start_sequence: u32,
-    /// The status that said so.
+    /// Status that confirms the start.
     pub status: Status,
 }
 
-/// What became of a start.
+/// Outcome of a start.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum Reconciled {
-    /// It was taken and the job is not at its end; the state in the status says whether it runs, holds or is ending.
+    /// The start was accepted and the job has not ended. The state in the status shows if it runs, holds or is ending.
     Running(Status),
-    /// It was taken and has ended; `done` and `outcome` in the status say how.
+    /// The start was accepted and the job has ended; `done` and `outcome` in the status show how.
     Finished(Status),
-    /// It provably was not taken, seen twice with a second between: prepare anew.
+    /// The start was provably not accepted: this was seen twice, a second apart. Prepare again.
     NotStarted(Status),
-    /// It cannot be told from here. A person has to look at the machine; nothing may be repeated.
+    /// The outcome cannot be determined from here. A person must look at the machine; nothing may be repeated.
     Unknown {
-        /// What does not fit, in words.
+        /// Contradiction, in words.
         why: String,
     },
 }
 
-/// A command of the handshake.
+/// Command of the handshake.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u16)]
 #[expect(missing_docs, reason = "the same words as the methods of `Machine`")]
@@ -205,33 +207,33 @@ impl fmt::Display for Command {
     }
 }
 
-/// Where a machine stands.
+/// State of a machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum State {
-    /// Nothing prepared, nothing running.
+    /// Nothing is prepared and nothing runs.
     Idle,
     /// A job is checked; START would begin it.
     Prepared,
     /// A job runs.
     Execute,
-    /// On the way to a safe place.
+    /// The machine moves to a safe place.
     Holding,
-    /// At a safe place in the middle of a job.
+    /// The machine is at a safe place in the middle of a job.
     Held,
-    /// Ending the job in order.
+    /// The machine ends the job in order.
     Stopping,
-    /// A job has ended; its result waits to be acknowledged.
+    /// A job has ended; its result waits for the acknowledgement.
     Complete,
-    /// Running the safe sequence.
+    /// The machine runs the safe sequence.
     Aborting,
-    /// Ended at once; needs CLEAR.
+    /// The job was ended at once; the machine needs CLEAR.
     Aborted,
-    /// Stands because of a fault; needs CLEAR.
+    /// The machine stopped because of a fault; it needs CLEAR.
     Faulted,
 }
 
 impl State {
-    /// Whether something may be moving.
+    /// Returns true if something may be moving.
     pub fn moves(self) -> bool {
         matches!(self, Self::Execute | Self::Holding | Self::Stopping | Self::Aborting)
     }
@@ -254,35 +256,35 @@ impl fmt::Display for State {
     }
 }
 
-/// What a machine answers to a command.
+/// Answer of a machine to a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum Answer {
-    /// None yet.
+    /// No answer yet.
     None,
     /// Accepted.
     Accepted,
     /// The client is not the owner, or has an old epoch.
     NotOwner,
-    /// Not allowed in the present state.
+    /// The present state does not allow the command.
     WrongState,
     /// The machine does not know the command.
     UnknownCommand,
-    /// The token is wrong or dead.
+    /// The token is wrong or has expired.
     DeadToken,
-    /// Job, cycle or digest are not what was prepared or is in force.
+    /// Job, cycle or digest differ from those that are prepared or in force.
     OtherJob,
-    /// This job and cycle were begun already.
+    /// This job and cycle were already begun.
     AlreadyBegun,
-    /// A payload is missing, broken or of another part.
+    /// A payload is missing, corrupt or made for another part.
     PayloadMissing,
     /// An interlock is open or the machine is not in automatic mode.
     InterlockOpen,
-    /// A value of a payload is outside the machine's limits.
+    /// A value of a payload is outside the limits of the machine.
     OutsideLimits,
-    /// The acknowledged number is not that of the finished job.
+    /// The acknowledged number is not the number of the finished job.
     OtherResult,
-    /// A number that is not in the contract.
+    /// The answer number is not in the contract.
     Unlisted(u16),
 }
 
@@ -310,7 +312,7 @@ impl fmt::Display for Answer {
     }
 }
 
-/// Why a machine stands.
+/// Fault of a machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum Fault {
@@ -318,11 +320,11 @@ pub enum Fault {
     None,
     /// The stop circuit is open.
     StopCircuit,
-    /// A collision or an unexpected touch.
+    /// A collision or an unexpected touch occurred.
     Collision,
     /// Air, coolant or power is missing.
     Supplies,
-    /// A limit of travel was met.
+    /// An axis reached a limit of travel.
     TravelLimit,
     /// A drive has failed.
     Drive,
@@ -330,12 +332,12 @@ pub enum Fault {
     Tool,
     /// The client was silent for too long.
     ClientSilent,
-    /// Another fault, by its number.
+    /// Another fault, with its number.
     Other(u16),
 }
 
 impl Fault {
-    /// The numbers of docs/modbus.md.
+    /// Faults with their numbers in docs/modbus.md.
     const NUMBERS: [(Self, u16); 8] = [
         (Self::None, 0),
         (Self::StopCircuit, 1),
@@ -347,12 +349,12 @@ impl Fault {
         (Self::ClientSilent, 20),
     ];
 
-    /// The fault with a number.
+    /// Returns the fault with a number.
     pub fn of(number: u16) -> Self {
         Self::NUMBERS.iter().find(|(_, known)| *known == number).map_or(Self::Other(number), |(fault, _)| *fault)
     }
 
-    /// The number of a fault.
+    /// Returns the number of a fault.
     pub fn number(self) -> u16 {
         match self {
             Self::Other(number) => number,
@@ -377,39 +379,39 @@ impl fmt::Display for Fault {
     }
 }
 
-/// How a job ended.
+/// Outcome of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum Outcome {
-    /// It has not.
+    /// The job has not ended.
     None,
-    /// To its end.
+    /// The job was completed.
     Complete,
-    /// By STOP.
+    /// STOP ended the job.
     Stopped,
-    /// By ABORT.
+    /// ABORT ended the job.
     Aborted,
-    /// By a fault.
+    /// A fault ended the job.
     Failed,
 }
 
-/// A signal that a cell file asks for besides the contract's own: its value and whether that is good come apart.
+/// Additional signal that a cell file requests. The value is given even if it is not good; [`Self::flaw`] judges it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SignalValue {
-    /// Its name in the cell file.
+    /// Name in the cell file.
     pub name: String,
-    /// Its value in its unit; none where the machine gives no number.
+    /// Value in its unit; `None` if the machine gives no number.
     pub value: Option<f64>,
-    /// Its unit, as written in the cell file.
+    /// Unit, as written in the cell file.
     pub unit: String,
-    /// Least and most that it may be.
+    /// Minimum and maximum allowed value.
     pub range: [f64; 2],
-    /// What explains a value that is not there or cannot be, in words.
+    /// Cause of a missing or impossible value, in words.
     pub cause: Option<String>,
 }
 
 impl SignalValue {
-    /// Says what is wrong with it, if anything is.
+    /// Returns in words why the value is missing or out of range; `None` if it is good.
     pub fn flaw(&self) -> Option<String> {
         let Self { name, value, unit, range: [least, most], cause } = self;
         let flaw = match value {
@@ -421,38 +423,38 @@ impl SignalValue {
     }
 }
 
-/// What a machine says of itself, all of one moment; `None` is what it cannot tell, and nobody fills that in: what has to be known
-/// and is not, a person is asked.
+/// Status of a machine, all of one moment. `None` marks a value that the machine cannot report. No code fills it in; if
+/// the value is required, a person is asked.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Status {
-    /// Where it stands.
+    /// State of the machine.
     pub state: State,
-    /// The job prepared, running or finished.
+    /// Job that is prepared, running or finished.
     pub job: Option<Job>,
-    /// The number of the START whose job ended last; 0 when there is none.
+    /// Sequence number of the START whose job ended last; 0 if there is none.
     pub done: u32,
-    /// How that job ended.
+    /// Outcome of that job.
     pub outcome: Outcome,
-    /// Whether wheel or probe is clear of the part.
+    /// True if the wheel or probe is clear of the part.
     pub clear_of_part: Option<bool>,
-    /// Whether air, coolant and the like are there.
+    /// True if air, coolant and other supplies are present.
     pub supplies: Option<bool>,
-    /// Whether it is in automatic mode; in manual mode a person may move it at its panel.
+    /// True if it is in automatic mode; in manual mode a person may move it at its panel.
     pub automatic: Option<bool>,
-    /// Why it stands.
+    /// Fault of the machine.
     pub fault: Option<Fault>,
-    /// Points measured, or thousandths of the path, and of how many.
+    /// Progress `(done, total)`: points measured, or thousandths of the path.
     pub progress: Option<(u32, u32)>,
-    /// Temperature of the part or the machine.
+    /// Temperature of the part or the machine, in °C.
     pub temperature_c: Option<f64>,
-    /// The number that changes whenever the machine's application starts.
+    /// Number that changes each time the application of the machine starts.
     pub boot_id: Option<u32>,
-    /// The signals that the cell file asks for besides.
+    /// Values of the additional signals that the cell file requests.
     pub signals: Vec<SignalValue>,
 }
 
 impl Status {
-    /// The status of a machine that tells nothing but where it stands.
+    /// Returns the status of a machine that reports nothing but its state.
     pub(super) fn of(state: State) -> Self {
         Self {
             state,
@@ -471,14 +473,15 @@ impl Status {
     }
 }
 
-/// A person's word about a machine that cannot tell it itself.
+/// Operator confirmation of a fact that a machine cannot report itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the fields are told above them")]
 pub enum Word {
-    /// It has begun its job, by this map where one was named.
+    /// The machine has begun its job, with this map if one was named.
     Started { map_identity: Option<[u8; 32]> },
-    /// It has ended its job, by this map where one was named, and is clear of the part; a measurement came as a file.
+    /// The machine has ended its job, with this map if one was named, and is clear of the part. A measurement came as a
+    /// file.
     Done { map_identity: Option<[u8; 32]>, file: Option<PathBuf> },
-    /// It stands still.
+    /// The machine does not move.
     Still,
 }

@@ -1,8 +1,10 @@
-//! Which columns of a table are coordinates, by the names that its header gives them: understood whole, or refused.
+//! Detection of the columns that are coordinates, by their names in the header: names are understood completely or
+//! rejected.
 //!
-//! A name is an axis with words beside it that say which of its points it is: "X_act", "Measured X", "x (nominal) [mm]". Points that were
-//! measured stand beside nominal ones in what most machines give out, and reading those for these would make every part a good one. So a header
-//! of two groups of coordinates is a question, and a header that names no group at all is not taken for one in the usual order.
+//! A name consists of an axis and of words that say which points it belongs to: "X_act", "Measured X", "x (nominal)
+//! [mm]". Most machines write measured and nominal points in the same table. If the nominal points were read as
+//! measured ones, every part would appear good. So a header with two groups of coordinates is ambiguous and requires a
+//! choice, and a header that names no group at all is not read in the usual order.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -17,14 +19,14 @@ use serde::{Deserialize, Serialize};
 use super::error::{FormatError, excerpt};
 use regrind_core::geometry::{Point, Vector};
 
-/// How a table is read where it does not say so itself, or says more than one thing.
+/// How to read a table that does not state its columns or units, or whose statements are ambiguous.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Table {
-    /// Which columns are x, y and z; without it those that the header names.
+    /// Columns of x, y and z; `None` for those that the header names.
     pub columns: Option<Columns>,
-    /// The unit of the coordinates; without it the millimetre, and a table that states another one is refused.
+    /// Unit of the coordinates; `None` for the millimetre, and then a table that states another unit is rejected.
     pub unit: Option<Unit>,
-    /// The unit of z, where it is another one than that of x and y.
+    /// Unit of z, if it differs from that of x and y.
     pub height_unit: Option<Unit>,
 }
 
@@ -35,7 +37,7 @@ impl Table {
         [unit, unit, self.height_unit.unwrap_or(unit)]
     }
 
-    /// Takes coordinates in its units to millimetres.
+    /// Converts coordinates from the units of the table to millimetres, in place.
     pub(super) fn to_mm(&self, points: &mut [Point]) {
         let units_mm = self.units().map(Unit::in_mm);
         if units_mm != [1.0; 3] {
@@ -114,7 +116,7 @@ impl fmt::Display for Columns {
 }
 
 impl Columns {
-    /// Whether a header has all columns that are given by name, each once.
+    /// Returns true if a header has all columns that are given by name, each once.
     pub(super) fn are_in(&self, names: &[String]) -> bool {
         self.0.iter().all(|column| match column {
             Column::Named(_) => column.among(names).len() == 1,
@@ -122,12 +124,12 @@ impl Columns {
         })
     }
 
-    /// Whether none is given by its name: no header is needed then.
+    /// Returns true if all columns are given by number: then no header is needed.
     pub(super) fn are_numbers(&self) -> bool {
         self.0.iter().all(|column| matches!(column, Column::Numbered(_)))
     }
 
-    /// Returns where they stand among so many columns, or says what is wrong with them.
+    /// Returns the indices of the columns among `count` columns, or an error in words.
     pub(super) fn places(&self, names: &[String], count: usize) -> Result<[usize; 3], String> {
         let mut places = [0; 3];
         for (place, column) in places.iter_mut().zip(&self.0) {
@@ -146,7 +148,7 @@ impl Columns {
 }
 
 impl Column {
-    /// The columns of that name, with or without its unit.
+    /// Returns the indices of the columns of that name, with or without its unit.
     fn among(&self, names: &[String]) -> Vec<usize> {
         let Self::Named(wanted) = self else { return Vec::new() };
         let is = |name: &String| name.trim() == wanted || split_unit(name).0 == wanted;
@@ -182,7 +184,7 @@ impl Unit {
     const ALL: [Self; 6] =
         [Self::Nanometre, Self::Micrometre, Self::Millimetre, Self::Centimetre, Self::Metre, Self::Inch];
 
-    /// Millimetres in one of them.
+    /// Returns the length of one unit, in millimetres.
     pub fn in_mm(self) -> f64 {
         match self {
             Self::Nanometre => 1e-6,
@@ -194,7 +196,7 @@ impl Unit {
         }
     }
 
-    /// The words for it, in lower case; the first is the one that it is asked for by.
+    /// Returns the words for the unit, in lower case; the first one is its name in settings.
     fn words(self) -> &'static [&'static str] {
         match self {
             Self::Nanometre => &["nm", "nanometre", "nanometres", "nanometer", "nanometers"],
@@ -216,7 +218,7 @@ impl Unit {
         }
     }
 
-    /// Returns whether a word in lower case stands for it.
+    /// Returns true if a word in lower case names this unit.
     pub(super) fn is(self, word: &str) -> bool {
         self.words().contains(&word)
     }
@@ -241,10 +243,10 @@ impl fmt::Display for Unit {
     }
 }
 
-/// Points that a column belongs to.
+/// Points that a column belongs to: measured, nominal or not stated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Group {
-    /// Nothing says which.
+    /// The name does not state the group.
     Plain,
     Measured,
     Nominal,
@@ -253,7 +255,7 @@ pub(super) enum Group {
 impl Group {
     const ALL: [Self; 3] = [Self::Plain, Self::Measured, Self::Nominal];
 
-    /// The words that say so, in the languages that machines print.
+    /// Returns the words that state the group, in the languages that machines print.
     fn words(self) -> &'static [&'static str] {
         match self {
             Self::Plain => &["coord", "coordinate", "coordinates", "pos", "position", "koordinate", "koord"],
@@ -312,7 +314,8 @@ impl fmt::Display for Group {
     }
 }
 
-/// Returns the axis, 0 to 2, and the group that a column's name in lower case states, without its unit; none of any other column.
+/// Returns the axis, 0 to 2, and the group that a column's name states (lower case, without its unit); `None` for any
+/// other column.
 fn axis_of(name: &str) -> Option<(usize, Group)> {
     let mut axis = None;
     let mut group = Group::Plain;
@@ -327,7 +330,7 @@ fn axis_of(name: &str) -> Option<(usize, Group)> {
     };
     for word in name.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()) {
         let is_known = take(word) || {
-            // Without anything between: xact, actx.
+            // Names without a separator: xact, actx.
             let after = word.strip_prefix(['x', 'y', 'z']).map(|rest| (&word[..1], rest));
             let before = word.strip_suffix(['x', 'y', 'z']).map(|rest| (&word[rest.len()..], rest));
             let is_group = |rest: &str| Group::ALL.iter().any(|of| of.words().contains(&rest));
@@ -341,22 +344,24 @@ fn axis_of(name: &str) -> Option<(usize, Group)> {
     axis.map(|axis| (axis, group))
 }
 
-/// The columns of each group and axis, from 0.
+/// Columns of each group and axis, from 0.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Axes {
     groups: [[Vec<usize>; 3]; 3],
-    /// A word that stands beside all three axes, and says of none of the groups that it is meant.
+    /// A word that occurs in the names of all three axes and that belongs to none of the known groups.
     unknown: Option<String>,
 }
 
-/// Words beside an axis that make it no coordinate: deviations, directions, tolerances, uncertainties.
+/// Words in the name of an axis that show that the column is not a coordinate: deviations, directions, tolerances,
+/// uncertainties.
 #[rustfmt::skip]
 const BESIDE_AXES: [&str; 41] = [
     "d", "dev", "devs", "deviation", "delta", "diff", "difference", "err", "error", "off", "offset", "abw", "abweichung", "ecart", "écart", "n", "norm", "normal", "normale", "normalvector", "dir", "direction",
     "vec", "vector", "cos", "i", "tol", "tolerance", "upper", "lower", "u", "unc", "uncertainty", "sigma", "std", "rms", "res", "resolution", "scatter", "weight", "quality",
 ];
 
-/// Returns the axis that a name in lower case has a word of, and what else stands in it; of a name that is one word, what stands before or behind a letter at its end.
+/// Returns the axis that a name in lower case contains, and the rest of the name; in a name of one word, the axis is a
+/// letter at either end.
 fn axis_beside(name: &str) -> Option<(usize, String)> {
     let axis_of = |word: &str| ["x", "y", "z"].iter().position(|of| *of == word);
     let words: Vec<&str> = name.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()).collect();
@@ -398,12 +403,13 @@ impl Axes {
         &self.groups[group as usize]
     }
 
-    /// Whether all three axes of any points are named, be it in words that nobody knows.
+    /// Returns true if the header names all three axes of some points, even with an unknown word.
     pub(super) fn are_named(&self) -> bool {
         self.unknown.is_some() || self.groups.iter().any(|group| group.iter().all(|columns| !columns.is_empty()))
     }
 
-    /// Chooses the columns x, y and z, or says what of the names is not clear; `of_nominal` where the nominal points are looked for.
+    /// Returns the columns x, y and z, or a text that says why the names are ambiguous; `of_nominal` allows nominal
+    /// columns.
     pub(super) fn chosen(&self, of_nominal: bool) -> Result<[usize; 3], String> {
         let there: Vec<Group> = Group::ALL
             .into_iter()
@@ -435,7 +441,7 @@ impl Axes {
     }
 }
 
-/// Returns words of a file: as UTF-8, or else as Latin-1, in which many instruments write the sign of micro.
+/// Returns text of a file, decoded as UTF-8 or else as Latin-1; many instruments write the micro sign in Latin-1.
 pub(super) fn text_of(bytes: &[u8]) -> Cow<'_, str> {
     match std::str::from_utf8(bytes) {
         Ok(text) => Cow::Borrowed(text),
@@ -443,13 +449,13 @@ pub(super) fn text_of(bytes: &[u8]) -> Cow<'_, str> {
     }
 }
 
-/// Splits a column's name in lower case into the name proper and the unit it states.
+/// Splits a column's name in lower case into the name itself and the unit that it states.
 pub(super) fn split_unit(name: &str) -> (&str, Option<String>) {
     let name = name.trim();
     for (open, close) in [('[', ']'), ('(', ')')] {
         if let (Some(at), true) = (name.rfind(open), name.ends_with(close)) {
             let unit = name[at + 1..name.len() - 1].trim();
-            // Square brackets hold units by custom, round ones hold anything.
+            // By convention square brackets hold units; round brackets can hold anything.
             let is_mark = !unit.is_empty() && !unit.chars().any(char::is_alphanumeric);
             let states = open == '[' || is_mark || is_unit(unit);
             return if states { (base_of(&name[..at]), Some(unit.to_owned())) } else { (name, None) };
@@ -472,14 +478,15 @@ fn is_millimetre(unit: &str) -> bool {
     Unit::Millimetre.is(unit)
 }
 
-/// Returns whether a word in lower case is a unit of length.
+/// Returns true if a word in lower case is a unit of length.
 pub(super) fn is_unit(word: &str) -> bool {
     is_millimetre(word) || OTHER_UNITS.contains(&word)
 }
 
 /// Returns the unit that a title or a comment states: "units: inch", "UNITS/INCH", "all dimensions in inches".
 ///
-/// A statement counts before a word. Short words may mean anything in a sentence: only those of four letters are taken for units there.
+/// An explicit statement has priority over a word. In a sentence, short words can mean anything: only words of at least
+/// four letters are read as units there.
 fn stated_unit(text: &str) -> Option<String> {
     const SHORTEST: usize = 4;
     unit_statement(text).or_else(|| {
@@ -489,7 +496,8 @@ fn stated_unit(text: &str) -> Option<String> {
     })
 }
 
-/// Units that a title or a comment states: of the heights alone ("height in um", "z: nm", "Heights (waves)"), and of everything.
+/// Units that a title or a comment states: for the heights alone ("height in um", "z: nm", "Heights (waves)"), and for
+/// everything.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct StatedUnits {
     pub(super) of_heights: Option<String>,
@@ -510,13 +518,13 @@ impl StatedUnits {
     }
 }
 
-/// Returns where the unit of the heights stands in a text in lower case.
+/// Returns the place of the unit of the heights in a text in lower case.
 fn height_unit(text: &str) -> Option<Range<usize>> {
     const HEIGHTS: [&str; 10] =
         ["z", "height", "heights", "höhe", "höhen", "hoehe", "sag", "hauteur", "hauteurs", "altura"];
     const NO_LENGTHS: [&str; 6] = ["wave", "waves", "fringe", "fringes", "lambda", "radians"];
     const BETWEEN: [&str; 6] = ["is", "are", "in", "en", "given", "unit"];
-    /// Words before it that make it another height than those of the points.
+    /// Words before it which show that another height is meant, not that of the points.
     const OTHER: [&str; 14] = [
         "step",
         "peak",
@@ -533,7 +541,7 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
         "noise",
         "tolerances",
     ];
-    /// A letter beside a name may be another name.
+    /// A single letter next to a name can be part of another name.
     const SHORTEST: usize = 2;
     let mut words: Vec<Range<usize>> = Vec::new();
     for (at, c) in text.char_indices().filter(|(_, c)| c.is_alphanumeric()) {
@@ -553,7 +561,7 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
         let unit = word(at);
         let is_one = is_unit(unit) || NO_LENGTHS.contains(&unit);
         let is_long = unit.chars().count() >= SHORTEST && (unit != "in" || at > height + 1);
-        // "mil-spec" names no unit, and "M coordinates" no metre.
+        // "mil-spec" does not name a unit, and "M coordinates" does not name the metre.
         let goes_on = text[words.get(at)?.end..].starts_with('-');
         let is_last = at + 1 == words.len();
         (is_one && !goes_on && (is_long || (at > height + 1 && is_last))).then(|| words[at].clone())
@@ -562,14 +570,15 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
     heights.filter(|&k| !(k.saturating_sub(2)..k).any(|before| is_other(word(before)))).find_map(unit_behind)
 }
 
-/// Returns the unit behind a word such as "units:", if one stands there; behind a mark whatever stands there, for it shall be one.
+/// Returns the unit after a word such as "units:", if there is one; after a colon, `=` or `/` returns any text that is
+/// there, because it is meant as a unit.
 fn unit_statement(text: &str) -> Option<String> {
     let behind = text.match_indices("unit").map(|(at, word)| &text[at + word.len()..]);
     behind
         .filter_map(|after| {
             let after = after.strip_prefix(['s', 'e']).unwrap_or(after);
             let states = after.trim_start().strip_prefix([':', '=']).or_else(|| after.strip_prefix('/')).map(str::trim);
-            // "unit in use" names no inch.
+            // "unit in use" does not name the inch.
             let rest = states.or_else(|| after.strip_prefix([' ', '(', '[']))?;
             let end = rest.find(|c: char| !c.is_alphabetic()).unwrap_or(rest.len());
             let word = &rest[..end];
@@ -580,7 +589,7 @@ fn unit_statement(text: &str) -> Option<String> {
         .next()
 }
 
-/// Refuses a file whose header states another unit than the one it is read in.
+/// Rejects a file whose header states a unit other than the one in which it is read.
 pub(super) fn check_stated_unit(
     path: &Path,
     line: u64,
@@ -595,7 +604,7 @@ pub(super) fn check_stated_unit(
     }
 }
 
-/// Marks of the inch.
+/// Symbols of the inch.
 const INCH_MARKS: [&str; 3] = ["\"", "''", "\u{2033}"];
 
 /// Units of length that are not the millimetre, in lower case.

@@ -1,8 +1,9 @@
 //! Results as DMIS output (ISO 22093): the actual points of features, `FA(P17) = FEAT/POINT,CART,x,y,z,i,j,k`.
 //!
-//! A statement ends with its line unless `$` stands at its end; `$$` begins a comment. The unit is that of `UNITS`, which has to stand above
-//! the first point. What a program has written by `TEXT/OUTFIL` says what the file is about, such as `'plan: 5f3c...'`. `PRCOMP/ON` says that the
-//! machine has taken the radius of the probe off, `PRCOMP/OFF` that it has not.
+//! A statement ends with its line unless the line ends with `$`; `$$` begins a comment. `UNITS` gives the unit and must
+//! come before the first point. Text that a program wrote with `TEXT/OUTFIL` contains the statements about the file,
+//! such as `'plan: 5f3c...'`. `PRCOMP/ON` means that the machine has compensated the radius of the probe, `PRCOMP/OFF`
+//! that it has not.
 
 use std::path::Path;
 
@@ -11,26 +12,26 @@ use super::number::is_believable;
 use super::result::{Content, ResultFile, Statements};
 use regrind_core::geometry::Point;
 
-/// Most points that are read.
+/// Maximum number of points that are read.
 const MOST_POINTS: usize = 5_000_000;
 /// Millimetres per inch.
 const INCH_MM: f64 = 25.4;
-/// Words with which a DMIS file begins.
+/// Words that begin a DMIS file.
 const BEGINNINGS: [&[u8]; 5] = [b"DMISMN/", b"DMISMD/", b"FILNAM/", b"UNITS/", b"$$"];
 
-/// Whether a file is one of DMIS, by its first line that is not blank.
+/// Returns true if the first non-blank line of a file is DMIS.
 pub(super) fn is_dmis(head: &[u8]) -> bool {
     let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head).trim_ascii_start();
     BEGINNINGS.iter().any(|word| head.get(..word.len()).is_some_and(|begins| begins.eq_ignore_ascii_case(word)))
 }
 
-/// A statement, in one line, and the line on which it began.
+/// Statement, joined into one line, and the number of the line where it began.
 struct Statement {
     text: String,
     line: u64,
 }
 
-/// What has been read so far.
+/// State of the reader.
 #[derive(Default)]
 struct Reading {
     unit_mm: Option<f64>,
@@ -40,10 +41,10 @@ struct Reading {
     is_ended: bool,
 }
 
-/// Reads what a file says of itself.
+/// Reads the statements of a file about itself.
 ///
 /// # Errors
-/// A statement that says something impossible.
+/// A statement with an impossible value.
 pub(super) fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
     read(path, text).map(|reading| reading.statements)
 }
@@ -51,7 +52,7 @@ pub(super) fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, Fo
 /// Reads the points of a file.
 ///
 /// # Errors
-/// A file without its end, its unit or its points, and numbers that are none, with their lines.
+/// A file without its end, its unit or its points; text in place of a number, with its line.
 pub(super) fn parse(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, FormatError> {
     let Reading { points, names, statements, .. } = read(path, text)?;
     if points.is_empty() {
@@ -69,7 +70,7 @@ pub(super) fn parse(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     })
 }
 
-/// The number of a target in the name of its feature: `P17`.
+/// Returns the number of the target in the name of its feature: `P17`.
 pub(super) fn index_of(name: &str) -> Option<u32> {
     let digits = name.trim().strip_prefix(['P', 'p'])?;
     digits.bytes().all(|b| b.is_ascii_digit()).then(|| digits.parse().ok()).flatten()
@@ -91,7 +92,7 @@ fn read(path: &Path, text: &[u8]) -> Result<Reading, FormatError> {
     Ok(reading)
 }
 
-/// Puts lines together to statements.
+/// Joins lines into statements.
 fn statements(text: &str) -> Vec<Statement> {
     let (mut all, mut begun): (Vec<Statement>, Option<Statement>) = (Vec::new(), None);
     for (line, number) in text.lines().zip(1..) {
@@ -151,7 +152,7 @@ impl Reading {
         Ok(())
     }
 
-    /// Takes what a program has written: `OUTFIL,'plan: 5f3c...'`.
+    /// Reads text that a program wrote: `OUTFIL,'plan: 5f3c...'`.
     fn written(&mut self, path: &Path, statement: &Statement, after: &str) -> Result<(), FormatError> {
         let quoted = after.split_once('\'').and_then(|(_, rest)| rest.rsplit_once('\''));
         match quoted.and_then(|(text, _)| text.split_once(':')) {
@@ -184,7 +185,7 @@ impl Reading {
         let unit_mm =
             self.unit_mm.ok_or_else(|| unexpected(path, statement, "UNITS above the first point", &statement.text))?;
         let fields: Vec<&str> = fields.collect();
-        // The three of a direction stand behind; one that is missing must not be taken from them.
+        // The three numbers of a direction follow; they must not replace a missing coordinate.
         if !matches!(fields.len(), 3 | 6) {
             let found = format!("{} numbers", fields.len());
             return Err(unexpected(path, statement, "3 numbers behind CART, or 6 with a direction", &found));
@@ -247,7 +248,7 @@ mod tests {
             parsed(&file().replace("PRCOMP/OFF", "PRCOMP/ON")).unwrap().coordinates,
             Some(Coordinates::Contacts)
         );
-        // A name that is no target's leaves the order to tell.
+        // A feature name that is not a target's leaves only the order to identify the target.
         assert_eq!(parsed(&file().replace("FA(P9)", "FA(TOP)")).unwrap().indices, None);
     }
 

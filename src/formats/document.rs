@@ -1,4 +1,4 @@
-//! `registration.json` and its companions: everything a registration found, for people and machines.
+//! `registration.json` and its companion files: the full result of a registration, for people and machines.
 
 use std::path::Path;
 
@@ -13,12 +13,12 @@ use regrind_core::registration::{
 };
 use regrind_core::surface::{Distance, Side};
 
-/// What stands in `registration.json`. The names are a contract; lengths are millimetres, angles radians.
+/// Content of `registration.json`. The names are a contract; lengths are in millimetres, angles in radians.
 #[derive(Serialize)]
 #[allow(missing_docs)]
 pub struct RegistrationDocument<'a> {
     pub program: Program,
-    /// Whether the points come from a simulated machine; absent where that is not known.
+    /// True if the points come from a simulated machine; absent if that is unknown.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub simulation: Option<bool>,
     pub nominal: NominalInput<'a>,
@@ -37,7 +37,7 @@ pub struct RegistrationDocument<'a> {
     pub warnings: &'a [String],
     pub converged: bool,
     pub iterations: usize,
-    /// After each step that was taken.
+    /// Values after each accepted step.
     pub objective_mm2: Vec<f64>,
     pub points: usize,
     pub used: usize,
@@ -49,9 +49,9 @@ pub struct RegistrationDocument<'a> {
     /// Indices of the measured points, from 0.
     pub outliers: Vec<usize>,
     pub off_part: Vec<usize>,
-    /// Each point that did not take part, and why.
+    /// Points that did not take part, each with the reason.
     pub left_out: Vec<LeftOut>,
-    /// The figures with the outliers among them; absent where there are none.
+    /// Figures including the outliers; absent if there are no outliers.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rms_with_left_out_mm: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -59,7 +59,7 @@ pub struct RegistrationDocument<'a> {
     pub trace: &'a [Iteration],
 }
 
-/// The program that wrote it.
+/// Program that wrote the file.
 #[derive(Serialize)]
 #[allow(missing_docs)]
 pub struct Program {
@@ -67,35 +67,36 @@ pub struct Program {
     pub version: &'static str,
 }
 
-/// The nominal surface that was registered to.
+/// Nominal surface of the registration.
 #[derive(Serialize)]
 #[allow(missing_docs)]
 pub struct NominalInput<'a> {
     pub file: &'a Path,
     pub points: usize,
-    /// In words.
+    /// Description in words.
     pub kind: String,
 }
 
-/// The points that were registered.
+/// Registered points.
 #[derive(Serialize)]
 #[allow(missing_docs)]
 pub struct MeasuredInput<'a> {
     pub file: &'a Path,
 }
 
-/// A point that did not take part in the fit.
+/// Point that did not take part in the fit.
 #[derive(Serialize)]
 #[allow(missing_docs)]
 pub struct LeftOut {
     /// From 0.
     pub index: usize,
     pub deviation_mm: f64,
-    /// `alone`: far from the surface, and no neighbour found the same. `off_part`: its foot lies beyond the edge of the nominal surface.
+    /// `alone`: far from the surface, and no neighbour has the same deviation. `off_part`: its projection is beyond the
+    /// edge of the nominal surface.
     pub reason: &'static str,
 }
 
-/// Another pose that fits about as well.
+/// Another pose that fits about equally well.
 #[derive(Serialize)]
 #[allow(missing_docs)]
 pub struct Alternative {
@@ -116,7 +117,7 @@ pub struct StandardUncertainty {
 }
 
 impl<'a> RegistrationDocument<'a> {
-    /// Puts together what a registration found and what it was asked.
+    /// Builds the document from the result of a registration and its inputs.
     pub fn new(
         registration: &'a Registration,
         options: &Options,
@@ -169,10 +170,10 @@ impl<'a> RegistrationDocument<'a> {
         }
     }
 
-    /// Makes sure that every number is finite: JSON has no NaN, and would say `null` where a reader expects a number.
+    /// Checks that every number is finite: JSON has no NaN, and would contain `null` instead of a number.
     ///
     /// # Errors
-    /// What is not, in words.
+    /// Name of the value that is not finite, in words.
     pub fn check(&self) -> Result<(), &'static str> {
         let finite = |numbers: &[f64]| numbers.iter().all(|v| v.is_finite());
         let step = |i: &Iteration| finite(&[i.objective_mm2, i.step, i.ball_radius]);
@@ -202,11 +203,11 @@ fn left_out((index, deviation): (usize, &Deviation)) -> Option<LeftOut> {
     Some(LeftOut { index, deviation_mm: deviation.deviation_mm, reason })
 }
 
-/// Writes `deviations.csv`, `deviation_uncertainty.csv` and `registration.json` into a folder; the JSON comes last, so that the
-/// others are whole where it is.
+/// Writes `deviations.csv`, `deviation_uncertainty.csv` and `registration.json` into a folder. The JSON file is written
+/// last: if it exists, the others are complete.
 ///
 /// # Errors
-/// A file that cannot be written, and a deviation that is not finite.
+/// A file that cannot be written; a deviation that is not finite.
 pub fn save_registration(
     folder: &Path,
     document: &RegistrationDocument,

@@ -1,4 +1,4 @@
-//! `figures.json`: what is left on the part, each figure with its labels.
+//! `figures.json`: the figures of the residual error of the part, each with its labels.
 
 use std::path::Path;
 
@@ -13,27 +13,27 @@ use regrind_core::form::{
 };
 use regrind_core::model::Form;
 
-/// What is written of a cycle's figures.
+/// Content of the file for the figures of one cycle.
 #[derive(Serialize)]
 struct FiguresDocument<'a> {
     simulation: bool,
     frame: &'static str,
-    /// Points that took part.
+    /// Number of points that took part.
     points: Option<usize>,
-    /// The form of the part: each figure with what the measurement leaves possible of it, and the raw one.
+    /// Form of the part: each figure with its credible interval, and the raw figure.
     form: Vec<Told>,
-    /// The indication of ISO 10110-5 that the form meets in each of its values with a probability of 97.5 %.
+    /// ISO 10110-5 indication that the form meets in each of its values with a probability of 97.5 %.
     form_iso_10110_5: Option<String>,
-    /// What was measured, the scatter of the probe in it.
+    /// Figures of the measured deviations, which include the noise of the probe.
     figures: Vec<Labelled>,
     iso_10110_5: Option<OfPoints<&'a Iso10110>>,
     zernike: Option<OfPoints<SeriesDocument>>,
     legendre: Option<OfPoints<SeriesDocument>>,
-    /// Which figures there are not, and why.
+    /// Figures that do not exist, each with the reason.
     missing: Vec<String>,
 }
 
-/// Something that is made of the points, with what one must know of it.
+/// Quantity computed from the points, with the labels needed to interpret it.
 #[derive(Serialize)]
 struct OfPoints<T> {
     removed: String,
@@ -59,18 +59,21 @@ struct SeriesDocument {
 #[derive(Serialize)]
 struct TermDocument {
     term: String,
-    /// Least squares of all terms together.
+    /// Coefficient of the least-squares fit of all terms together.
     coefficient_nm: f64,
-    /// What the term takes once it is orthogonal, on the points, to those before it: a root mean square with a sign.
+    /// Signed root mean square that the term removes after it is made orthogonal, on the points, to the terms before
+    /// it.
     orthogonal_nm: f64,
 }
 
-/// What there is to be written of a cycle: the figures of the points, the slopes of the map, and the form; none where there is no map or no form.
+/// Results of a cycle: the figures of the points, the slopes of the map, and the form; `None` if there is no map or no
+/// form.
 pub type Found<'a> = (Result<&'a Figures, &'a FormError>, Option<Result<&'a Slope, &'a FormError>>, Option<&'a Form>);
 
-/// Writes `figures.json`: the figures of the form and beside them those of the points and the slopes of the map, all with what was taken out before.
+/// Writes `figures.json`: the figures of the form, those of the points and the slopes of the map, all with the terms
+/// that were removed before.
 ///
-/// Where there are no figures the file says why.
+/// If there are no figures, the file gives the reason.
 ///
 /// # Errors
 /// A file that cannot be written.

@@ -1,4 +1,4 @@
-//! The folder that results go to.
+//! Folder for results.
 
 use std::fs;
 use std::io;
@@ -8,16 +8,16 @@ use super::error::FormatError;
 use super::registration::try_writing;
 use super::system::{is_socket, link_to};
 
-/// A folder that can be written to; what was created for it goes away again unless it is kept.
+/// Writable folder; the folders that were created for it are removed again unless it is kept.
 #[derive(Debug)]
 pub struct ResultFolder {
     path: PathBuf,
-    /// Folders that did not exist before, the outermost first.
+    /// Folders that did not exist before, outermost first.
     created: Vec<PathBuf>,
 }
 
 impl ResultFolder {
-    /// Creates a folder and its parents where they do not exist, and tries whether a file can be created in it.
+    /// Creates a folder and its parents if they do not exist, and checks that a file can be created in it.
     ///
     /// # Errors
     /// A folder that cannot be created or written to.
@@ -36,12 +36,12 @@ impl ResultFolder {
         Ok(folder)
     }
 
-    /// Returns the folder.
+    /// Returns the path of the folder.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Keeps the folder: it holds a result now.
+    /// Keeps the folder, because it now contains a result.
     pub fn keep(mut self) {
         self.created.clear();
     }
@@ -50,16 +50,16 @@ impl ResultFolder {
 impl Drop for ResultFolder {
     fn drop(&mut self) {
         for folder in self.created.iter().rev() {
-            // Only empty folders go; the error that brought us here is the one to report.
+            // Only empty folders are removed; the first error is the one to report.
             let _ = fs::remove_dir(folder);
         }
     }
 }
 
-/// Removes a socket that nobody listens on any more; anything else of that name is left alone.
+/// Removes a socket without a listener; leaves anything else of that name unchanged.
 ///
 /// # Errors
-/// A folder that cannot be written, and a file of that name that is no socket.
+/// A folder that is not writable; a file of that name that is not a socket.
 pub fn remove_socket(path: &Path) -> std::io::Result<()> {
     if !is_socket(path)? {
         return Err(std::io::Error::from(std::io::ErrorKind::AlreadyExists));
@@ -67,10 +67,11 @@ pub fn remove_socket(path: &Path) -> std::io::Result<()> {
     fs::remove_file(path)
 }
 
-/// Places a link to a device, replacing one that an earlier simulation left; anything else of that name is left alone.
+/// Creates a link to a device, and replaces a link of an earlier simulation; leaves anything else of that name
+/// unchanged.
 ///
 /// # Errors
-/// A folder that cannot be written, and something of that name that is no link.
+/// A folder that is not writable; something of that name that is not a link.
 pub fn place_link(device: &Path, link: &Path) -> std::io::Result<()> {
     if fs::symlink_metadata(link).is_ok() {
         remove_link(link)?;
@@ -78,10 +79,10 @@ pub fn place_link(device: &Path, link: &Path) -> std::io::Result<()> {
     link_to(device, link)
 }
 
-/// Removes a link; anything else of that name is left alone.
+/// Removes a link; leaves anything else of that name unchanged.
 ///
 /// # Errors
-/// A folder that cannot be written, and something of that name that is no link.
+/// A folder that is not writable; something of that name that is not a link.
 pub fn remove_link(link: &Path) -> std::io::Result<()> {
     if !fs::symlink_metadata(link)?.file_type().is_symlink() {
         return Err(std::io::Error::from(std::io::ErrorKind::AlreadyExists));
@@ -89,15 +90,15 @@ pub fn remove_link(link: &Path) -> std::io::Result<()> {
     fs::remove_file(link)
 }
 
-/// A folder for what is only compared, taken away with all in it when this is dropped.
+/// Temporary folder for a comparison, removed with its content when this value is dropped.
 #[derive(Debug)]
 pub struct ScratchFolder(PathBuf);
 
 impl ScratchFolder {
-    /// Takes a path for it; what an earlier one left there is taken away. The folder is made by who writes into it.
+    /// Reserves a path for the folder and removes what an earlier run left there. The writer creates the folder.
     ///
     /// # Errors
-    /// Something there that cannot be taken away.
+    /// Existing content that cannot be removed.
     pub fn at(path: PathBuf) -> Result<Self, FormatError> {
         match fs::remove_dir_all(&path) {
             Err(source) if source.kind() != io::ErrorKind::NotFound => {
@@ -107,7 +108,7 @@ impl ScratchFolder {
         }
     }
 
-    /// Returns where it is.
+    /// Returns the path.
     pub fn path(&self) -> &Path {
         &self.0
     }
@@ -115,20 +116,20 @@ impl ScratchFolder {
 
 impl Drop for ScratchFolder {
     fn drop(&mut self) {
-        // Nobody needs anything of it, and the next one begins by taking it away.
+        // An error is harmless: nothing in it is needed, and the next run removes it first.
         let _ = fs::remove_dir_all(&self.0);
     }
 }
 
-/// Returns the names of the files in a folder, sorted, if it is there. What was being written when a program ended, and so never had
-/// its name, is taken away first: nothing refers to it.
+/// Returns the sorted names of the files in a folder, if the folder exists. First removes unfinished files that a
+/// terminated program left under a temporary name: nothing refers to them.
 pub fn finished_files(folder: &Path) -> Option<Vec<String>> {
     let entries = fs::read_dir(folder).ok()?.flatten().filter(|entry| entry.path().is_file());
     let mut names: Vec<_> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
     names.retain(|name| {
         let unfinished = name.starts_with('.') && name.ends_with(".tmp");
         if unfinished {
-            // It is in nobody's way where it cannot be.
+            // A file that cannot be removed does no harm.
             let _ = fs::remove_file(folder.join(name));
         }
         !unfinished

@@ -1,18 +1,18 @@
-//! Files of other programs that are not read, told by their first bytes, each with what to do.
+//! Files of other programs that are not read, detected by their first bytes, each with a remedy.
 
 use std::path::Path;
 
 use super::error::FormatError;
 
-/// A file that is not read, and how its content gets here all the same.
+/// File format that is not read, and the way to provide its content in another format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Foreign {
-    /// With its article.
+    /// Name of the format, with its article.
     pub found: &'static str,
     pub remedy: &'static str,
 }
 
-/// What is read instead of it.
+/// Alternative that is read.
 const EXPECTED: &str = "points as text or PLY, a mesh, or a map as X3P, SDF or MetroPro";
 
 const AS_TEXT: &str = "save the sheet with the points as CSV";
@@ -21,7 +21,7 @@ const SAMPLE: &str = "sample the surface as points in the CAD system, or export 
 const DEFINE: &str = "write the equation of the surface into a definition (TOML), or export points as text";
 const MAP: &str = "export the map as X3P, or as SDF of version 1.0";
 
-/// First bytes that nothing else has.
+/// First bytes that are unique to a format.
 const BEGINNINGS: [(&[u8], &str, &str); 20] = [
     (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "a workbook of an old Excel, or another file of Office (xls)", AS_TEXT),
     (b"\x1f\x8b", "a file packed by gzip", UNPACK),
@@ -49,7 +49,7 @@ const BEGINNINGS: [(&[u8], &str, &str); 20] = [
     (b"BEGIN PGM", "a program in Klartext", "give the measured points"),
 ];
 
-/// Tells a file that is not read by its first bytes.
+/// Detects a file format that is not read by the first bytes.
 pub(super) fn foreign(head: &[u8]) -> Option<Foreign> {
     let plain = narrowed(head);
     let text = plain.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&plain).trim_ascii_start();
@@ -58,34 +58,34 @@ pub(super) fn foreign(head: &[u8]) -> Option<Foreign> {
     begins.or_else(|| packed(head)).or_else(|| by_lines(text)).or_else(|| surface_data(head))
 }
 
-/// Refuses a file of another program.
+/// Rejects a file of another program.
 pub(super) fn check_is_ours(path: &Path, head: &[u8]) -> Result<(), FormatError> {
     let Some(Foreign { found, remedy }) = foreign(head) else { return Ok(()) };
     Err(FormatError::WrongKind { path: path.to_owned(), expected: EXPECTED, found, remedy })
 }
 
-/// Whether text has two bytes a character, with or without the mark that says so.
+/// Returns true if text has two bytes per character, with or without a byte order mark.
 pub(super) fn is_utf16(head: &[u8]) -> bool {
-    /// So many characters are looked at.
+    /// Number of characters that are checked.
     const LOOKED_AT: usize = 200;
     if head.starts_with(b"\xff\xfe") || head.starts_with(b"\xfe\xff") {
         return true;
     }
     let pairs = || head.chunks_exact(2).take(LOOKED_AT);
-    // ASCII in two bytes: every second one is 0. A cut off last byte does not matter.
+    // ASCII in two bytes: every second byte is 0. A truncated last byte is harmless.
     let is_wide = |zero: usize| pairs().all(|pair| pair[zero] == 0 && matches!(pair[1 - zero], b'\t'..=b'\r' | b' '..));
     head.len() > 3 && (is_wide(0) || is_wide(1))
 }
 
-/// The first bytes of text, one a character.
+/// Returns the first bytes of text, with one byte per character.
 fn narrowed(head: &[u8]) -> std::borrow::Cow<'_, [u8]> {
     if is_utf16(head) { head.iter().copied().filter(|b| (1..0x80).contains(b)).collect() } else { head.into() }
 }
 
-/// Tells what a zip container holds by the names of its first entries; X3P is one too.
+/// Detects the content of a zip container by the names of its first entries; X3P is a zip container too.
 fn packed(head: &[u8]) -> Option<Foreign> {
     const LOCAL: &[u8] = b"PK\x03\x04";
-    /// Where the length of a name and the name stand.
+    /// Offsets of the length of a name and of the name.
     const LENGTH: usize = 26;
     const NAME: usize = 30;
     if !head.starts_with(LOCAL) {
@@ -111,9 +111,9 @@ fn packed(head: &[u8]) -> Option<Foreign> {
     found.map(|(found, remedy)| Foreign { found, remedy })
 }
 
-/// Tells text by its first lines.
+/// Detects text formats by their first lines.
 fn by_lines(text: &[u8]) -> Option<Foreign> {
-    /// Where the letter of a section stands in a line of IGES.
+    /// Column of the section letter in a line of IGES.
     const SECTION: usize = 72;
     let mut lines = text.split(|&b| b == b'\n').map(<[u8]>::trim_ascii_end);
     let (first, second) = (lines.next()?, lines.next().unwrap_or_default());
@@ -124,7 +124,7 @@ fn by_lines(text: &[u8]) -> Option<Foreign> {
         let fields = line.split(u8::is_ascii_whitespace).filter(|field| !field.is_empty());
         fields.map(|field| fast_float2::parse(field).ok()).collect()
     };
-    // Seven numbers of a grid, and rows of a height, its slopes and its twist.
+    // Seven numbers of a grid, then rows of a height, its slopes and its twist.
     let is_sag = numbers(first).zip(numbers(second)).is_some_and(|(grid, row)| {
         grid.len() == 7 && grid[..2].iter().all(|n| n.fract() == 0.0 && *n > 1.0) && matches!(row.len(), 4 | 5)
     });
@@ -149,7 +149,7 @@ fn by_lines(text: &[u8]) -> Option<Foreign> {
     Some(Foreign { found, remedy })
 }
 
-/// Tells surface data files of versions whose heights do not have the meaning of version 1.0.
+/// Detects surface data files of versions whose heights have another meaning than in version 1.0.
 fn surface_data(head: &[u8]) -> Option<Foreign> {
     const AGAIN: &str = "export it as SDF of version 1.0 (ISO), or as X3P";
     let version = head.get(1..8).filter(|_| matches!(head[0], b'a' | b'b' | b'A' | b'B'))?.to_ascii_uppercase();

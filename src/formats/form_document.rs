@@ -1,4 +1,4 @@
-//! What the model of the error says of a registered measurement, as files.
+//! Results of the error model for a registered measurement, as files.
 
 use std::path::Path;
 
@@ -10,54 +10,56 @@ use super::registration::{write_json_atomic, write_rows};
 use regrind_core::model::{BudgetEntry, Form, FormPoint, Interval, IsoFigures, SlopeFigures};
 use regrind_core::registration::Registration;
 
-/// The columns of `form.csv`.
+/// Columns of `form.csv`.
 const FORM_HEADER: &str = "x_mm,y_mm,form_mm,sigma_mm";
 
-/// `model.json`. Lengths in millimetres.
+/// Content of `model.json`. Lengths in millimetres.
 #[derive(Serialize)]
 struct FormDocument<'a> {
-    /// Whether the part is one of a simulated cell; absent where nobody says.
+    /// True if the part comes from a simulated cell; absent if that is unknown.
     #[serde(skip_serializing_if = "Option::is_none")]
     simulation: Option<bool>,
-    /// Standard deviation and range of the form, and scatter of a single point.
+    /// Standard deviation and range of the form; `scatter_mm` below is the noise of a single point.
     form_sigma_mm: f64,
     form_range_mm: f64,
-    /// How often it can be differentiated: once, endless.
+    /// Number of times that the form is differentiable: once or without limit.
     form_smoothness: &'static str,
-    /// Where it is wider along a direction: how many times as wide as across, and the angle of that direction from x.
+    /// Anisotropy of the form: the ratio of the range along the lay to that across it, and the angle of the lay from x.
     form_lay_stretch: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
     form_lay_deg: Option<f64>,
     scatter_mm: f64,
-    /// How much of its scatter the next point along the path has.
+    /// Autocorrelation of the noise from a point to the next one along the path.
     scatter_drift: f64,
-    /// Whether a form shows at all; where it does not, the figures are known from above alone.
+    /// True if a form error is detectable; if not, the figures are only upper bounds.
     form_is_seen: bool,
-    /// How many degrees of freedom the fit leaves; below 20 nothing but a reference sphere tells the form from the scatter.
+    /// Degrees of freedom of the residuals of the fit; below 20, only a reference sphere can separate the form from the
+    /// noise.
     degrees_of_freedom: f64,
-    /// Figures of the form after its own best fit: median, and the interval that holds it with 95 %.
+    /// Figures of the form after its own best fit: median and 95 % credible interval.
     rms: Interval,
     pv: Interval,
     pv_99_8: Interval,
-    /// What the standard uncertainties of the figures come from; the squares of all add up.
+    /// Contributions to the standard uncertainties of the figures; their squares add up.
     budget: &'a [BudgetEntry],
-    /// The slopes of the smooth form, and what ISO 10110-5 says of the form; absent where the points are too few.
+    /// Slopes of the smooth form, and its figures by ISO 10110-5; absent if there are too few points.
     #[serde(skip_serializing_if = "Option::is_none")]
     slope: Option<SlopeFigures>,
     #[serde(skip_serializing_if = "Option::is_none")]
     iso_10110_5: Option<IsoFigures>,
-    /// The same of the deviations as they were measured, the scatter of the probe in them.
+    /// The same figures of the measured deviations, which include the noise of the probe.
     raw_rms_mm: f64,
     raw_pv_mm: f64,
-    /// How well the place of the nominal frame is known; `covariance` of registration.json is how well the same pose is found again.
+    /// Uncertainty of the position of the nominal frame; `covariance` of registration.json is the repeatability of the
+    /// same pose.
     frame_standard_uncertainty: StandardUncertainty,
     frame_covariance: [[f64; 6]; 6],
 }
 
-/// Writes `model.json`, and `form.csv` with a row a measured point that was used, in the order given.
+/// Writes `model.json`, and `form.csv` with one row per measured point that was used, in the order given.
 ///
 /// # Errors
-/// A folder that cannot be written.
+/// A folder that is not writable.
 pub fn save_form(
     folder: &Path,
     form: &Form,

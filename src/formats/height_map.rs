@@ -1,4 +1,4 @@
-//! A map of heights over a regular grid, as interferometers and profilometers give it.
+//! Maps of heights over a regular grid, from interferometers and profilometers.
 
 use std::path::Path;
 
@@ -6,31 +6,32 @@ use super::error::FormatError;
 use super::number::{LIMIT_MM, is_believable};
 use regrind_core::geometry::{Grid, Point};
 
-/// Most samples of a map that is read: 450 MB of them.
+/// Maximum number of samples of a map that is read: 450 MB of them.
 pub(super) const MOST_SAMPLES: u64 = 50_000_000;
 
-/// Heights over a regular grid in x and y, some of which may not have been measured.
+/// Heights over a regular grid in x and y; some samples can be missing.
 ///
-/// Frame: that of the instrument, right-handed: x to the right, y upwards, z towards the instrument. Units: millimetres.
+/// Frame: that of the instrument, right-handed: x to the right, y upwards, z towards the instrument. Units:
+/// millimetres.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeightMap {
-    /// Where the samples are.
+    /// Grid of the samples.
     pub grid: Grid,
-    /// The heights; finite everywhere, 0 where `valid` is not.
+    /// Heights; finite everywhere, and 0 for samples that are not valid.
     pub heights_mm: Vec<f64>,
-    /// Whether a sample was measured.
+    /// True for each sample that was measured.
     pub valid: Vec<bool>,
-    /// What the reader had to decide about the file, in words.
+    /// Decisions of the reader about ambiguous content, in words.
     pub notes: Vec<String>,
 }
 
 impl HeightMap {
-    /// Lays samples on a grid; `None` is a sample that was not measured.
+    /// Creates a map from samples on a grid; `None` is a sample that was not measured.
     ///
     /// # Errors
-    /// No sample along an axis, more than 50 million of them or another number than the grid has; a spacing that is not above
-    /// 0; a place or a height that is NaN, infinite or beyond 1e7 mm; not one sample that was measured. `path` is only what
-    /// messages call the file.
+    /// An axis without samples; more than 50 million samples, or a number of samples that differs from the grid; a
+    /// spacing that is not above 0; a position or a height that is NaN, infinite or beyond 1e7 mm; no measured sample
+    /// at all. `path` only names the file in messages.
     pub fn new(path: &Path, grid: Grid, samples: impl IntoIterator<Item = Option<f64>>) -> Result<Self, FormatError> {
         let Grid { columns, rows, first_mm, spacing_mm } = grid;
         let unexpected = |place: String, expected: &str, found: String| FormatError::Unexpected {
@@ -86,12 +87,12 @@ impl HeightMap {
             .collect()
     }
 
-    /// Returns how many samples were measured.
+    /// Returns the number of measured samples.
     pub fn measured_count(&self) -> usize {
         self.valid.iter().filter(|v| **v).count()
     }
 
-    /// Returns the largest less the least measured height, in millimetres.
+    /// Returns the maximum minus the minimum of the measured heights, in millimetres.
     pub fn pv_mm(&self) -> f64 {
         let (low, high) = self.measured().fold((f64::MAX, f64::MIN), |(l, h), (_, z)| (l.min(z), h.max(z)));
         high - low
@@ -109,13 +110,13 @@ impl HeightMap {
     }
 }
 
-/// A format of maps.
+/// Format of maps.
 pub(super) struct MapFormat {
-    /// Whether the first bytes of a file are those of one.
+    /// Returns true if the first bytes of a file are those of this format.
     pub(super) begins: fn(&[u8]) -> bool,
     /// Reads a file.
     pub(super) read: fn(&Path) -> Result<MapPoints, FormatError>,
-    /// Parses the bytes of a file; the path is what messages call it.
+    /// Parses the bytes of a file; the path names the file in messages.
     pub(super) parse: fn(&Path, &[u8]) -> Result<MapPoints, FormatError>,
 }
 
@@ -133,8 +134,8 @@ impl MapFormat {
     }
 }
 
-/// Refuses heights of which several far from all others are exactly the same: -9999 and the like, which some programs write where
-/// nothing was measured. A surface that is as far off has more than one height.
+/// Rejects a map in which several heights far from all others are exactly equal, such as -9999: some programs write
+/// this value for samples that were not measured. A real surface that far away would have different heights.
 fn check_marks(path: &Path, heights_mm: impl Iterator<Item = f64> + Clone) -> Result<(), FormatError> {
     const FAR: f64 = 10.0;
     let (low, high) = heights_mm.clone().fold((f64::MAX, f64::MIN), |(low, high), z| (low.min(z), high.max(z)));
@@ -155,7 +156,7 @@ fn check_marks(path: &Path, heights_mm: impl Iterator<Item = f64> + Clone) -> Re
     Ok(())
 }
 
-/// The measured points of a map, and what the reader had to decide about it.
+/// Measured points of a map, and the decisions of the reader about it.
 pub(super) struct MapPoints {
     pub(super) points: Vec<Point>,
     pub(super) notes: Vec<String>,
@@ -167,7 +168,7 @@ impl From<HeightMap> for MapPoints {
     }
 }
 
-/// Refuses a grid that has no sample or more than are read, before anything is reserved for it.
+/// Rejects a grid without samples or with too many, before memory is reserved for it.
 pub(super) fn check_size(path: &Path, columns: u64, rows: u64) -> Result<(), FormatError> {
     let samples = columns.saturating_mul(rows);
     match samples {
@@ -199,7 +200,7 @@ mod tests {
         assert_eq!((points.len(), map.measured_count()), (5, 5));
         assert_eq!((points[1], points[4]), (Point::new(-0.5, 4.0, 1.0), Point::new(0.0, 6.0, 5.0)));
         assert_eq!((map.pv_mm(), map.heights_mm[4]), (5.0, 0.0));
-        // 0 1 2 3 5: mean 2.2, squares about it 4.84 1.44 0.04 0.64 7.84.
+        // 0 1 2 3 5: mean 2.2, squared deviations from it 4.84 1.44 0.04 0.64 7.84.
         assert!((map.rms_mm() - (14.8f64 / 5.0).sqrt()).abs() < 1e-15);
     }
 

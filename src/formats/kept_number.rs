@@ -1,20 +1,20 @@
-//! A number that outlives the program which counts it.
+//! Persistent counter: a number that outlives the program that counts it.
 
 use std::fs::{File, TryLockError};
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
-/// A number in a file of its own, which one program has at a time.
+/// Number in a file of its own, locked by one program at a time.
 #[derive(Debug)]
 pub struct KeptNumber {
     file: File,
 }
 
 impl KeptNumber {
-    /// Takes the number for this program until this is dropped; none where another program has it.
+    /// Locks the number for this program until the value is dropped; returns `None` if another program holds the lock.
     ///
     /// # Errors
-    /// A file that cannot be made, written or locked.
+    /// A file that cannot be created, written or locked.
     pub fn take(path: &Path) -> io::Result<Option<Self>> {
         let file = File::options().read(true).write(true).create(true).truncate(false).open(path)?;
         match file.try_lock() {
@@ -24,7 +24,7 @@ impl KeptNumber {
         }
     }
 
-    /// Reads the number; none where there was none yet, or what stands there is no number.
+    /// Reads the number; returns `None` if none was written yet, or if the content is not a number.
     ///
     /// # Errors
     /// A file that cannot be read.
@@ -37,10 +37,10 @@ impl KeptNumber {
         }
     }
 
-    /// Writes another number.
+    /// Writes a new number.
     ///
     /// # Errors
-    /// A disk that is full.
+    /// A file that cannot be written, for example because the disk is full.
     pub fn set(&mut self, number: u64) -> io::Result<()> {
         self.file.seek(SeekFrom::Start(0))?;
         self.file.write_all(format!("{number:<20}\n").as_bytes())
@@ -49,7 +49,7 @@ impl KeptNumber {
 
 impl Drop for KeptNumber {
     fn drop(&mut self) {
-        // Closing would not do: a child that another thread has just forked shares the lock until its exec.
+        // Closing the file is not enough: a child that another thread has just forked shares the lock until its exec.
         let _ = self.file.unlock();
     }
 }
@@ -66,7 +66,7 @@ mod tests {
         assert_eq!(number.get().unwrap(), None);
         number.set(255).unwrap();
         number.set(7).unwrap();
-        // What a child has between its fork and its exec.
+        // The handle that a child has between its fork and its exec.
         let _of_a_child = number.file.try_clone().unwrap();
         assert!(KeptNumber::take(&path).unwrap().is_none());
         drop(number);

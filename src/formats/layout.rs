@@ -1,4 +1,5 @@
-//! How a text cloud is laid out: separator, columns, decimal mark, units. Found in its first lines, then enforced.
+//! Layout of a text cloud: separator, columns, decimal mark, units. It is detected in the first lines and then required
+//! of all.
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -7,7 +8,7 @@ use super::columns::{Axes, StatedUnits, Table, Unit, is_unit, split_unit, text_o
 use super::error::{FormatError, excerpt};
 use super::number::{Decimal, Evidence, evidence, looks_numeric, without_blanks};
 
-/// What stands between two columns.
+/// Separator between two columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Separator {
     Comma,
@@ -18,10 +19,10 @@ pub(super) enum Separator {
 }
 
 impl Separator {
-    /// In the order in which they are tried: a semicolon or a tab is hardly ever anything else.
+    /// In the order in which they are tried: a semicolon or a tab is almost never anything else.
     const ALL: [Self; 4] = [Self::Tab, Self::Semicolon, Self::Comma, Self::Blank];
 
-    /// Returns the byte that separates; for blanks one of the two.
+    /// Returns the byte that separates columns; for blanks, one of the two possible bytes.
     pub(super) fn byte(self) -> u8 {
         match self {
             Self::Comma => b',',
@@ -31,7 +32,7 @@ impl Separator {
         }
     }
 
-    /// Returns whether a byte may surround a field without belonging to it.
+    /// Returns true if a byte can surround a field without belonging to it.
     pub(super) fn pads(self, byte: u8) -> bool {
         byte == b' ' || (byte == b'\t' && self != Self::Tab)
     }
@@ -45,7 +46,7 @@ impl Separator {
         }
     }
 
-    /// Returns a field without the blanks that group its thousands; only where neither blanks nor commas separate columns.
+    /// Returns a field without the blanks that group its thousands, if neither blanks nor commas separate columns.
     pub(super) fn ungrouped(self, field: &[u8]) -> Cow<'_, [u8]> {
         let may = matches!(self, Self::Tab | Self::Semicolon);
         may.then(|| without_blanks(field)).flatten().map_or(Cow::Borrowed(field), Cow::Owned)
@@ -56,7 +57,7 @@ impl Separator {
     }
 }
 
-/// The columns of one line, trimmed and out of their quotes.
+/// Columns of one line, trimmed and without their quotes.
 pub(super) struct Fields<'a> {
     rest: Option<&'a [u8]>,
     separator: Separator,
@@ -76,7 +77,8 @@ impl<'a> Iterator for Fields<'a> {
         let rest = self.rest?;
         let padding = rest.iter().take_while(|&&b| self.separator.pads(b)).count();
         let start = &rest[padding..];
-        // A separator inside quotes does not count; a quote that is never closed is left in the field and found out there.
+        // A separator inside quotes does not count. A quote that is never closed stays in the field, and its parsing
+        // reports it.
         let closing = match start {
             [b'"', inside @ ..] => inside.iter().position(|&b| b == b'"').map_or(0, |at| at + 1),
             _ => 0,
@@ -91,21 +93,21 @@ impl<'a> Iterator for Fields<'a> {
     }
 }
 
-/// How to read every line of a cloud.
+/// Layout that applies to every line of a cloud.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Layout {
     pub(super) separator: Separator,
-    /// Where x, y and z stand, from 0.
+    /// Columns of x, y and z, from 0.
     pub(super) columns: [usize; 3],
-    /// How many columns every line has.
+    /// Number of columns of every line.
     pub(super) count: usize,
     pub(super) decimal: Decimal,
-    /// The first line with data, from 1.
+    /// First line with data, from 1.
     pub(super) first_line: u64,
 }
 
 impl Layout {
-    /// Returns the x, y and z fields of a line and how many columns it has.
+    /// Returns the x, y and z fields of a line and its number of columns.
     pub(super) fn pick<'a>(&self, line: &'a [u8]) -> ([&'a [u8]; 3], usize) {
         let mut picked = [&line[..0]; 3];
         let mut count = 0;
@@ -118,7 +120,7 @@ impl Layout {
         (picked, count)
     }
 
-    /// Settles the decimal mark by the first lines that tell it.
+    /// Determines the decimal mark from the first lines that show it.
     ///
     /// Errors: the first number with a comma, if nothing tells what the commas mean.
     pub(super) fn settle_decimal(&mut self, path: &Path, text: &[u8]) -> Result<(), FormatError> {
@@ -148,26 +150,26 @@ impl Layout {
     }
 }
 
-/// Returns whether a line is a comment.
+/// Returns true if a line is a comment.
 pub(super) fn is_comment(line: &[u8]) -> bool {
     let line = line.trim_ascii_start();
     line.starts_with(b"#") || line.starts_with(b"//")
 }
 
-/// What stands above the data, gathered line by line until the first point shows the layout.
+/// Lines above the data, collected until the first point shows the layout.
 #[derive(Debug)]
 pub(super) struct Preamble<'p> {
     path: &'p Path,
-    /// Whether the nominal points are looked for.
+    /// True if nominal points are wanted.
     of_nominal: bool,
-    /// The columns and the unit that a person gave.
+    /// Columns and unit that a person gave.
     table: &'p Table,
-    /// The last comment that names x, y and z: many programs comment their header out.
+    /// Last comment that names x, y and z: many programs write their header as a comment.
     comment: Option<(u64, Vec<u8>)>,
     header: Option<(u64, Vec<u8>)>,
-    /// The line of units below the header.
+    /// Line of units below the header.
     units: Option<(u64, Vec<String>)>,
-    /// A line of words and numbers that is a title, if a header follows it.
+    /// Error for a line of words and numbers; the line is a title, and no error, if a header follows it.
     title: Option<FormatError>,
 }
 
@@ -176,13 +178,13 @@ impl<'p> Preamble<'p> {
         Self { path, of_nominal, table, comment: None, header: None, units: None, title: None }
     }
 
-    /// Returns the names of the columns in lower case, if a header gives each of them one.
+    /// Returns the names of the columns in lower case, if a header names each of them.
     pub(super) fn names(&self, separator: Separator) -> Vec<String> {
         let header = self.header.as_ref().or(self.comment.as_ref());
         header.map_or(Vec::new(), |(_, line)| names(line, separator))
     }
 
-    /// Takes the next line and returns the layout if it is the first with data.
+    /// Reads the next line and returns the layout if it is the first line with data.
     pub(super) fn take(&mut self, line: &[u8], number: u64) -> Result<Option<Layout>, FormatError> {
         let content = line.trim_ascii();
         if content.is_empty() || (number == 1 && is_separator_line(content)) {
@@ -204,7 +206,7 @@ impl<'p> Preamble<'p> {
         Ok(Some(Layout { separator, columns, count, decimal: Decimal::Point, first_line: number }))
     }
 
-    /// Takes a line without a point in it: the header, a title or the units above or below it, or an error.
+    /// Reads a line without a point: the header, a title, a line of units, or an error.
     fn take_words(&mut self, line: &[u8], number: u64) -> Result<(), FormatError> {
         let likely = likely_separator(line);
         let fields: Vec<&[u8]> = Fields::of(line, likely).collect();
@@ -231,7 +233,7 @@ impl<'p> Preamble<'p> {
         Ok(())
     }
 
-    /// The error of a line that is no point.
+    /// Returns the error for a line that is not a point.
     fn no_point(&self, line: &[u8], number: u64) -> FormatError {
         let path = self.path.to_owned();
         let fields: Vec<&[u8]> = Fields::of(line, likely_separator(line)).collect();
@@ -242,7 +244,7 @@ impl<'p> Preamble<'p> {
         }
     }
 
-    /// Says why no point was found under what was read.
+    /// Returns the reason why no point was found in the text read.
     pub(super) fn without_points(mut self) -> FormatError {
         let path = self.path.to_owned();
         match (self.title.take(), &self.header) {
@@ -253,7 +255,7 @@ impl<'p> Preamble<'p> {
         }
     }
 
-    /// Whether a line names coordinates.
+    /// Returns true if a line names coordinates.
     fn is_understood(&self, header: &[u8]) -> bool {
         let names = names(header, likely_separator(header));
         match &self.table.columns {
@@ -263,30 +265,31 @@ impl<'p> Preamble<'p> {
         }
     }
 
-    /// Refuses a unit that a table states, unless it is the one that it is read in.
+    /// Rejects a unit that a table states, unless it is the one in which the table is read.
     fn check_unit(&self, line: u64, found: String, unit: Unit) -> Result<(), FormatError> {
         if unit.is(&found) { Ok(()) } else { Err(FormatError::Unit { path: self.path.to_owned(), line, found, unit }) }
     }
 
-    /// Refuses a text that speaks of other units.
+    /// Rejects a text that mentions other units.
     fn check_stated(&self, line: u64, text: &[u8]) -> Result<(), FormatError> {
         self.check_heights(line, text)?;
         let of_all = StatedUnits::found_in(&text_of(text)).of_all;
         of_all.map_or(Ok(()), |found| self.check_unit(line, found, self.table.units()[0]))
     }
 
-    /// Refuses a text that speaks of another unit of the heights.
+    /// Rejects a text that mentions another unit of the heights.
     fn check_heights(&self, line: u64, text: &[u8]) -> Result<(), FormatError> {
         let of_heights = StatedUnits::found_in(&text_of(text)).of_heights;
         of_heights.map_or(Ok(()), |found| self.check_unit(line, found, self.table.units()[2]))
     }
 
-    /// Refuses a title that speaks of another unit; a person who gave the unit of all has answered what it says of all.
+    /// Rejects a title that mentions another unit. If a person gave the unit, the title's statement about all
+    /// coordinates is ignored.
     fn check_title(&self, title: &[u8], number: u64) -> Result<(), FormatError> {
         if self.table.unit.is_some() { self.check_heights(number, title) } else { self.check_stated(number, title) }
     }
 
-    /// Refuses other units that a header states of x, y and z.
+    /// Rejects other units that a header states for x, y and z.
     fn check_units(&self, line: u64, columns: [usize; 3], names: &[String]) -> Result<(), FormatError> {
         let stated = |column: usize| split_unit(names.get(column)?).1;
         let pairs = columns.into_iter().zip(self.table.units());
@@ -295,14 +298,15 @@ impl<'p> Preamble<'p> {
             .try_for_each(|(found, unit)| self.check_unit(line, found, unit))
     }
 
-    /// Refuses other units in the line below the header; where that has no unit for each column, all are those of x and y.
+    /// Rejects other units in the line below the header; if it does not have one unit per column, all of its units
+    /// count for x and y.
     fn check_unit_line(&self, columns: [usize; 3], count: usize) -> Result<(), FormatError> {
         let Some((line, units)) = &self.units else { return Ok(()) };
         let of_axes = self.table.units();
         let unit_of = |column: usize| match columns.iter().position(|of| *of == column) {
             Some(axis) if units.len() == count => Some(of_axes[axis]),
             Some(_) => Some(of_axes[0]),
-            // A column beside the coordinates has a unit of its own.
+            // A column other than the coordinates has its own unit.
             None => (units.len() != count).then_some(of_axes[0]),
         };
         let stated = units.iter().enumerate().filter(|(_, found)| !found.is_empty());
@@ -311,7 +315,7 @@ impl<'p> Preamble<'p> {
             .try_for_each(|(found, unit)| self.check_unit(*line, found.clone(), unit))
     }
 
-    /// Takes a line of units below a header; false where it is none.
+    /// Reads a line of units below a header; returns false if it is not one.
     fn take_units(&mut self, fields: &[&[u8]], number: u64) -> bool {
         let unit = |field: &&[u8]| text_of(field).trim_matches(['[', ']', '(', ')', ' ']).to_lowercase();
         let units: Vec<String> = fields.iter().map(unit).collect();
@@ -336,7 +340,8 @@ impl<'p> Preamble<'p> {
         Ok(())
     }
 
-    /// Returns which columns hold x, y and z: those that the header names, or of a table without names the only three, or those before unit normals.
+    /// Returns the columns that hold x, y and z: those that the header names, or, in a table without names, the only
+    /// three or those before unit normals.
     fn columns(
         &self,
         separator: Separator,
@@ -372,7 +377,7 @@ impl<'p> Preamble<'p> {
             None => Axes::of(&names).chosen(self.of_nominal),
         };
         if names.len() != count && !names.is_empty() {
-            // A comment may be a sentence that names the three columns of a table in their order.
+            // A comment can be a sentence that names the three columns of a table in their order.
             let is_sentence = self.header.is_none() && count == 3 && names.len() > count;
             if is_sentence && columns.as_ref().is_ok_and(|columns| columns.is_sorted()) {
                 return Ok([0, 1, 2]);
@@ -392,7 +397,7 @@ impl<'p> Preamble<'p> {
     }
 }
 
-/// Whether the last three of six columns are a direction.
+/// Returns true if the last three of six columns are a direction.
 fn has_normal(line: &[u8], separator: Separator) -> bool {
     const OFF: f64 = 1e-3;
     let last = Fields::of(line, separator).skip(3);
@@ -401,7 +406,8 @@ fn has_normal(line: &[u8], separator: Separator) -> bool {
     squares.is_some_and(|squares| (squares.iter().sum::<f64>() - 1.0).abs() < OFF)
 }
 
-/// Returns the separator under which a line is a point: three numbers first, or else three numbers anywhere.
+/// Returns the separator with which a line is a point: preferably three numbers at the start, or else three numbers
+/// anywhere.
 fn data_separator(line: &[u8]) -> Option<Separator> {
     let numbers = |separator: Separator, first: usize| {
         let fields = Fields::of(line, separator).take(first);
@@ -411,13 +417,13 @@ fn data_separator(line: &[u8]) -> Option<Separator> {
     first_three.or_else(|| Separator::ALL.into_iter().find(|&separator| numbers(separator, usize::MAX) >= 3))
 }
 
-/// Returns the separator a line of words seems to have.
+/// Returns the separator that a line of words appears to have.
 fn likely_separator(line: &[u8]) -> Separator {
     let there = |separator: &Separator| line.contains(&separator.byte());
     Separator::ALL.into_iter().find(there).unwrap_or(Separator::Blank)
 }
 
-/// Returns the names of the columns in lower case; a unit set off by a blank belongs to the name before it.
+/// Returns the names of the columns in lower case; a unit separated by a blank belongs to the name before it.
 fn names(header: &[u8], separator: Separator) -> Vec<String> {
     let mut names: Vec<String> = Vec::new();
     for field in Fields::of(header, separator) {
@@ -430,13 +436,13 @@ fn names(header: &[u8], separator: Separator) -> Vec<String> {
     names
 }
 
-/// Whether a line says which byte separates the columns, as Excel writes it: `sep=;`.
+/// Returns true if a line states the separator, as Excel writes it: `sep=;`.
 pub(super) fn is_separator_line(line: &[u8]) -> bool {
     let line = line.trim_ascii();
     line.len() <= 5 && line.get(..4).is_some_and(|word| word.eq_ignore_ascii_case(b"sep="))
 }
 
-/// Whether lines have nothing but empty columns, or the mark that once ended a text.
+/// Returns true if all lines have only empty columns, or only an old end-of-file mark.
 pub(super) fn are_empty_rows(lines: &[u8], separator: Separator) -> bool {
     lines.iter().all(|b| b"\"\x1a \t\r\n".contains(b) || separator.separates(*b))
 }

@@ -1,4 +1,4 @@
-//! What a finished run knows of the grinder, kept for the next part of the same kind.
+//! Knowledge of the grinder that a finished run saves for the next part of the same kind.
 
 use std::path::{Path, PathBuf};
 
@@ -10,61 +10,61 @@ use super::whole::read_whole;
 use regrind_core::compensation::{Alike, Correction, LearningState, Set, Shared};
 use regrind_core::model::PartPriors;
 
-/// The file in a run folder.
+/// Name of the file in a run folder.
 pub const LEARNED: &str = "learned.json";
-/// A file larger than this is none of ours.
+/// Maximum size of the file, in bytes; a larger file is not one of Regrind's.
 const MOST_BYTES: u64 = 256 << 20;
 
-/// How the file is laid out; another number is not read.
+/// Version of the file's layout; a file of another version is not read.
 const LAYOUT: u32 = 2;
 
-/// The correction that took back what comes in every pass, and how well it is known.
+/// Correction that compensates the error common to all passes, and its uncertainty.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Learned {
     layout: u32,
-    /// Whether the passes were simulated.
+    /// True if the passes were simulated.
     pub simulation: bool,
-    /// What the passes had in common; a run with another of these learns nothing from it.
+    /// Setting that the passes had in common; a run with another setting learns nothing from this file.
     pub setting: String,
-    /// The run that it was learned in.
+    /// Run from which the correction was learned.
     pub run: String,
-    /// The correction that the next pass of that part would have had.
+    /// Correction that the next pass of that part would have had.
     pub correction: Correction,
-    /// How well it is known.
+    /// State of learning: how well the correction is known.
     pub known: LearningState,
-    /// What this part and those before it taught of the fields of their errors; nothing in files of earlier versions.
+    /// Priors of the error fields, learned from this part and those before it; absent in files of earlier versions.
     #[serde(default)]
     pub fields: PartPriors,
-    /// What other cells have to have in common with the passes to begin with what was learned; nothing in files of earlier versions.
+    /// Kind that other cells must share with these passes to begin with this file; absent in files of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub kind: Option<String>,
-    /// Who taught it, where this is what other cells found and no run of this one.
+    /// Cells that the knowledge comes from, if it is from other cells and not from a run of this one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub taught_by: Option<TaughtBy>,
 }
 
-/// Where what a first part begins with comes from.
+/// Origin of the knowledge that a first part begins with.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TaughtBy {
-    /// The cells and the run of each.
+    /// Cells, and the run of each.
     pub runs: Vec<CellRun>,
-    /// For each band of wavelengths that was taken over: the waves from which it is, in millimetres, and the rms share of what comes back there that
-    /// is taken to be a machine's own.
+    /// For each band of wavelengths that was taken over: its shortest wavelength, in millimetres, and the rms share of
+    /// the repeatable error in it that is assumed to be specific to a machine.
     pub differ: Vec<[f64; 2]>,
-    /// Comparisons of machines that tell this.
+    /// Number of comparisons between machines on which this is based.
     pub comparisons: usize,
 }
 
-/// A run of a cell.
+/// Run of a cell.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CellRun {
-    /// What the cell is called in the plant.
+    /// Name of the cell in the plant.
     pub cell: String,
-    /// Its run.
+    /// Name of the run.
     pub run: String,
 }
 
-/// What tells whether a file is looked for at all.
+/// Fields that decide if the rest of a file is read.
 #[derive(Deserialize)]
 struct Head {
     #[serde(default)]
@@ -73,7 +73,7 @@ struct Head {
     setting: String,
 }
 
-/// Why nothing is learned from a file.
+/// Reason why nothing is learned from a file.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -85,16 +85,18 @@ pub enum LearnedError {
 }
 
 impl Learned {
-    /// What a run leaves to the next part.
+    /// Creates the knowledge that a run leaves to the next part.
     pub fn new(simulation: bool, setting: String, run: String, correction: Correction, known: LearningState) -> Self {
         let (fields, kind, taught_by) = (PartPriors::default(), None, None);
         Self { layout: LAYOUT, simulation, setting, run, correction, known, fields, kind, taught_by }
     }
 
-    /// What the first part of a recipe begins with on a machine that has not ground it: what others found, as far as machines are alike. `None` where
-    /// they tell nothing of it. `fresh` and `none` are what it begins with without them.
+    /// Returns the start for the first part of a recipe on a machine that has not ground it yet: the results of other
+    /// machines, as far as machines are similar. Returns `None` if they give no information. `fresh` and `none` are the
+    /// state and the correction to begin with otherwise.
     ///
-    /// Another machine's wheel and setting are another machine's: what parameters took back there is in the map here.
+    /// The wheel and the setting of another machine differ from those of this one: the correction by its parameters is
+    /// part of the map here.
     pub fn from_others(
         others: &[(CellRun, Self)],
         alike: &Alike,
@@ -112,22 +114,23 @@ impl Learned {
         Some(Self { taught_by, ..learned.with_fields(PartPriors::pooled(&fields)) })
     }
 
-    /// The same for other cells too, that have this in common with it.
+    /// Returns the same knowledge with the kind that other cells must share.
     #[must_use]
     pub fn of_kind(self, kind: String) -> Self {
         Self { kind: Some(kind), ..self }
     }
 
-    /// The same with what was taught of the fields.
+    /// Returns the same knowledge with the priors of the error fields.
     #[must_use]
     pub fn with_fields(self, fields: PartPriors) -> Self {
         Self { fields, ..self }
     }
 
-    /// Reads what a run left, and the file as it is; `None` where it left nothing, or nothing for this setting.
+    /// Reads the knowledge that a run left, together with the bytes of the file; returns `None` if there is none, or
+    /// none for this setting.
     ///
     /// # Errors
-    /// A file that cannot be read, that is none of ours, or whose numbers cannot be.
+    /// A file that cannot be read or is not one of Regrind's; numbers that are impossible.
     pub fn read(run: &Path, setting: &str, simulation: bool) -> Result<Option<(Self, Vec<u8>)>, LearnedError> {
         let path = run.join(LEARNED);
         let broken = |why| LearnedError::Broken { path: path.clone(), why };
@@ -141,7 +144,7 @@ impl Learned {
             }
             Err(error) => return Err(error.into()),
         };
-        // First whether it is meant at all: what another part left, or an earlier version, is in nobody's way.
+        // The head is read first: a file of another part or of an earlier version is ignored without an error.
         let head: Head = serde_json::from_slice(&text).map_err(|error| broken(error.to_string()))?;
         if head.layout != LAYOUT || head.simulation != simulation || head.setting != setting {
             return Ok(None);
@@ -149,10 +152,10 @@ impl Learned {
         Self::of(&path, &text).map(|learned| Some((learned, text)))
     }
 
-    /// Reads what another cell's run left, of this kind and simulation; `from` says where it came from.
+    /// Reads the knowledge of another cell's run, of this kind and simulation; `from` names its origin.
     ///
     /// # Errors
-    /// A text that is none of ours, of another kind, or whose numbers cannot be.
+    /// A text that is not one of Regrind's, that is of another kind, or that has impossible numbers.
     pub fn of_another(from: &Path, text: &[u8], kind: &str, simulation: bool) -> Result<Self, LearnedError> {
         let learned = Self::of(from, text)?;
         let is_meant = learned.layout == LAYOUT
@@ -167,10 +170,10 @@ impl Learned {
         }
     }
 
-    /// Reads the copy that a run kept of what it began with; `path` is what messages call it.
+    /// Reads the copy that a run saved of its start; `path` names the file in messages.
     ///
     /// # Errors
-    /// A text that is none of ours, or whose numbers cannot be.
+    /// A text that is not one of Regrind's, or that has impossible numbers.
     pub fn of(path: &Path, text: &[u8]) -> Result<Self, LearnedError> {
         let broken = |why| LearnedError::Broken { path: path.to_owned(), why };
         let learned: Self = serde_json::from_slice(text).map_err(|error| broken(error.to_string()))?;
@@ -180,7 +183,7 @@ impl Learned {
         }
     }
 
-    /// What in it cannot be.
+    /// Returns the first impossible value, in words.
     fn flaw(&self) -> Option<String> {
         let Correction { grid, values_mm, level_mm, .. } = &self.correction;
         if !grid.is_sound() || values_mm.len() != grid.len() {
@@ -205,7 +208,8 @@ impl Learned {
         (!self.known.is_sound()).then(|| "a number of what it knows of the grinder cannot be".into())
     }
 
-    /// Returns the correction of the first pass of another part: what came back in every pass of this one, on the grid of `none`.
+    /// Returns the correction of the first pass of another part: the error that repeated in every pass of this one, on
+    /// the grid of `none`.
     pub fn first_correction(&self, none: Correction) -> Correction {
         let on_grid = |values: &Vec<f64>| self.correction.grid.resample(values, &none.grid);
         let set = self.correction.set.as_ref().map(|set| Set {
@@ -254,7 +258,8 @@ mod tests {
             Learned::read(tempfile::tempdir().unwrap().path(), "", true).unwrap().is_none(),
             "no file is nothing learned"
         );
-        // Another grid of the same part: what lies between the nodes, and the height of the new part.
+        // Another grid of the same part: values between the nodes are interpolated, and the level is that of the new
+        // part.
         let finer = Grid { columns: 9, rows: 7, spacing_mm: [0.5, 0.5], ..GRID };
         let first = back.first_correction(Correction::none(finer, 0.06));
         assert_eq!((first.level_mm, first.cycle, first.values_mm.len()), (0.06, 1, 63));
@@ -279,7 +284,7 @@ mod tests {
         assert_eq!(begun.run, "run-cell-1 of cell-1 and run-cell-3 of cell-3");
         let told = begun.taught_by.as_ref().unwrap();
         assert_eq!((told.runs.len(), told.comparisons), (2, 1));
-        // It is read back from what is kept of it, and nobody takes it for what a run has found.
+        // The saved copy can be read back, and is not mistaken for the result of a run.
         let text = serde_json::to_vec(&begun).unwrap();
         let back = Learned::of(Path::new("kept"), &text).unwrap();
         assert_eq!((&back.correction, &back.taught_by), (&begun.correction, &begun.taught_by));
@@ -297,7 +302,7 @@ mod tests {
         );
         let text = serde_json::to_string(&learned().with_fields(fields)).unwrap();
         assert_eq!(read(&text).unwrap().unwrap().0.fields, fields);
-        // As earlier versions wrote it.
+        // The format that earlier versions wrote.
         let plain = serde_json::to_string(&learned()).unwrap();
         let old = plain.replace(",\"fields\":{}", "");
         assert_ne!(plain, old);

@@ -1,7 +1,7 @@
-//! Files in and out: point clouds, meshes, and what a registration leaves behind.
+//! Readers and writers of files: point clouds, meshes, maps, programs, and the results of a registration.
 //!
-//! No file is trusted. Whatever is wrong with one comes back as a [`FormatError`] that names the file, the place, what was
-//! found, what was expected and what to do; nothing here panics, and time and memory are bounded by the size of the file.
+//! No file is trusted. A [`FormatError`] reports any fault of a file. It names the file and the place, gives the text
+//! found and the text expected, and says what to do. Nothing here panics. The size of the file bounds time and memory.
 
 mod columns;
 mod dmis;
@@ -74,10 +74,10 @@ use layout::is_separator_line;
 use measured_map::map_format;
 use regrind_core::geometry::Point;
 
-/// Largest surface definition that is read.
+/// Largest surface definition that is read, in bytes.
 const MOST_DEFINITION_BYTES: u64 = 1 << 20;
 
-/// What a nominal surface may come as.
+/// Nominal surface in one of the forms that a file can have.
 #[derive(Clone, Debug, PartialEq)]
 pub enum NominalFile {
     /// Points on the surface, in millimetres, in the order of the file.
@@ -89,7 +89,7 @@ pub enum NominalFile {
         /// Corner indices.
         triangles: Vec<[u32; 3]>,
     },
-    /// The text of a TOML file that defines the surface by its equation; parsed elsewhere.
+    /// The text of a TOML file that defines the surface by its equation; another module parses it.
     Definition(String),
 }
 
@@ -101,11 +101,11 @@ enum Kind {
     Map(&'static MapFormat),
 }
 
-/// Reads a nominal surface as [`read_nominal_as`] does, and returns the SHA-256 of the file with it; of the file and of what was said of its columns and unit, where
-/// something was: other columns are another surface.
+/// Reads a nominal surface as [`read_nominal_as`] does, and returns it with a SHA-256. The hash covers the bytes of the
+/// file and, if `table` states columns or units, these too: other columns are another surface.
 ///
 /// # Errors
-/// Those of [`read_nominal_as`].
+/// The same as for [`read_nominal_as`].
 pub fn read_nominal_with_identity(
     path: impl AsRef<Path>,
     table: &Table,
@@ -135,18 +135,19 @@ pub fn read_nominal_with_identity(
 
 /// Reads a nominal surface: points as text or PLY, a mesh as PLY or STL, or a TOML definition.
 ///
-/// The content decides which it is; the extension only where the content does not tell.
+/// The content decides the format. The extension decides only if the content is ambiguous.
 ///
 /// # Errors
-/// Those of the format found.
+/// The errors of the format found.
 pub fn read_nominal(path: impl AsRef<Path>) -> Result<NominalFile, FormatError> {
     read_nominal_as(path, &Table::default())
 }
 
-/// Reads a nominal surface as [`read_nominal`] does; of a table of points `table` says what it does not say of itself.
+/// Reads a nominal surface as [`read_nominal`] does; for a table of points, `table` gives the columns and units that
+/// the file does not state.
 ///
 /// # Errors
-/// Those of [`read_nominal`], columns that are not there, and columns or a unit of what is no table.
+/// The same as for [`read_nominal`]; columns that do not exist; columns or a unit for a file that is not a table.
 pub fn read_nominal_as(path: impl AsRef<Path>, table: &Table) -> Result<NominalFile, FormatError> {
     let path = path.as_ref();
     let kind = kind(path)?;
@@ -173,21 +174,22 @@ pub fn read_nominal_as(path: impl AsRef<Path>, table: &Table) -> Result<NominalF
     })
 }
 
-/// Reads measured points, in millimetres and in the order of the file, from text, the vertices of a PLY file, or the measured
-/// samples of a map: X3P, SDF or MetroPro.
+/// Reads measured points, in millimetres and in the order of the file, from text, the vertices of a PLY file, or the
+/// measured samples of a map: X3P, SDF or MetroPro.
 ///
-/// The points of a map lie on the surface, where a probe's centres lie above it.
+/// The points of a map lie on the surface. The centres of a probe lie above it.
 ///
 /// # Errors
-/// Those of the format found, and a file that is STL or TOML.
+/// The errors of the format found; a file that is STL or TOML.
 pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
     read_measured_with_notes(path, &Table::default()).map(|read| read.points)
 }
 
-/// Reads measured points as [`read_measured`] does, with what the file leaves open; of a table `table` says what it does not say of itself.
+/// Reads measured points as [`read_measured`] does, and returns them with notes on what the file leaves ambiguous; for
+/// a table, `table` gives the columns and units that the file does not state.
 ///
 /// # Errors
-/// Those of [`read_measured`], columns that are not there, and columns or a unit of what is no table.
+/// The same as for [`read_measured`]; columns that do not exist; columns or a unit for a file that is not a table.
 pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
     let wrong = |found, remedy| {
@@ -205,10 +207,11 @@ pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result
     }
 }
 
-/// Reads the places of a measuring plan, in millimetres, as [`read_measured`] reads points; the columns of a table may be called nominal, as a plan's are.
+/// Reads the positions of a measuring plan, in millimetres, as [`read_measured`] reads points; the columns of a table
+/// can be named nominal, as those of a plan are.
 ///
 /// # Errors
-/// Those of [`read_measured_with_notes`].
+/// The same as for [`read_measured_with_notes`].
 pub fn read_plan(path: impl AsRef<Path>, table: &Table) -> Result<Vec<Point>, FormatError> {
     let path = path.as_ref();
     match kind(path)? {
@@ -217,7 +220,7 @@ pub fn read_plan(path: impl AsRef<Path>, table: &Table) -> Result<Vec<Point>, Fo
     }
 }
 
-/// Refuses columns and a unit of a file that is no table.
+/// Rejects columns and a unit for a file that is not a table.
 fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatError> {
     if matches!(kind, Kind::Text) || *table == Table::default() {
         return Ok(());
@@ -230,7 +233,7 @@ fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatE
     })
 }
 
-/// Tells the kind of a file by its beginning, and by its extension where that leaves it open.
+/// Determines the kind of a file from its beginning, and from its extension if the beginning is ambiguous.
 fn kind(path: &Path) -> Result<Kind, FormatError> {
     let opened = whole::open(path)?;
     let (head, length) = (&opened.head[..], opened.length);
@@ -250,7 +253,7 @@ fn kind(path: &Path) -> Result<Kind, FormatError> {
     let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
     let is_data = first_words(head).is_some_and(|line| line.first().is_some_and(|b| b"+-.0123456789".contains(b)));
     Ok(match extension.as_deref() {
-        // Numbers under a wrong name are points all the same.
+        // A file of numbers is read as points even if its extension is wrong.
         _ if is_data && !head.contains(&0) => Kind::Text,
         Some("ply") => Kind::Ply,
         Some("stl") => Kind::Stl,
@@ -265,12 +268,12 @@ fn first_words(head: &[u8]) -> Option<&[u8]> {
     head.split(|&b| b == b'\n').map(<[u8]>::trim_ascii).find(|line| !line.is_empty() && !line.starts_with(b"#"))
 }
 
-/// Returns whether a file begins with `[table]` or `key = value`.
+/// Returns true if a file begins with `[table]` or `key = value`.
 fn is_toml(head: &[u8]) -> bool {
     let Some(line) = first_words(head) else { return false };
     let is_key = |b: &u8| b.is_ascii_alphanumeric() || b"_-.".contains(b);
     let table = line.strip_prefix(b"[").and_then(|rest| rest.split(|&b| b == b']').next());
-    // `sep=;` is a table of Excel.
+    // `sep=;` begins a table written by Excel.
     let key =
         line.iter().position(|&b| b == b'=').map(|at| line[..at].trim_ascii()).filter(|_| !is_separator_line(line));
     let opens_table = line.contains(&b']')

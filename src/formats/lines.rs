@@ -1,4 +1,4 @@
-//! Lines that are added to a file as things happen.
+//! Files to which lines are appended as events occur.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -9,17 +9,17 @@ use serde::Serialize;
 
 use super::FormatError;
 
-/// A file to which lines of JSON are added. Clones add to the same file, from any thread.
+/// File to which lines of JSON are appended. Clones append to the same file, from any thread.
 #[derive(Clone, Debug)]
 pub struct AddedLines {
     file: Arc<Mutex<File>>,
 }
 
 impl AddedLines {
-    /// Opens a file, or makes it; what it holds stays.
+    /// Opens a file, or creates it; existing content is preserved.
     ///
     /// # Errors
-    /// A file that cannot be written.
+    /// A file that is not writable.
     pub fn open(path: &Path) -> Result<Self, FormatError> {
         let file = OpenOptions::new().append(true).create(true).open(path);
         let file =
@@ -27,7 +27,7 @@ impl AddedLines {
         Ok(Self { file: Arc::new(Mutex::new(file)) })
     }
 
-    /// Adds a line in one piece. A disk that is full loses it: who tells what happens is not to stand for that.
+    /// Appends a line in one write. If the disk is full the line is lost: logging an event must not stop the program.
     pub fn add(&self, line: &impl Serialize) {
         let Ok(mut text) = serde_json::to_string(line) else { return };
         text.push('\n');

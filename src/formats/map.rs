@@ -1,4 +1,4 @@
-//! Maps over x and y of the model frame as text: what was found, and what the grinder was asked for.
+//! Maps over x and y of the model frame as text: the measured error, and the correction for the grinder.
 
 use std::path::Path;
 
@@ -7,28 +7,28 @@ use super::gcode::hex;
 use super::registration::write_rows;
 use regrind_core::compensation::{Correction, ErrorMap};
 
-/// The columns of `error_map.csv`.
+/// Columns of `error_map.csv`.
 const ERROR_MAP_COLUMNS: &str = "x_mm,y_mm,error_mm,sigma_mm,valid";
 
-/// What an error was measured on.
+/// Origin of a measured error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ErrorMapOrigin {
     /// SHA-256 of the part's nominal surface.
     pub part: [u8; 32],
-    /// The cycle that measured it.
+    /// Cycle in which it was measured.
     pub cycle: u32,
-    /// SHA-256 of the map of the pass before, as the grinder got it; `None` where that was 0 everywhere.
+    /// SHA-256 of the map of the previous pass, as sent to the grinder; `None` if that map was 0 everywhere.
     pub ground_with: Option<[u8; 32]>,
 }
 
-/// Writes `error_map.csv`: `x_mm,y_mm,error_mm,sigma_mm,valid`, a row per node, row by row with x fastest.
+/// Writes `error_map.csv`: `x_mm,y_mm,error_mm,sigma_mm,valid`, one row per node, row by row with x fastest.
 ///
-/// Positive stands proud; `sigma_mm` is the standard uncertainty that the scatter of the points leaves in the error, 0 where
-/// that is not known. Where `valid` is 0 nothing was measured and the values are those of the nearest node with some. Comments tell what was
-/// measured.
+/// A positive error is proud. `sigma_mm` is the standard uncertainty of the error due to the noise of the points, 0 if
+/// unknown. If `valid` is 0, nothing was measured at the node, and its values are those of the nearest measured node.
+/// Comments give the origin of the measurement.
 ///
 /// # Errors
-/// Those of [`super::write_deviations`].
+/// The same as for [`super::write_deviations`].
 pub fn write_error_map(
     path: &Path,
     map: &ErrorMap,
@@ -53,42 +53,42 @@ pub fn write_error_map(
     write_rows(path, &header, &rows, |(values, valid)| (*values, Some(*valid)))
 }
 
-/// A node of an error map where something was measured, in the model frame.
+/// Measured node of an error map, in the model frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapNode {
-    /// Where.
+    /// Position of the node.
     pub at_mm: [f64; 2],
-    /// The error; positive stands proud.
+    /// Error; positive is proud.
     pub error_mm: f64,
-    /// Its standard uncertainty, 0 where that is not known.
+    /// Standard uncertainty of the error, 0 if unknown.
     pub sigma_mm: f64,
 }
 
 impl MapNode {
-    /// Returns x, y and error.
+    /// Returns x, y and the error.
     pub fn error(&self) -> [f64; 3] {
         [self.at_mm[0], self.at_mm[1], self.error_mm]
     }
 
-    /// Returns x, y and how well the error is known.
+    /// Returns x, y and the standard uncertainty of the error.
     pub fn sigma(&self) -> [f64; 3] {
         [self.at_mm[0], self.at_mm[1], self.sigma_mm]
     }
 }
 
-/// Reads back what [`write_error_map`] wrote: every node where something was measured.
+/// Reads a file that [`write_error_map`] wrote: returns every measured node.
 ///
 /// # Errors
-/// A file that cannot be read, other columns, rows that are no finite numbers.
+/// A file that cannot be read, other columns, rows that are not finite numbers.
 pub fn read_error_map(path: &Path) -> Result<Vec<MapNode>, FormatError> {
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
     parse_error_map(path, &std::fs::read_to_string(path).map_err(unreadable)?)
 }
 
-/// Reads an error map from its text; the path is for messages.
+/// Parses an error map from its text; the path names the file in messages.
 ///
 /// # Errors
-/// Other columns, rows that are no finite numbers.
+/// Other columns, rows that are not finite numbers.
 pub fn parse_error_map(path: &Path, text: &str) -> Result<Vec<MapNode>, FormatError> {
     let mut lines = text.lines().zip(1..).filter(|(line, _)| !line.starts_with('#') && !line.trim().is_empty());
     let unexpected = |found: &str, line: u64, expected: &str| FormatError::Unexpected {
@@ -110,7 +110,7 @@ pub fn parse_error_map(path: &Path, text: &str) -> Result<Vec<MapNode>, FormatEr
     Ok(nodes)
 }
 
-/// Reads a row of an error map: nothing of a node where nothing was measured, and none of what is no row.
+/// Reads a row of an error map: `Some(None)` for a node without a measurement, `None` for an invalid row.
 fn node(row: &str) -> Option<Option<MapNode>> {
     let cells: Vec<&str> = row.split(',').map(str::trim).collect();
     let [x, y, error, sigma, valid] = cells[..] else { return None };
@@ -123,22 +123,22 @@ fn node(row: &str) -> Option<Option<MapNode>> {
     }
 }
 
-/// What a correction is for, what it is, and what it takes the place of.
+/// Part, identity and predecessor of a correction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CorrectionIdentities {
     /// SHA-256 of the part's nominal surface.
     pub part: [u8; 32],
-    /// SHA-256 of the map as the grinder gets it.
+    /// SHA-256 of the map as sent to the grinder.
     pub map: [u8; 32],
-    /// That of the map of the pass before.
+    /// SHA-256 of the map of the previous pass.
     pub replaces: [u8; 32],
 }
 
-/// Writes `correction.csv`: `x_mm,y_mm,correction_mm`, the map as the grinder gets it, with part, cycle, level, identities and the parameters that
-/// are taken back beside it in comments.
+/// Writes `correction.csv`: `x_mm,y_mm,correction_mm`, the map as sent to the grinder. Comments give the part, the
+/// cycle, the level, the identities and the parameters that are compensated in addition.
 ///
 /// # Errors
-/// Those of [`super::write_deviations`].
+/// The same as for [`super::write_deviations`].
 pub fn write_correction(
     path: &Path,
     correction: &Correction,

@@ -1,4 +1,4 @@
-//! The formats of measured maps that are told by their first bytes.
+//! Formats of measured maps that are detected by their first bytes.
 
 use std::path::Path;
 
@@ -6,15 +6,15 @@ use super::error::FormatError;
 use super::height_map::MapFormat;
 use super::{metropro, sdf, whole, x3p};
 
-/// Every format: another one is a file of its own and a line here.
+/// All formats; a new format needs a file of its own and a line here.
 const FORMATS: [MapFormat; 3] = [x3p::FORMAT, sdf::FORMAT, metropro::FORMAT];
 
-/// Tells the format by the first bytes; none where it is no map.
+/// Returns the format that the first bytes belong to; `None` if the file is not a map.
 pub(super) fn map_format(head: &[u8]) -> Option<&'static MapFormat> {
     FORMATS.iter().find(|format| (format.begins)(head))
 }
 
-/// Returns whether a file is a map of heights, whose points lie on the surface: X3P, SDF or MetroPro.
+/// Returns true if a file is a map of heights, whose points lie on the surface: X3P, SDF or MetroPro.
 ///
 /// # Errors
 /// A file that cannot be read.

@@ -1,9 +1,9 @@
 //! Maps of Zygo interferometers in MetroPro's binary format (`.dat`).
 //!
-//! A header of 834 or 4096 bytes, the intensities as 16-bit and the phases as 32-bit integers, everything that is read here
-//! big-endian. The height of a sample is raw * scale * obliquity * wavelength / R in metres, where R is 4096, 32768 or 131072 by the phase
-//! resolution; 2147483640 and above was not measured. Rows run from the top of the picture downwards and are turned over
-//! here, so that the map is right-handed.
+//! A header of 834 or 4096 bytes, the intensities as 16-bit and the phases as 32-bit integers, all big-endian. The
+//! height of a sample is raw * scale * obliquity * wavelength / R in metres, where R is 4096, 32768 or 131072 depending
+//! on the phase resolution. A raw value of 2147483640 or more was not measured. Rows run from the top of the picture
+//! downwards and are reversed here, so that the map is right-handed.
 //! Format: Zygo, MetroPro Reference Guide, "Data format of MetroPro binary data files".
 
 use std::path::Path;
@@ -13,14 +13,14 @@ use super::height_map::{HeightMap, MapFormat, check_size};
 use super::whole::open;
 use regrind_core::geometry::Grid;
 
-/// From here on a phase was not measured.
+/// First raw value that means not measured.
 const NOT_MEASURED: i32 = 2_147_483_640;
-/// Magic number, header format and length of the header that go together.
+/// Valid combinations of magic number, header format and header length.
 const HEADERS: [(u32, u16, u32); 3] = [(0x881b_036f, 1, 834), (0x881b_0370, 2, 834), (0x881b_0371, 3, 4096)];
-/// Bytes of a header in which everything stands that is read.
+/// Bytes of a header that contain all fields that are read.
 const LEAST_HEADER: usize = 834;
 
-/// MetroPro, told by its first bytes.
+/// MetroPro format, detected by its first bytes.
 pub(super) const FORMAT: MapFormat = MapFormat {
     begins: is_metropro,
     read: |path| read_metropro(path).map(Into::into),
@@ -30,16 +30,16 @@ pub(super) const FORMAT: MapFormat = MapFormat {
 /// Reads a MetroPro map of at most 1 GiB.
 ///
 /// # Errors
-/// A file that is not readable, no MetroPro file, cut, without phases or without lateral scale; numbers in its header that are
-/// none.
+/// A file that is not readable, not MetroPro, cut, without phases or without lateral scale; invalid numbers in its
+/// header.
 pub fn read_metropro(path: impl AsRef<Path>) -> Result<HeightMap, FormatError> {
     open(path.as_ref())?.parse(path.as_ref(), parse_metropro)
 }
 
-/// Parses the bytes of a MetroPro file; `path` is only what messages call it.
+/// Parses the bytes of a MetroPro file; `path` only names the file in messages.
 ///
 /// # Errors
-/// Those of [`read_metropro`].
+/// The same as for [`read_metropro`].
 pub fn parse_metropro(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     let header = Header::read(path, bytes)?;
     let [columns, rows] = header.size;
@@ -61,14 +61,14 @@ pub fn parse_metropro(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatErro
     HeightMap::new(path, Grid { columns, rows, first_mm: [0.0; 2], spacing_mm: [1e3 * pitch_m; 2] }, samples)
 }
 
-/// Returns whether a file begins like one of MetroPro.
+/// Returns true if a file begins like MetroPro.
 fn is_metropro(head: &[u8]) -> bool {
     HEADERS.iter().any(|(magic, ..)| head.starts_with(&magic.to_be_bytes()))
 }
 
-/// What is read of a header.
+/// Header fields that are used.
 struct Header {
-    /// Columns and rows of the phases.
+    /// Number of columns and rows of the phases.
     size: [usize; 2],
     /// First byte of the phases.
     begin: usize,

@@ -1,16 +1,17 @@
-//! What a file of points leaves open, although it can be read: said beside the points, and nothing is refused for it.
+//! Ambiguities of a file of points that do not prevent reading it; they are reported with the points and never cause a
+//! rejection.
 
 use std::fmt;
 use std::path::PathBuf;
 
 use regrind_core::geometry::Point;
 
-/// Points with what a person should know of how they were read.
+/// Points, with notes on how they were read.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct NotedPoints {
     /// In millimetres, in the order of the file.
     pub points: Vec<Point>,
-    /// Empty when there is nothing to say.
+    /// Notes; empty if there are none.
     pub notes: Vec<PointNote>,
 }
 
@@ -20,31 +21,32 @@ impl From<Vec<Point>> for NotedPoints {
     }
 }
 
-/// What a person should know of how points were read; lines count from 1.
+/// Note on how points were read; lines count from 1.
 #[derive(Clone, Debug, PartialEq)]
 pub enum PointNote {
-    /// The last line has no end: many programs write it so, and a copy that was cut ends so too.
+    /// The last line has no line end: many programs write files like this, but a copy that was cut looks the same.
     NoLineEnd {
         /// The file.
         path: PathBuf,
         /// The last line.
         line: u64,
-        /// The last number in it, as it stands there.
+        /// The last number in the line, as written.
         found: String,
-        /// What the line was read as.
+        /// Value that was read from the line.
         point: Point,
-        /// Digits behind the mark, or in the exponent, of that number and the fewest of the lines above, if these are more.
+        /// Number of digits after the mark, or in the exponent, of that number, and the minimum in the lines above, if
+        /// the latter is larger.
         fewer_digits: Option<[usize; 2]>,
     },
-    /// One number of the file has a mark between its thousands, and no other has.
+    /// Exactly one number of the file has a separator between its thousands.
     OneThousandsMark {
         /// The file.
         path: PathBuf,
-        /// Where it stands.
+        /// Line of the number.
         line: u64,
-        /// As it stands there.
+        /// Number as written.
         found: String,
-        /// What it was read as.
+        /// Value that was read.
         value_mm: f64,
     },
 }

@@ -1,12 +1,12 @@
-//! Numbers as people and programs write them: decimal point or comma, thousands separated or not.
+//! Numbers as people and programs write them: decimal point or comma, with or without thousands separators.
 
-/// Largest coordinate that is believed, in millimetres: ten kilometres.
+/// Largest accepted coordinate, in millimetres: ten kilometres.
 pub const LIMIT_MM: f64 = 1e7;
 
-/// Longest number with marks to be removed or replaced; plain numbers may be longer.
+/// Maximum length of a number with marks to remove or replace; plain numbers can be longer.
 const LONGEST_MARKED: usize = 64;
 
-/// The mark between the whole and the fraction.
+/// Decimal mark.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Decimal {
     /// 2512.12, or 2,512.12 where the comma does not separate columns.
@@ -15,7 +15,7 @@ pub(super) enum Decimal {
     Comma,
 }
 
-/// Why a field is not a coordinate.
+/// Reason why a field is not a coordinate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum NumberFault {
     Text,
@@ -25,7 +25,7 @@ pub(super) enum NumberFault {
     OtherMark,
 }
 
-/// What a field tells about the decimal mark of its file.
+/// Evidence in a field for the decimal mark of its file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Evidence {
     Says(Decimal),
@@ -35,8 +35,8 @@ pub(super) enum Evidence {
 
 /// Returns the value of a field, in millimetres.
 ///
-/// Accepted are an optional sign, digits with at most one decimal mark, and an optional exponent of ten; besides, thousands
-/// separated by the other mark if the decimal mark is there too, so that 2,512 is never taken for a number in silence.
+/// A field can have a sign, digits with at most one decimal mark, and an exponent of ten. Thousands separators (the
+/// other mark) are accepted only if the decimal mark is present too, so that 2,512 is never accepted silently.
 pub(super) fn coordinate(field: &[u8], decimal: Decimal) -> Result<f64, NumberFault> {
     let value = match (decimal, field.contains(&b','), field.contains(&b'.')) {
         (Decimal::Point, false, _) | (Decimal::Comma, false, false) => plain(field)?,
@@ -54,7 +54,7 @@ pub(super) fn coordinate(field: &[u8], decimal: Decimal) -> Result<f64, NumberFa
     if is_believable(value) { Ok(value) } else { Err(NumberFault::OutOfRange) }
 }
 
-/// Returns whether a value may be a coordinate: not NaN, not infinite, not astronomical.
+/// Returns true if a value is possible as a coordinate: not NaN, not infinite, not above the limit.
 #[inline]
 pub(super) fn is_believable(value: f64) -> bool {
     value.abs() <= LIMIT_MM
@@ -65,7 +65,7 @@ pub(super) fn any_number(field: &[u8]) -> Option<f64> {
     fast_float2::parse(field).ok()
 }
 
-/// Returns whether a field is a number in any notation, NaN and infinity included.
+/// Returns true if a field is a number in any notation, including NaN and infinity.
 pub(super) fn looks_numeric(field: &[u8]) -> bool {
     any_number(field).is_some() || plain_with_point(field, b',', None).is_ok() || {
         let grouped = |mark, group| plain_with_point(field, mark, Some(group)).is_ok();
@@ -73,12 +73,12 @@ pub(super) fn looks_numeric(field: &[u8]) -> bool {
     }
 }
 
-/// Returns whether there is a point and a comma: the one is the decimal mark of a number, and the other stands between its thousands.
+/// Returns true if a field has both a point and a comma: one is the decimal mark, the other separates thousands.
 pub(super) fn has_both_marks(text: &[u8]) -> bool {
     text.contains(&b'.') && text.contains(&b',')
 }
 
-/// Returns how many digits stand behind the decimal mark of a number, and how many in its exponent.
+/// Returns the number of digits after the decimal mark of a number, and the number of digits in its exponent.
 pub(super) fn digits_after(field: &[u8]) -> [usize; 2] {
     let begins = |is: fn(&u8) -> bool| field.iter().rposition(is).map(|at| &field[at + 1..]);
     let digits = |text: Option<&[u8]>| {
@@ -89,7 +89,7 @@ pub(super) fn digits_after(field: &[u8]) -> [usize; 2] {
     [digits(begins(|b| matches!(b, b'.' | b','))), digits(begins(|b| matches!(b, b'e' | b'E')))]
 }
 
-/// Returns what a field tells about the decimal mark.
+/// Returns the evidence in a field for the decimal mark.
 pub(super) fn evidence(field: &[u8]) -> Evidence {
     let last = |mark: u8| field.iter().rposition(|&b| b == mark);
     let count = |mark: u8| field.iter().filter(|&&b| b == mark).count();
@@ -104,9 +104,10 @@ pub(super) fn evidence(field: &[u8]) -> Evidence {
     }
 }
 
-/// Returns a number without the blanks that group its thousands, as in 1 234,56; `None` if no blanks do.
+/// Returns a number without the blanks that group its thousands, as in 1 234,56; `None` if there are no grouping
+/// blanks.
 ///
-/// A blank may be a plain one, one that does not break the line (U+00A0), or a narrow one of these (U+202F).
+/// A grouping blank is a plain blank, a no-break space (U+00A0) or a narrow no-break space (U+202F).
 pub(super) fn without_blanks(field: &[u8]) -> Option<Vec<u8>> {
     let text = std::str::from_utf8(field).ok().filter(|text| text.len() <= LONGEST_MARKED)?;
     let is_blank = |c: char| matches!(c, ' ' | '\u{a0}' | '\u{202f}');
@@ -118,15 +119,15 @@ pub(super) fn without_blanks(field: &[u8]) -> Option<Vec<u8>> {
     Some(marked.bytes().filter(|&b| b != b' ').chain(fraction.bytes()).collect())
 }
 
-/// Reads a number with a decimal point and nothing else in it.
+/// Reads a number in plain notation with a decimal point.
 fn plain(field: &[u8]) -> Result<f64, NumberFault> {
     let value: f64 = fast_float2::parse(field).map_err(|_| NumberFault::Text)?;
     let spelt_out = field.iter().any(|b| matches!(b, b'n' | b'N'));
-    // A number of too many digits overflows to infinity; that is a matter of range.
+    // A number with too many digits overflows to infinity; the range check rejects it.
     if spelt_out { Err(NumberFault::NotFinite) } else { Ok(value) }
 }
 
-/// Reads a number after taking out the thousands separators and putting a point for the decimal mark.
+/// Reads a number after removing the thousands separators and replacing the decimal mark by a point.
 fn plain_with_point(field: &[u8], mark: u8, group: Option<u8>) -> Result<f64, NumberFault> {
     let at = field.iter().position(|&b| b == mark).ok_or(NumberFault::Text)?;
     let (whole, fraction) = (&field[..at], &field[at + 1..]);
@@ -143,7 +144,7 @@ fn plain_with_point(field: &[u8], mark: u8, group: Option<u8>) -> Result<f64, Nu
     plain(&text[..length])
 }
 
-/// Returns whether digits come in threes, as in -1,234,567.
+/// Returns true if the digits are in groups of three, as in -1,234,567.
 fn is_grouped(whole: &[u8], group: u8) -> bool {
     let digits = whole.strip_prefix(b"-").or(whole.strip_prefix(b"+")).unwrap_or(whole);
     let mut parts = digits.split(|&b| b == group);
@@ -153,7 +154,7 @@ fn is_grouped(whole: &[u8], group: u8) -> bool {
     well_begun && rest.peek().is_some() && rest.all(|part| part.len() == 3 && part.iter().all(u8::is_ascii_digit))
 }
 
-/// Returns whether a field such as 2,512 may be read in two ways.
+/// Returns true if a field such as 2,512 is ambiguous.
 fn is_one_group(field: &[u8]) -> bool {
     is_grouped(field, b',')
 }

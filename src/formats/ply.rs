@@ -1,7 +1,7 @@
 //! Point clouds and meshes in PLY: ascii, binary little endian, binary big endian.
 //!
-//! Of the elements, `vertex` and `face` are read and all others skipped; of their properties, x y z, nx ny nz and the list of
-//! vertex indices. Counts in the header are never believed further than the bytes that are there.
+//! The elements `vertex` and `face` are read, all others are skipped. Of their properties, x y z, nx ny nz and the list
+//! of vertex indices are read. Counts in the header are trusted only as far as the file has bytes for them.
 //! Format: G. Turk, The PLY Polygon File Format, 1994.
 
 use std::cell::{Cell, RefCell};
@@ -13,37 +13,39 @@ use super::number::{any_number, is_believable};
 use super::whole::{is_degenerate, open};
 use regrind_core::geometry::{Point, Vector};
 
-/// What a PLY file holds.
+/// Content of a PLY file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PlyFile {
     /// The vertices in the order of the file, in millimetres.
     pub points: Vec<Point>,
-    /// One direction a vertex, of unit length or zero where the file has none, if the file has nx, ny, nz.
+    /// One unit direction per vertex, or a zero vector for a vertex without one, if the file has nx, ny, nz.
     pub normals: Option<Vec<Vector>>,
-    /// Corner indices of the triangles; a polygon is fanned from its first corner, which suits convex ones.
+    /// Corner indices of the triangles; a polygon is split into a fan from its first corner, which is correct for
+    /// convex ones.
     pub triangles: Vec<[u32; 3]>,
-    /// How many triangles were left out because they span no area.
+    /// Number of triangles that were skipped because their area is 0.
     pub degenerate: usize,
 }
 
 /// Reads a PLY file of at most 1 GiB.
 ///
 /// # Errors
-/// A file that is not readable, no PLY, malformed, cut, or with content after its end; a vertex that is not finite or beyond 1e7
-/// mm; a face with fewer than three corners or with a corner that is no vertex.
+/// A file that is not readable, not PLY, malformed or cut, or that has content after its end; a vertex that is not
+/// finite or beyond 1e7 mm; a face with fewer than three corners or with a corner that is not a vertex.
 pub fn read_ply(path: impl AsRef<Path>) -> Result<PlyFile, FormatError> {
     open(path.as_ref())?.parse(path.as_ref(), parse_ply)
 }
 
-/// Parses the bytes of a PLY file; `path` is only what messages call it.
+/// Parses the bytes of a PLY file; `path` only names the file in messages.
 ///
 /// # Errors
-/// Those of [`read_ply`].
+/// The same as for [`read_ply`].
 pub fn parse_ply(path: &Path, bytes: &[u8]) -> Result<PlyFile, FormatError> {
     parse_ply_in(path, bytes, [Unit::Millimetre; 2])
 }
 
-/// Parses PLY whose comments may state these units, of all and of the heights, and no others; the coordinates stay in them.
+/// Parses PLY whose comments can state only these units, for everything and for the heights; the coordinates are not
+/// converted.
 pub(super) fn parse_ply_in(path: &Path, bytes: &[u8], units: [Unit; 2]) -> Result<PlyFile, FormatError> {
     let header = Header::parse(path, bytes, units)?;
     let data = &bytes[header.length..];
@@ -54,7 +56,7 @@ pub(super) fn parse_ply_in(path: &Path, bytes: &[u8], units: [Unit; 2]) -> Resul
     }
 }
 
-/// Returns whether a file begins like PLY.
+/// Returns true if a file begins like PLY.
 pub(super) fn is_ply(head: &[u8]) -> bool {
     head.strip_prefix(b"ply").is_some_and(|rest| rest.trim_ascii_start().len() < rest.len() || rest.is_empty())
 }
@@ -107,7 +109,7 @@ impl Scalar {
     }
 }
 
-/// A property of an element.
+/// Property of an element.
 #[derive(Clone, Debug, PartialEq)]
 struct Property {
     name: String,
@@ -128,24 +130,24 @@ impl Element {
         self.properties.iter().position(|property| property.name == name)
     }
 
-    /// Returns where three scalar properties stand, if all are there.
+    /// Returns the indices of three scalar properties, if all exist.
     fn triple(&self, names: [&str; 3]) -> Option<[usize; 3]> {
         let found = names.map(|name| self.position(name).filter(|&at| self.properties[at].list.is_none()));
         if let [Some(a), Some(b), Some(c)] = found { Some([a, b, c]) } else { None }
     }
 
-    /// Returns the fewest bytes one item takes.
+    /// Returns the minimum number of bytes of one item.
     fn least_size(&self, encoding: Encoding) -> usize {
         let size = |p: &Property| if encoding == Encoding::Ascii { 2 } else { p.list.unwrap_or(p.scalar).size() };
         self.properties.iter().map(size).sum::<usize>().max(1)
     }
 }
 
-/// The header of a file.
+/// Header of a file.
 struct Header {
     encoding: Encoding,
     elements: Vec<Element>,
-    /// Bytes and lines of the header.
+    /// Number of bytes and lines of the header.
     length: usize,
     lines: u64,
 }
@@ -181,7 +183,7 @@ impl Header {
         Ok(header)
     }
 
-    /// Takes the next line of the header, which must have its end.
+    /// Reads the next line of the header, which must have its line end.
     fn next_line<'b>(&mut self, path: &Path, rest: &'b [u8]) -> Result<&'b [u8], FormatError> {
         let most = rest.len().min(LONGEST_LINE);
         let end = rest[..most].iter().position(|&b| b == b'\n');
@@ -206,7 +208,7 @@ impl Header {
         Ok(line)
     }
 
-    /// Takes a line that declares an element or a property; the error is what was expected.
+    /// Reads a line that declares an element or a property; the error is the expected text.
     fn declare(&mut self, words: &[&[u8]]) -> Result<(), &'static str> {
         let text = |word: &[u8]| String::from_utf8_lossy(word).into_owned();
         let (name, list, scalar) = match *words {
@@ -232,7 +234,7 @@ impl Header {
         Ok(())
     }
 
-    /// Checks that there is something to read.
+    /// Checks that the file has something to read.
     fn check(&self, path: &Path) -> Result<(), FormatError> {
         let fault = |expected: &str, found: &str| FormatError::Unexpected {
             path: path.to_owned(),
@@ -267,7 +269,7 @@ impl Header {
     fn read(&self, path: &Path, source: &mut impl Source) -> Result<PlyFile, FormatError> {
         let mut file = PlyFile::default();
         let vertices = self.elements.iter().find(|e| e.name == "vertex").map_or(0, |e| e.count);
-        // An element without properties has no bytes, so that its count bounds nothing.
+        // An element without properties has no bytes, so nothing bounds its count.
         for element in self.elements.iter().filter(|e| !e.properties.is_empty()) {
             let reading = Reading { path, element, room: source.remaining() / element.least_size(self.encoding) };
             match element.name.as_str() {
@@ -290,11 +292,11 @@ fn header_fault(path: &Path, line: u64, expected: &str, found: &[u8]) -> FormatE
     FormatError::Unexpected { path, place, expected: expected.to_owned(), found: excerpt(found) }
 }
 
-/// Longest beginning of a number that a cut may leave.
+/// Maximum length of an incomplete number at a cut.
 const LONGEST_WORD: usize = 64;
-/// Longest line of a header.
+/// Maximum length of a line of the header.
 const LONGEST_LINE: usize = 4096;
-/// Longest header; less than what is read of a file at first.
+/// Maximum length of the header; less than the part of a file that is read first.
 const LONGEST_HEADER: usize = 32 << 10;
 
 impl Encoding {
@@ -314,16 +316,17 @@ fn indices_of(face: &Element) -> Option<&Property> {
     face.properties.iter().find(is_indices)
 }
 
-/// One element while it is being read.
+/// Element while it is read.
 struct Reading<'a> {
     path: &'a Path,
     element: &'a Element,
-    /// How many items the bytes left can hold at most.
+    /// Maximum number of items that the remaining bytes can hold.
     room: usize,
 }
 
 impl Reading<'_> {
-    /// Walks over all items: `value` is told the property, the place in its list and the value; `done` closes the item.
+    /// Reads all items: calls `value` with the property, the index in its list and the value, and `done` at the end of
+    /// each item.
     fn each<S: Source>(
         &self,
         source: &mut S,
@@ -345,7 +348,7 @@ impl Reading<'_> {
                     let wanted = format!("the length of list {} of {}", property.name, expected());
                     return Err(self.unexpected(source, wanted, format!("{length}")));
                 }
-                // A list longer than the file ends with the file, so that the length needs no limit.
+                // A list that is longer than the file ends with the file, so its length needs no limit.
                 for _ in 0..length as u64 {
                     value(at, source.scalar(property.scalar).map_err(lost)?, source)?;
                 }
@@ -362,7 +365,7 @@ impl Reading<'_> {
         let direction = self.element.triple(["nx", "ny", "nz"]);
         let mut points = Vec::with_capacity(capacity);
         let mut normals = Vec::with_capacity(if direction.is_some() { capacity } else { 0 });
-        // x, y, z, nx, ny, nz of the vertex at hand; the normal stays zero where there is none.
+        // x, y, z, nx, ny, nz of the current vertex; the normal stays zero if there is none.
         let columns = [position, direction.unwrap_or([usize::MAX; 3])].concat();
         let values = Cell::new([0.0; 6]);
         self.each(
@@ -426,10 +429,10 @@ impl Reading<'_> {
     }
 }
 
-/// Why the next value could not be had.
+/// Reason why the next value could not be read.
 struct Fault {
     place: String,
-    /// What stands there; nothing if the file is at its end.
+    /// Text at that place; empty at the end of the file.
     found: Option<String>,
 }
 
@@ -443,24 +446,24 @@ impl Fault {
     }
 }
 
-/// Where values come from, one after the other.
+/// Source of values, one after the other.
 trait Source {
     fn begin_item(&mut self) -> Result<(), Fault>;
     fn scalar(&mut self, scalar: Scalar) -> Result<f64, Fault>;
     fn end_item(&mut self) -> Result<(), Fault>;
-    /// Checks that nothing is left.
+    /// Checks that no content remains.
     fn finish(&mut self) -> Result<(), Fault>;
     fn remaining(&self) -> usize;
     fn place(&self) -> String;
 }
 
-/// Values in binary.
+/// Values in binary form.
 struct Bytes<'a, const BIG: bool> {
     data: &'a [u8],
     at: usize,
-    /// Where the last value began.
+    /// Start of the last value.
     last: usize,
-    /// Where the data begin in the file.
+    /// Start of the data in the file.
     start: usize,
 }
 
@@ -507,7 +510,7 @@ impl<const BIG: bool> Source for Bytes<'_, BIG> {
     }
 
     fn finish(&mut self) -> Result<(), Fault> {
-        // A newline after the data does no harm; anything more means that the counts are wrong.
+        // A newline after the data is harmless; more content means that the counts are wrong.
         let rest = self.data[self.at..].trim_ascii();
         let found = format!("{} bytes more", rest.len());
         if rest.is_empty() {
@@ -526,13 +529,13 @@ impl<const BIG: bool> Source for Bytes<'_, BIG> {
     }
 }
 
-/// Values as words, one item a line.
+/// Values as words, one item per line.
 struct Words<'a> {
-    /// The lines to come.
+    /// Remaining lines.
     rest: &'a [u8],
-    /// What is left of this line.
+    /// Rest of the current line.
     line: &'a [u8],
-    /// Whether this line has its newline.
+    /// True if the current line has its newline.
     ended: bool,
     number: u64,
 }
@@ -542,7 +545,7 @@ impl<'a> Words<'a> {
         Self { rest, line: &[], ended: true, number: header_lines }
     }
 
-    /// Goes to the next line with words in it; returns whether there is one.
+    /// Advances to the next line that has words; returns true if there is one.
     fn next_line(&mut self) -> bool {
         while !self.rest.is_empty() {
             let end = self.rest.iter().position(|&b| b == b'\n').unwrap_or(self.rest.len());
@@ -574,7 +577,7 @@ impl Source for Words<'_> {
             return Err(Fault { place: self.place(), found: None });
         }
         let value = any_number(word).filter(|v| !scalar.is_integer() || v.fract() == 0.0);
-        // Half a word at the end of a file is a cut, not somebody's text.
+        // An incomplete word at the end of a file means that the file is cut, not that it contains foreign text.
         let cut = || Fault { place: self.place(), found: None };
         let value = value.ok_or_else(|| {
             if rest.is_empty() && !self.ended && end < LONGEST_WORD { cut() } else { self.fault(word) }

@@ -1,8 +1,8 @@
-//! Point clouds as text: one point a line, with or without a header, in whatever separator a machine exports.
+//! Point clouds as text: one point per line, with or without a header, with any separator that machines export.
 //!
-//! The file is streamed in batches that are parsed in parallel, so that memory holds the points and a few megabytes, whatever
-//! the file. Every line is first tried by `quick_line`, which knows only the plain case and reports nothing; what it
-//! declines goes through `careful_line`, which alone decides what is an error.
+//! The file is streamed in batches that are parsed in parallel. Memory holds the points and a few megabytes, whatever
+//! the size of the file. `quick_line` tries every line first: it knows only the plain case and reports no errors. Lines
+//! that it declines go to `careful_line`, which alone decides what is an error.
 
 use std::fs::File;
 use std::io::{ErrorKind, Read};
@@ -19,39 +19,41 @@ use super::number::{Decimal, NumberFault, coordinate, digits_after, has_both_mar
 use super::system;
 use regrind_core::geometry::Point;
 
-/// Largest text file that is read.
+/// Largest text file that is read, in bytes.
 const MOST_BYTES: u64 = 2 << 30;
-/// Most points that are read: 2.4 GB of them.
+/// Maximum number of points that are read: 2.4 GB of them.
 const MOST_POINTS: u64 = 100_000_000;
-/// Longest line.
+/// Longest line that is read, in bytes.
 const LONGEST_LINE: usize = 64 << 10;
-/// Bytes looked at before anything is believed.
+/// Bytes that are checked before anything is parsed.
 const HEAD: usize = 64 << 10;
-/// Bytes read at a time, and the share of them that one thread parses.
+/// Bytes read at a time, and the part of them that one thread parses.
 const BATCH: usize = 4 << 20;
 const SHARE: usize = 256 << 10;
 
 /// Reads a point cloud from a text file, in millimetres and in the order of the file.
 ///
-/// One point a line; columns separated by comma, semicolon, tab or blanks, which is found in the first point and required of
-/// all. Blank lines and lines that begin with `#` or `//` are skipped. A header, or a comment that stands for one, names x, y and z once; columns of
-/// nominal points beside measured ones are a question that only a person answers. A table without a header has three columns, or six with unit
-/// normals behind the points. Lines above a header are titles. Decimal commas are understood
-/// where the comma does not separate columns, thousands separators where the number also has its decimal mark, and blanks between
-/// thousands where a tab or a semicolon separates columns.
+/// One point per line. Columns are separated by comma, semicolon, tab or blanks: the first point determines the
+/// separator, and all lines must use it. Blank lines and lines that begin with `#` or `//` are skipped. A header, or a
+/// comment that serves as one, names x, y and z once each. If a table has columns of both nominal and measured points,
+/// a person must choose. A table without a header has three columns, or six with unit normals after the points. Lines
+/// above a header are titles. Decimal commas are accepted if the comma does not separate columns. Thousands separators
+/// are accepted if the number also has its decimal mark. Blanks between thousands are accepted if a tab or a semicolon
+/// separates columns.
 ///
 /// # Errors
-/// A file that is not readable, not text, empty, too large or cut; a line with another number of columns; anything but a
-/// finite number of at most 1e7 mm where a coordinate should be; a header that states another unit than mm or whose columns
-/// x, y, z are not clear.
+/// A file that is not readable, not text, empty, too large or cut; a line with another number of columns; a coordinate
+/// that is not a finite number of at most 1e7 mm; a header that states a unit other than mm, or whose columns x, y, z
+/// are ambiguous.
 pub fn read_points(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
     read_points_with_notes(path, &Table::default()).map(|read| read.points)
 }
 
-/// Reads the points of a nominal surface as [`read_points`] does; their columns may be called nominal. `table` says what the file does not.
+/// Reads the points of a nominal surface as [`read_points`] does; their columns can be named nominal. `table` gives the
+/// columns and units that the file does not state.
 ///
 /// # Errors
-/// Those of [`read_points`], and columns that are not there.
+/// The same as for [`read_points`]; columns that do not exist.
 pub fn read_nominal_points(path: impl AsRef<Path>, table: &Table) -> Result<Vec<Point>, FormatError> {
     let path = path.as_ref();
     let (file, length) = opened(path)?;
@@ -66,25 +68,26 @@ fn opened(path: &Path) -> Result<(File, u64), FormatError> {
     Ok((file, length))
 }
 
-/// Reads a point cloud as [`read_points`] does, with what the file leaves open; `table` says what it does not say of itself.
+/// Reads a point cloud as [`read_points`] does, and returns it with notes on what the file leaves ambiguous. `table`
+/// gives the columns and units that the file does not state.
 ///
 /// # Errors
-/// Those of [`read_points`], and columns that are not there.
+/// The same as for [`read_points`]; columns that do not exist.
 pub fn read_points_with_notes(path: impl AsRef<Path>, table: &Table) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
     let (file, length) = opened(path)?;
     Cloud::new(path, length, table).read(file)
 }
 
-/// Reads a point cloud from a stream of text; `path` is only what messages call it.
+/// Reads a point cloud from a stream of text; `path` only names the file in messages.
 ///
 /// # Errors
-/// Those of [`read_points`].
+/// The same as for [`read_points`].
 pub fn parse_points(path: impl AsRef<Path>, reader: impl Read + Send) -> Result<Vec<Point>, FormatError> {
     Cloud::new(path.as_ref(), 0, &Table::default()).read(reader).map(|read| read.points)
 }
 
-/// Reads a point cloud of which a cell says what the file does not; the decimal mark may be known from elsewhere.
+/// Reads a point cloud with the columns and units that the cell states; the decimal mark can be given too.
 pub(super) fn parse_points_with(
     path: &Path,
     text: &[u8],
@@ -94,34 +97,34 @@ pub(super) fn parse_points_with(
     Cloud { decimal, ..Cloud::new(path, 0, table) }.read(text).map(|read| read.points)
 }
 
-/// A cloud while it is being read.
+/// Point cloud while it is read.
 struct Cloud<'p> {
     path: &'p Path,
-    /// The decimal mark, where it need not be told from the file.
+    /// Decimal mark, if it is known and need not be detected in the file.
     decimal: Option<Decimal>,
     table: &'p Table,
-    /// Expected length of the file, for reserving memory only.
+    /// Expected length of the file, only used to reserve memory.
     length: u64,
     preamble: Preamble<'p>,
     layout: Option<Layout>,
-    /// Lines done.
+    /// Number of lines read.
     lines: u64,
-    /// The first of the rows of empty cells behind the last point.
+    /// The first of the rows of empty cells after the last point.
     empty_from: Option<u64>,
     points: Vec<Point>,
     grouped: Grouped,
 }
 
-/// Numbers with a mark between their thousands: how many lines were found to have one, up to two, and the first.
+/// Numbers with a separator between thousands: how many lines have one (counted up to two), and the first of them.
 #[derive(Default)]
 struct Grouped {
     lines: usize,
-    /// Lines before it in what was read, the number and its value.
+    /// Number of lines before it in the text read, the number as written, and its value.
     first: Option<(u64, String, f64)>,
 }
 
 impl Grouped {
-    /// Looks at a line that was read as a point, unless enough is known.
+    /// Checks a line that was read as a point, unless two lines are known already.
     fn see(&mut self, line: &[u8], layout: &Layout, lines_before: u64) {
         if self.lines > 1 || !has_both_marks(line) {
             return;
@@ -134,7 +137,7 @@ impl Grouped {
         }
     }
 
-    /// Takes what was found in a share that follows some lines.
+    /// Adds the numbers found in a share that follows `lines_before` lines.
     fn add(&mut self, share: Self, lines_before: u64) {
         self.lines += share.lines;
         let first = share.first.map(|(line, found, value)| (line + lines_before, found, value));
@@ -142,16 +145,16 @@ impl Grouped {
     }
 }
 
-/// A piece of the file in memory.
+/// Part of the file in memory.
 struct Batch {
     bytes: Vec<u8>,
-    /// What of the bytes is in use.
+    /// Range of the bytes that is in use.
     begin: usize,
     end: usize,
 }
 
 impl Batch {
-    /// Fills the batch with what was left over of the one before and with more of the stream; returns how much more.
+    /// Fills the batch with the rest of the previous one and with more of the stream; returns the number of bytes read.
     fn read(&mut self, left_over: &[u8], reader: &mut impl Read) -> std::io::Result<usize> {
         self.bytes.resize(BATCH, 0);
         self.bytes[..left_over.len()].copy_from_slice(left_over);
@@ -161,12 +164,12 @@ impl Batch {
     }
 }
 
-/// What one thread made of its share of a batch.
+/// Result of one thread for its share of a batch.
 struct Share {
     points: Vec<Point>,
-    /// Lines done without error.
+    /// Number of lines read without error.
     lines: u64,
-    /// Where the first bad line begins, if there is one.
+    /// Start of the first bad line, if there is one.
     bad: Option<usize>,
     grouped: Grouped,
 }
@@ -189,7 +192,7 @@ impl<'p> Cloud<'p> {
         let mut next = Batch { bytes: Vec::new(), begin: 0, end: 0 };
         let mut total = batch.end as u64;
         while batch.end == BATCH {
-            // One thread reads on while the others parse.
+            // One thread reads ahead while the others parse.
             let lines = self.whole_lines(&batch)?;
             let (text, tail) = batch.bytes[batch.begin..].split_at(lines);
             let (taken, read) = rayon::join(|| self.take(text, total), || next.read(tail, &mut reader));
@@ -204,7 +207,8 @@ impl<'p> Cloud<'p> {
         Ok(NotedPoints { notes, points: self.finish()? })
     }
 
-    /// Returns what the file leaves open; `text` is the end of it, whole lines but for the last.
+    /// Returns notes on what the file leaves ambiguous; `text` is the end of the file, in whole lines except perhaps
+    /// the last.
     fn notes(&mut self, text: &[u8]) -> Vec<PointNote> {
         let mut notes = Vec::new();
         if let (1, Some((before, found, value_mm))) = (self.grouped.lines, self.grouped.first.take()) {
@@ -214,9 +218,10 @@ impl<'p> Cloud<'p> {
         notes
     }
 
-    /// Tells of a last line that breaks off behind a digit, and whether it shows that digits are missing.
+    /// Reports a last line that ends after a digit without a line end, and whether it has fewer digits than the lines
+    /// above.
     fn note_of_end(&self, text: &[u8]) -> Option<PointNote> {
-        /// Lines above that its digits are compared with, and how many have to be there.
+        /// Number of lines above whose digits are compared with the last line, and the minimum number required.
         const ABOVE: usize = 1000;
         const LEAST: usize = 3;
         let (layout, point) = (self.layout.as_ref()?, *self.points.last().filter(|_| self.empty_from.is_none())?);
@@ -235,20 +240,20 @@ impl<'p> Cloud<'p> {
         Some(PointNote::NoLineEnd { path, line, found, point, fewer_digits })
     }
 
-    /// Returns the length of the whole lines in a full batch, unless the last one goes on for too long.
+    /// Returns the length of the whole lines in a full batch, or an error if the last line is too long.
     fn whole_lines(&mut self, batch: &Batch) -> Result<usize, FormatError> {
         let text = &batch.bytes[batch.begin..];
         let lines = text.iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);
         if text.len() - lines <= LONGEST_LINE {
             return Ok(lines);
         }
-        // The lines before it may hold an earlier fault, and give the line its number.
+        // The lines before it can contain an earlier error, and are needed to count its line number.
         self.take(&text[..lines], BATCH as u64)?;
         let line = self.lines + 1;
         Err(FormatError::LineTooLong { path: self.path.to_owned(), line, limit_bytes: LONGEST_LINE })
     }
 
-    /// Takes whole lines, of which only the very last of the file may lack its end.
+    /// Parses whole lines; only the very last line of the file can lack its line end.
     fn take(&mut self, text: &[u8], bytes_so_far: u64) -> Result<(), FormatError> {
         let rest = self.take_preamble(text)?;
         let Some(layout) = &self.layout else { return self.check_preamble(bytes_so_far) };
@@ -288,7 +293,7 @@ impl<'p> Cloud<'p> {
         if found > limit { Err(too_many()) } else { Ok(()) }
     }
 
-    /// Takes the lines above the first point and returns the rest, which begins with it.
+    /// Reads the lines above the first point, and returns the rest, which begins with that point.
     fn take_preamble<'t>(&mut self, text: &'t [u8]) -> Result<&'t [u8], FormatError> {
         let mut rest = text;
         while self.layout.is_none() && !rest.is_empty() {
@@ -317,7 +322,7 @@ impl<'p> Cloud<'p> {
         Err(self.preamble.without_points())
     }
 
-    /// Gives up on a file that begins with nothing but comments.
+    /// Rejects a file that begins with nothing but comments.
     fn check_preamble(&self, bytes: u64) -> Result<(), FormatError> {
         let (path, limit, unit) = (self.path, BATCH as u64 - 1, "bytes before the first point");
         let too_large = || FormatError::TooLarge { path: path.to_owned(), found: bytes, limit, unit };
@@ -330,7 +335,7 @@ impl<'p> Cloud<'p> {
         if bytes > limit { Err(too_large()) } else { Ok(()) }
     }
 
-    /// Tells text from anything else by the first bytes.
+    /// Distinguishes text from other content by the first bytes.
     fn check_head(&self, head: &[u8]) -> Result<(), FormatError> {
         check_is_ours(self.path, head)?;
         if is_utf16(head) {
@@ -348,13 +353,13 @@ impl<'p> Cloud<'p> {
     }
 }
 
-/// Leaves out the marks that once ended a text.
+/// Removes the end-of-file marks of old systems from the end of a text.
 fn without_end_of_file(text: &[u8]) -> &[u8] {
     let end = text.iter().rposition(|b| *b != 0x1a && !b.is_ascii_whitespace()).map_or(0, |at| at + 1);
     if text[end..].contains(&0x1a) { &text[..end] } else { text }
 }
 
-/// Reads until the buffer is full or the stream ends; returns how much it read.
+/// Reads until the buffer is full or the stream ends; returns the number of bytes read.
 pub(super) fn fill(reader: &mut impl Read, buffer: &mut [u8]) -> std::io::Result<usize> {
     let mut filled = 0;
     while filled < buffer.len() {
@@ -368,14 +373,16 @@ pub(super) fn fill(reader: &mut impl Read, buffer: &mut [u8]) -> std::io::Result
     Ok(filled)
 }
 
-/// Returns how many points to make room for, from the share of the file that is read; never more than the file can hold.
+/// Returns the number of points to reserve memory for, estimated from the part of the file that is read; never more
+/// than the file can hold.
 fn expected_points(found: usize, bytes_so_far: u64, length: u64) -> usize {
     let ratio = length.max(bytes_so_far) as f64 / bytes_so_far.max(1) as f64;
-    // A batch of the smallest points would otherwise reserve many times what a file with a long tail of comments needs.
+    // Without this bound, a batch of very short points would reserve many times the memory that a file with a long tail
+    // of comments needs.
     ((found as f64 * ratio * 1.02) as usize).min(MOST_POINTS as usize / 4)
 }
 
-/// Splits text into shares for the threads, each of whole lines.
+/// Splits text into shares of whole lines, one for each thread.
 fn split_at_lines(text: &[u8]) -> Vec<&[u8]> {
     let mut shares = Vec::with_capacity(text.len() / SHARE + 1);
     let mut rest = text;
@@ -429,7 +436,7 @@ fn read_share(text: &[u8], layout: &Layout) -> Share {
     share
 }
 
-/// Reads a line of three plain numbers and perhaps more columns, and its end; `None` if it is anything else.
+/// Reads a line of three plain numbers, perhaps with more columns, and its line end; returns `None` for anything else.
 #[inline]
 fn quick_line(text: &[u8], layout: &Layout) -> Option<(Point, usize)> {
     let separator = layout.separator;
@@ -469,13 +476,14 @@ fn skip_separator(text: &[u8], at: usize, separator: Separator) -> Option<usize>
     (text.get(end) == Some(&separator.byte())).then(|| skip_padding(text, end + 1, separator))
 }
 
-/// Returns the end of a line after counting its columns; `None` if the count is wrong or the columns are not plain.
+/// Returns the end of a line after counting its columns; returns `None` if the count is wrong or the columns are not
+/// plain.
 fn skip_columns(text: &[u8], mut at: usize, layout: &Layout) -> Option<usize> {
     for _ in 3..layout.count {
         at = skip_separator(text, at, layout.separator)?;
         let stop = |&b: &u8| b == layout.separator.byte() || b < b' ' || b == b'"';
         let width = text[at..].iter().position(stop)?;
-        // Between blanks there is no empty column, only the blanks at the end of the line.
+        // With blanks as separator there is no empty column, only blanks at the end of the line.
         if width == 0 && layout.separator == Separator::Blank {
             return None;
         }
@@ -484,7 +492,7 @@ fn skip_columns(text: &[u8], mut at: usize, layout: &Layout) -> Option<usize> {
     Some(skip_padding(text, at, layout.separator))
 }
 
-/// Refuses what no line may be.
+/// Rejects a line with content that no line can have.
 fn check_line(path: &Path, number: u64, line: &[u8]) -> Result<(), FormatError> {
     if line.len() > LONGEST_LINE {
         return Err(FormatError::LineTooLong { path: path.to_owned(), line: number, limit_bytes: LONGEST_LINE });
@@ -495,7 +503,7 @@ fn check_line(path: &Path, number: u64, line: &[u8]) -> Result<(), FormatError> 
     Ok(())
 }
 
-/// Reads any line: a point, or nothing in a blank line or a comment, or the error that is to be reported.
+/// Reads any line: returns a point, `None` for a blank line or a comment, or the error to report.
 fn careful_line(
     path: &Path,
     number: u64,
@@ -514,7 +522,8 @@ fn careful_line(
     let mut values = [0.0; 3];
     for ((value, field), column) in values.iter_mut().zip(fields).zip(layout.columns) {
         *value = coordinate(&layout.separator.ungrouped(field), layout.decimal).map_err(|fault| {
-            // The beginning of a number at the very end of a file is a cut, not somebody's text.
+            // An incomplete number at the very end of a file means that the file is cut, not that it contains foreign
+            // text.
             let begun = field.iter().all(|b| matches!(b, b'0'..=b'9' | b'+' | b'-' | b'.' | b',' | b'e' | b'E'));
             if !ended && fault == NumberFault::Text && begun {
                 return FormatError::CutLine { path: path.to_owned(), line: number, found: excerpt(line) };

@@ -1,8 +1,10 @@
-//! Results as QIF 3.0 (ISO 23952): the points of `MeasuredPointSets`, or where there are none those of measured point features.
+//! Results as QIF 3.0 (ISO 23952): the points of `MeasuredPointSets`, or, if there are none, those of measured point
+//! features.
 //!
-//! The unit is that of `FileUnits/PrimaryUnits/LinearUnit`, by its factor to the metre. A point set says by `Compensated` whether its points are
-//! contacts (true) or centres of the probe (false), and may say its `ProbeRadius`. What the file is about is said by attributes,
-//! anywhere: `<AttributeStr name="regrind plan" value="5f3c..."/>`, likewise `regrind part` and `regrind cycle`. Features named `P17` are those of target 17.
+//! The unit is that of `FileUnits/PrimaryUnits/LinearUnit`, by its factor to the metre. `Compensated` of a point set
+//! says if its points are contacts (true) or centres of the probe (false); the set can also give its `ProbeRadius`.
+//! Attributes anywhere in the file are the statements about it: `<AttributeStr name="regrind plan" value="5f3c..."/>`,
+//! and likewise `regrind part` and `regrind cycle`. Features named `P17` belong to target 17.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -16,23 +18,23 @@ use super::result::{Content, Coordinates, ResultFile, Statements};
 use super::xml::{Beyond, beyond_bounds};
 use regrind_core::geometry::Point;
 
-/// Most nodes of a document.
+/// Maximum number of nodes of a document.
 const MOST_NODES: u32 = 10_000_000;
-/// The namespace of QIF 3.
+/// Namespace of QIF 3.
 const NAMESPACE: &str = "http://qifstandards.org/xsd/qif3";
-/// How attributes are named that are Regrind's.
+/// Prefix of the names of Regrind's attributes.
 const OURS: &str = "regrind ";
 
-/// Whether a file is XML.
+/// Returns true if a file is XML.
 pub(super) fn is_xml(head: &[u8]) -> bool {
     let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head).trim_ascii_start();
     head.starts_with(b"<?xml") || head.starts_with(b"<QIFDocument") || head.starts_with(b"<!--")
 }
 
-/// Reads what a document says of itself.
+/// Reads the statements of a document about itself.
 ///
 /// # Errors
-/// No document of QIF 3, and statements that say something impossible.
+/// A file that is not a document of QIF 3; a statement with an impossible value.
 pub(super) fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
     with_root(path, text, |root| Qif { path, root }.statements())
 }
@@ -40,7 +42,7 @@ pub(super) fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, Fo
 /// Reads the points of a document.
 ///
 /// # Errors
-/// No document of QIF 3; no unit, no points, and numbers that are none, with their lines.
+/// A file that is not a document of QIF 3; no unit, no points; text in place of a number, with its line.
 pub(super) fn parse(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, FormatError> {
     with_root(path, text, |root| Qif { path, root }.points(content))
 }
@@ -76,7 +78,7 @@ struct Qif<'p, 'a, 'i> {
     root: Node<'a, 'i>,
 }
 
-/// Points and what they are.
+/// Points and their meaning.
 #[derive(Default)]
 struct Found {
     points: Vec<Point>,
@@ -135,7 +137,7 @@ impl Qif<'_, '_, '_> {
         self.root.descendants().filter(move |node| node.has_tag_name((NAMESPACE, name)))
     }
 
-    /// Millimetres of the unit of length.
+    /// Returns the length of the unit, in millimetres.
     fn unit_mm(&self) -> Result<f64, FormatError> {
         let missing = || FormatError::Missing {
             path: self.path.to_owned(),
@@ -198,7 +200,7 @@ impl Qif<'_, '_, '_> {
         Ok(())
     }
 
-    /// Takes in whether points are compensated, and by what radius; all sets have to say the same.
+    /// Stores if points are compensated, and the radius of the probe; all sets must agree.
     fn what_they_are(&self, set: Node<'_, '_>, unit_mm: f64, found: &mut Found) -> Result<(), FormatError> {
         if let Some(compensated) = child(set, "Compensated") {
             let says = match compensated.text().unwrap_or_default().trim() {
@@ -225,7 +227,7 @@ impl Qif<'_, '_, '_> {
         Ok(())
     }
 
-    /// Measured point features, each with the name of its item.
+    /// Reads measured point features, each with the name of its item.
     fn features(&self, unit_mm: f64) -> Result<Found, FormatError> {
         let name = |node: Node<'_, '_>| child(node, "FeatureName").and_then(|name| name.text()).map(str::to_owned);
         let items = self.named("PointFeatureItem");
@@ -310,7 +312,7 @@ mod tests {
             <Location>1 2 3</Location></PointFeatureMeasurement></MeasuredFeatures>";
         let found = parsed(&document(features)).unwrap();
         assert_eq!((found.points, found.indices), (vec![Point::new(1.0, 2.0, 3.0)], Some(vec![17])));
-        // Of these nothing says whether the radius is off: who reads them asks the cell file.
+        // The file does not say if these points are compensated: the caller takes that from the cell file.
         assert_eq!(found.coordinates, None);
     }
 

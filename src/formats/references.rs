@@ -1,7 +1,8 @@
-//! Files of reference points: YAML as tracker software keeps them, or any point file, with or without names.
+//! Files of reference points: YAML as written by tracker software, or any point file, with or without names.
 //!
-//! YAML is read by its events, so that no alias unfolds and no depth of nesting is followed: wanted is one group, a list of points or
-//! a mapping from names to points, where a point is three numbers or a list that begins with them.
+//! YAML is read event by event, so that aliases are not expanded and deep nesting is not followed. The file must
+//! contain one group: a list of points, or a mapping from names to points. A point is three numbers or a list that
+//! begins with them.
 
 use std::path::{Path, PathBuf};
 
@@ -18,26 +19,26 @@ const MOST_BYTES: u64 = 1 << 20;
 /// Deepest nesting that is followed.
 const DEEPEST: usize = 32;
 
-/// A reference point.
+/// Reference point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Reference {
-    /// Its name, if the file gives it one.
+    /// Name, if the file gives one.
     pub name: Option<String>,
-    /// Where it is, in millimetres.
+    /// Position, in millimetres.
     pub at: Point,
 }
 
-/// The reference points of one file.
+/// Reference points of one file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct References {
-    /// The file.
+    /// Path of the file.
     pub path: PathBuf,
     /// The points, in the order of the file.
     pub points: Vec<Reference>,
 }
 
 impl References {
-    /// The name of a point, or its number where it has none.
+    /// Returns the name of a point, or its number if it has no name.
     pub fn name(&self, index: usize) -> String {
         self.points.get(index).and_then(|p| p.name.clone()).unwrap_or_else(|| format!("number {}", index + 1))
     }
@@ -45,19 +46,20 @@ impl References {
 
 /// Reads reference points from YAML (`.yaml`, `.yml`) or from any point file.
 ///
-/// `group` names the list in a YAML file that holds several; without it the file must hold one.
+/// `group` names the list in a YAML file with several; without it the file must contain exactly one.
 ///
 /// # Errors
-/// A file that cannot be read, a group that is not there, anything but finite numbers of millimetres where a point should be.
+/// A file that cannot be read; a group that does not exist; a point whose coordinates are not finite numbers in
+/// millimetres.
 pub fn read_references(path: &Path, group: Option<&str>) -> Result<References, FormatError> {
     let bytes = whole::open(path)?.read_all(path, MOST_BYTES)?;
     parse_references(path, &bytes, group)
 }
 
-/// Reads reference points from the bytes of a file; `path` tells the kind, and is what messages call it.
+/// Reads reference points from the bytes of a file; `path` determines the format and names the file in messages.
 ///
 /// # Errors
-/// Those of [`read_references`].
+/// The same as for [`read_references`].
 pub fn parse_references(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<References, FormatError> {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
     let points = if ["yaml", "yml"].contains(&extension.as_str()) {
@@ -81,7 +83,7 @@ fn reference(path: &Path, line: usize, expected: &'static str, found: impl Into<
     FormatError::Reference { path: path.to_owned(), line, expected, found: found.into() }
 }
 
-/// A piece of a YAML file.
+/// Node of a YAML file.
 #[derive(Debug)]
 struct Node {
     line: usize,
@@ -92,7 +94,7 @@ struct Node {
 enum Tree {
     Scalar(String),
     List(Vec<Node>),
-    /// Key and value in turn.
+    /// Keys and values, alternating.
     Mapping(Vec<Node>),
 }
 
@@ -112,7 +114,7 @@ fn from_yaml(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<Vec<Refer
     }
 }
 
-/// Finds the group of points: the one of that name, the only one, or the whole file.
+/// Returns the group of points: the one with the given name, the only one, or the whole file.
 fn group_of<'n>(path: &Path, root: &'n Node, group: Option<&str>) -> Result<&'n Node, FormatError> {
     let Tree::Mapping(pairs) = &root.content else { return Ok(root) };
     let named: Vec<(&str, &Node)> = pairs
@@ -134,7 +136,7 @@ fn group_of<'n>(path: &Path, root: &'n Node, group: Option<&str>) -> Result<&'n 
     }
 }
 
-/// Returns the position that a node holds: three numbers, or a list that begins with them.
+/// Returns the position in a node: three numbers, or a list that begins with them.
 fn position(path: &Path, node: &Node) -> Result<Point, FormatError> {
     let mut inner = node;
     while let Tree::List(nodes) = &inner.content
@@ -153,7 +155,7 @@ fn position(path: &Path, node: &Node) -> Result<Point, FormatError> {
     Ok(Point::new(number(x)?, number(y)?, number(z)?))
 }
 
-/// Builds the tree of a YAML file; the first document counts.
+/// Builds the tree of a YAML file; only the first document is used.
 fn tree(path: &Path, text: &str) -> Result<Node, FormatError> {
     let mut open: Vec<Node> = Vec::new();
     for event in Parser::new_from_str(text) {

@@ -1,7 +1,7 @@
-//! What a registration leaves behind: deviations, point clouds, JSON.
+//! Files of a registration: deviations, point clouds, JSON.
 //!
-//! Every file is written under a temporary name in the same folder, brought to the disk and renamed: whoever looks sees the old
-//! file or the new one, whole, also after a loss of power.
+//! Every file is written under a temporary name in the same folder, flushed to the disk and renamed. A reader sees
+//! either the old file or the new one, complete, even after a loss of power.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
@@ -15,32 +15,34 @@ use super::error::FormatError;
 use super::system;
 use regrind_core::geometry::Point;
 
-/// The first line of `deviations.csv`. These names are a contract.
+/// First line of `deviations.csv`. These names are a contract.
 const DEVIATIONS_HEADER: &str = "x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used";
 
-/// Rows that one thread formats at a time, and that are held in memory at a time.
+/// Number of rows that one thread formats at a time, and number of rows held in memory at a time.
 const SHARE: usize = 4096;
 const BATCH: usize = 16 * SHARE;
 
-/// What the registration says of one measured point.
+/// Result of the registration for one measured point.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DeviationRow {
     /// Contact point, in the model frame.
     pub point_mm: [f64; 3],
     /// Unit normal of the nominal surface there, in the model frame, outward.
     pub normal: [f64; 3],
-    /// Positive where material stands proud of the nominal surface.
+    /// Signed deviation along the normal: positive where material is proud of the nominal surface.
     pub deviation_mm: f64,
-    /// Whether the point took part in the fit.
+    /// True if the point took part in the fit.
     pub used: bool,
 }
 
-/// Writes `deviations.csv`: `x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used`, then a row per measured point in the order given.
+/// Writes `deviations.csv`: `x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used`, then one row per measured point in the order
+/// given.
 ///
-/// Numbers read back to the same bits; `used` is 1 or 0.
+/// Numbers are written so that reading them returns the same bits; `used` is 1 or 0.
 ///
 /// # Errors
-/// A row that holds NaN or an infinity; a file that cannot be written. The file of that name is then what it was.
+/// A row that contains NaN or an infinity; a file that cannot be written. An existing file of that name is then
+/// unchanged.
 pub fn write_deviations(path: impl AsRef<Path>, rows: &[DeviationRow]) -> Result<(), FormatError> {
     write_rows(path.as_ref(), DEVIATIONS_HEADER, rows, |row| {
         let ([x, y, z], [nx, ny, nz]) = (row.point_mm, row.normal);
@@ -48,10 +50,10 @@ pub fn write_deviations(path: impl AsRef<Path>, rows: &[DeviationRow]) -> Result
     })
 }
 
-/// Reads back what [`write_deviations`] wrote.
+/// Reads a file that [`write_deviations`] wrote.
 ///
 /// # Errors
-/// A file that cannot be read, other columns, rows that are no finite numbers.
+/// A file that cannot be read, other columns, rows that are not finite numbers.
 pub fn read_deviations(path: &Path) -> Result<Vec<DeviationRow>, FormatError> {
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
     let text = fs::read_to_string(path).map_err(unreadable)?;
@@ -86,25 +88,25 @@ fn deviation_row(row: &str) -> Option<DeviationRow> {
     cells.next().is_none().then_some(DeviationRow { point_mm: [x, y, z], normal: [nx, ny, nz], deviation_mm, used })
 }
 
-/// Writes a point cloud as comma separated text under the header given, in millimetres; no header if it is empty.
+/// Writes a point cloud as comma-separated text, in millimetres, with the given header; an empty header is omitted.
 ///
 /// # Errors
-/// Those of [`write_deviations`].
+/// The same as for [`write_deviations`].
 pub fn write_points(path: impl AsRef<Path>, header: &str, points: &[Point]) -> Result<(), FormatError> {
     write_rows(path.as_ref(), header, points, |point| ([point.x, point.y, point.z], None))
 }
 
-/// Writes one column of numbers under the header given.
+/// Writes one column of numbers with the given header.
 ///
 /// # Errors
-/// Those of [`write_deviations`].
+/// The same as for [`write_deviations`].
 pub fn write_column(path: impl AsRef<Path>, header: &str, values: &[f64]) -> Result<(), FormatError> {
     write_rows(path.as_ref(), header, values, |value| ([*value], None))
 }
 
 /// Writes a value as indented JSON.
 ///
-/// JSON has no NaN: a field that holds one becomes `null`. See to it that none does.
+/// JSON has no NaN: a field that is NaN becomes `null`. The caller must make sure that there is none.
 ///
 /// # Errors
 /// A value that JSON cannot express, such as a map whose keys are not text; a file that cannot be written.
@@ -116,7 +118,7 @@ pub fn write_json_atomic(path: impl AsRef<Path>, value: &impl Serialize) -> Resu
     write_atomic(path, &text)
 }
 
-/// Writes a file whole or not at all.
+/// Writes a file completely or not at all.
 ///
 /// # Errors
 /// A file that cannot be written.
@@ -126,26 +128,26 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
     draft.publish()
 }
 
-/// Writes a file that nobody but its owner may read, whole or not at all.
+/// Writes a file that only its owner can read, completely or not at all.
 ///
 /// # Errors
-/// Those of [`write_atomic`].
+/// The same as for [`write_atomic`].
 pub fn write_private(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
     let mut draft = Draft::create_private(path)?;
     draft.write(bytes)?;
     draft.publish()
 }
 
-/// Tries whether files can be written to a folder.
+/// Checks that files can be written to a folder.
 ///
 /// # Errors
-/// A folder that is not there or that takes none.
+/// A folder that does not exist or is not writable.
 pub fn try_writing(folder: &Path) -> Result<(), FormatError> {
-    // A draft that is not published leaves nothing behind.
+    // A draft that is not published leaves no file.
     Draft::create(&folder.join("probe")).map(drop)
 }
 
-/// Writes rows of N numbers and perhaps a flag.
+/// Writes rows of N numbers, optionally with a flag.
 pub(super) fn write_rows<T: Sync, const N: usize>(
     path: &Path,
     header: &str,
@@ -189,7 +191,7 @@ fn format_rows<T, const N: usize>(rows: &[T], cells: impl Fn(&T) -> ([f64; N], O
     text
 }
 
-/// A file under a temporary name, which goes away unless it is published.
+/// File under a temporary name, which is removed unless it is published.
 pub(super) struct Draft<'p> {
     path: &'p Path,
     temporary: PathBuf,
@@ -202,7 +204,7 @@ impl<'p> Draft<'p> {
         Self::create_by(path, |temporary| OpenOptions::new().write(true).create_new(true).open(temporary))
     }
 
-    /// One that nobody but its owner may read.
+    /// Creates a draft that only its owner can read.
     fn create_private(path: &'p Path) -> Result<Self, FormatError> {
         Self::create_by(path, system::create_owners)
     }
@@ -213,7 +215,7 @@ impl<'p> Draft<'p> {
         if path.is_dir() {
             return Err(failed(io::Error::from(io::ErrorKind::IsADirectory)));
         }
-        // A device or a pipe would be replaced by a file of its name.
+        // Publishing would replace a device or a pipe by a regular file.
         if path.metadata().is_ok_and(|there| !there.is_file()) {
             return Err(failed(io::Error::new(io::ErrorKind::InvalidInput, "it is a device or a pipe, not a file")));
         }
@@ -236,7 +238,7 @@ impl<'p> Draft<'p> {
         self.file.write_all(bytes).map_err(failed)
     }
 
-    /// Brings the bytes to the disk, then gives the file its name, then brings the name to the disk.
+    /// Flushes the bytes to the disk, renames the file, then flushes the new name to the disk.
     pub(super) fn publish(mut self) -> Result<(), FormatError> {
         let failed = self.failed("bringing it to the disk");
         self.file.flush().map_err(&failed)?;
@@ -250,16 +252,16 @@ impl<'p> Draft<'p> {
 impl Drop for Draft<'_> {
     fn drop(&mut self) {
         if !self.published {
-            // The error that brought us here is the one to report.
+            // The first error is the one to report.
             let _ = fs::remove_file(&self.temporary);
         }
     }
 }
 
-/// Makes the rename of a path last.
+/// Makes the rename of a path durable.
 ///
 /// # Errors
-/// A folder that cannot be brought to the disk.
+/// A folder that cannot be flushed to the disk.
 pub fn sync_folder(path: &Path) -> io::Result<()> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     system::sync_folder(folder)

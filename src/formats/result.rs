@@ -1,19 +1,21 @@
-//! The result file of a measurement: points, and what the file says of itself.
+//! Result file of a measurement: points, and the statements of the file about itself.
 //!
-//! Any point file that the library reads will do. What it may say besides, in comments above the points:
+//! Any point file that the library reads is accepted. The file can also make statements in comments above the points:
 //!
 //! ```text
 //! # part: SN-0042          # cycle: 2              # plan: 5f3c... (the identity from plan.json)
 //! # coordinates: centres   # units: mm             # probe radius mm: 1.5     # temperature c: 20.1
 //! ```
 //!
-//! and in columns with a header: `index` (the number of the plan's target), `enabled` (rows that say unchecked are left out, as laser
-//! trackers export them), `probe` (the *diameter* of a tracker's reflector in mm) or `probe_radius_mm`, and `name` or `feature`.
+//! and in columns with a header: `index` (the number of the plan's target), `enabled` (rows marked as unchecked are
+//! skipped, as laser trackers export them), `probe` (the *diameter* of a tracker's reflector in mm) or
+//! `probe_radius_mm`, and `name` or `feature`.
 //!
-//! Points may come as QIF (`QIFDocument`) or as DMIS output too; what these say of themselves, and how, stands in their files here.
+//! Points in QIF (`QIFDocument`) or DMIS output are accepted too; `qif.rs` and `dmis.rs` describe the statements of
+//! these formats.
 //!
-//! A map of an interferometer or profilometer (X3P, SDF, MetroPro) says nothing of itself; its measured samples are points of contact,
-//! in millimetres whatever the unit of other files.
+//! A map of an interferometer or profilometer (X3P, SDF, MetroPro) makes no statements. Its measured samples are points
+//! of contact, in millimetres whatever the unit of other files.
 
 use std::path::Path;
 
@@ -30,9 +32,9 @@ use super::points::parse_points_with;
 use super::{FormatError, dmis, ply, qif, whole};
 use regrind_core::geometry::Point;
 
-/// Largest result file that is read.
+/// Largest result file that is read, in bytes.
 const MOST_BYTES: u64 = 512 << 20;
-/// Bytes at the beginning of a file in which it may say something of itself.
+/// Bytes at the beginning of a file in which statements are searched.
 const PREAMBLE_BYTES: usize = 64 << 10;
 
 /// What measured coordinates are.
@@ -67,31 +69,31 @@ pub enum DecimalMark {
     Comma,
 }
 
-/// What the cell knows of its result files.
+/// Properties of the result files that the cell states.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Content {
-    /// What the coordinates are, where the cell says so.
+    /// Meaning of the coordinates, if the cell states it.
     pub coordinates: Option<Coordinates>,
     /// The decimal mark.
     pub decimal: DecimalMark,
-    /// The unit of length of the files: mm, but for a machine that is known to write another one.
+    /// Unit of length of the files: mm, except for a machine that is known to write another one.
     pub unit: Unit,
-    /// The unit of z, where it is another one.
+    /// Unit of z, if it differs.
     pub height_unit: Option<Unit>,
-    /// Which columns of the files are x, y and z, where their headers do not say so.
+    /// Columns x, y and z of the files, if their headers do not name them.
     pub columns: Option<Columns>,
 }
 
-/// What a file says of itself.
+/// Statements of a file about itself.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Statements {
-    /// The part it belongs to.
+    /// Part that the file belongs to.
     pub part: Option<String>,
-    /// The cycle it belongs to.
+    /// Cycle that the file belongs to.
     pub cycle: Option<u16>,
-    /// The identity of the plan, 64 hexadecimal digits in lower case.
+    /// Identity of the plan, 64 hexadecimal digits in lower case.
     pub plan: Option<String>,
-    /// What the coordinates are.
+    /// Meaning of the coordinates.
     pub coordinates: Option<Coordinates>,
     /// Unit of length.
     pub unit: Option<Unit>,
@@ -101,33 +103,33 @@ pub struct Statements {
     pub temperature_c: Option<f64>,
 }
 
-/// A result file as it was read.
+/// Content of a result file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResultFile {
-    /// The points in millimetres, in the order of the file, rows that are switched off left out.
+    /// The points in millimetres, in the order of the file, without rows that are switched off.
     pub points: Vec<Point>,
-    /// For each point the number of its target, if the file has a column `index`.
+    /// Number of the target of each point, if the file has a column `index`.
     pub indices: Option<Vec<u32>>,
-    /// For each point its name, if the file has a column `name`, `point` or `feature`.
+    /// Name of each point, if the file has a column `name`, `point` or `feature`.
     pub names: Option<Vec<String>>,
-    /// What the coordinates are, by the file or else by the cell.
+    /// Meaning of the coordinates, as stated by the file or else by the cell.
     pub coordinates: Option<Coordinates>,
-    /// Radius of the probe, by a statement or a column.
+    /// Radius of the probe in mm, from a statement or a column.
     pub probe_radius_mm: Option<f64>,
-    /// Rows that were left out because they are switched off.
+    /// Number of rows that were skipped because they are switched off.
     pub switched_off: usize,
-    /// What the reader had to decide about the file, in words.
+    /// Decisions of the reader about ambiguous content, in words.
     pub notes: Vec<String>,
-    /// What the file says of itself.
+    /// Statements of the file about itself.
     pub statements: Statements,
 }
 
-/// Checks that the last line of a text has its end; a file that was cut short in its last number has not.
+/// Checks that the last line of a text has its line end; a file that was cut in its last number has none.
 ///
 /// # Errors
-/// The line that was cut.
+/// A last line that is cut.
 pub fn check_ended(path: &Path, text: &[u8]) -> Result<(), FormatError> {
-    // A document has an end of its own.
+    // An XML or DMIS document has its own end mark.
     let is_document = ply::is_ply(text) || map_format(text).is_some() || qif::is_xml(text) || dmis::is_dmis(text);
     if is_document || text.ends_with(b"\n") {
         return Ok(());
@@ -140,15 +142,15 @@ pub fn check_ended(path: &Path, text: &[u8]) -> Result<(), FormatError> {
 /// Reads the bytes of a result file.
 ///
 /// # Errors
-/// A file that cannot be read or is too large.
+/// A file that is not readable or too large.
 pub fn read_bytes(path: &Path) -> Result<Vec<u8>, FormatError> {
     whole::open(path)?.read_all(path, MOST_BYTES)
 }
 
-/// Reads what a file says of itself, without its points.
+/// Reads the statements of a file, without its points.
 ///
 /// # Errors
-/// A statement that says something impossible.
+/// A statement with an impossible value.
 pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
     if map_format(text).is_some() {
         return Ok(Statements { coordinates: Some(Coordinates::Contacts), ..Statements::default() });
@@ -169,7 +171,7 @@ pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatErr
             (true, Some(comment)) => comment,
             (true, None) if line == "end_header" => break,
             (false, _) if is_comment(line.as_bytes()) => line.trim_start_matches(['#', '/']),
-            // Statements stand above the points; a header may stand between.
+            // Statements are above the points; a header can be between them.
             (false, _) if line.starts_with(|c: char| c.is_ascii_digit() || "+-.".contains(c)) => break,
             _ => continue,
         };
@@ -181,7 +183,7 @@ pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatErr
 }
 
 impl Statements {
-    /// Takes one statement; what is none of ours is only a comment.
+    /// Reads one statement; any other comment is ignored.
     pub(super) fn take(&mut self, path: &Path, line: u64, key: &str, value: &str) -> Result<(), FormatError> {
         let wrong = |key, expected| FormatError::Statement {
             path: path.to_owned(),
@@ -231,10 +233,10 @@ impl Statements {
     }
 }
 
-/// Reads the text of a result file; `path` is what messages call it.
+/// Parses the text of a result file; `path` only names the file in messages.
 ///
 /// # Errors
-/// Those of [`super::read_points`]; statements and columns that contradict the cell or each other.
+/// The same as for [`super::read_points`]; statements and columns that contradict the cell or each other.
 pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, FormatError> {
     let statements = read_statements(path, text)?;
     let coordinates = agreed_coordinates(path, &statements, content)?;
@@ -242,7 +244,7 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
         let MapPoints { points, notes } = format.parse_points(path, text)?;
         return Ok(ResultFile { points, coordinates, notes, statements, ..ResultFile::default() });
     }
-    // Both say their unit themselves.
+    // Both formats state their own unit.
     if qif::is_xml(text) {
         return qif::parse(path, text, content);
     }
@@ -325,17 +327,18 @@ fn agreed_radius(path: &Path, stated: Option<f64>, column: Option<f64>) -> Resul
     }
 }
 
-/// What stands beside the coordinates.
+/// Data of the columns other than the coordinates.
 #[derive(Default)]
 struct OtherColumns {
     indices: Option<Vec<u32>>,
     names: Option<Vec<String>>,
-    /// Empty if nothing is switched off.
+    /// Empty if no row is switched off.
     enabled: Vec<bool>,
     probe_radius_mm: Option<f64>,
 }
 
-/// Returns where a header names what is read beside the coordinates: index, name, enabled, radius and diameter of the probe.
+/// Returns the indices of the other columns that the header names: index, name, enabled, radius and diameter of the
+/// probe.
 fn beside(names: &[String]) -> [Option<usize>; 5] {
     let wanted: [&[&str]; 5] = [
         &["index", "target"],
@@ -348,7 +351,7 @@ fn beside(names: &[String]) -> [Option<usize>; 5] {
 }
 
 impl OtherColumns {
-    /// Goes through the lines again for the columns that the header names; the points have been read from the same lines.
+    /// Reads the lines again for the columns that the header names; the points come from the same lines.
     fn read(
         path: &Path,
         text: &[u8],
@@ -407,7 +410,7 @@ impl OtherColumns {
     }
 }
 
-/// Reads the size of a probe in the notation of the file, or else with a decimal point.
+/// Reads the size of a probe in the number notation of the file, or else with a decimal point.
 fn probe_size_mm(path: &Path, layout: &Layout, text: &[u8]) -> Result<f64, FormatError> {
     let size_mm = coordinate(&layout.separator.ungrouped(text), layout.decimal)
         .or_else(|_| coordinate(text, Decimal::Point))
@@ -435,7 +438,7 @@ fn whole_number(path: &Path, line: u64, field: &[u8]) -> Result<u32, FormatError
     })
 }
 
-/// Remembers the first probe of a file and refuses another one.
+/// Stores the first probe of a file, and rejects any other one.
 fn same_probe(path: &Path, line: u64, field: &[u8], first: &mut Option<Vec<u8>>) -> Result<(), FormatError> {
     match first {
         Some(first) if first != field => {
@@ -481,7 +484,7 @@ mod tests {
         for content in [&Content::default(), &comma] {
             assert_eq!(parse(text, content).unwrap().probe_radius_mm, Some(19.05));
         }
-        // Whole coordinates do not tell the mark; the cell does.
+        // Coordinates without decimals do not show the decimal mark; the cell states it.
         let whole = "name;x;y;z;probe\na;1;2;3;1.500,5\n";
         assert_eq!(parse(whole, &comma).unwrap().probe_radius_mm, Some(750.25));
     }

@@ -1,8 +1,9 @@
 //! Maps in the surface data file format (`.sdf`; ISO 25178-71, EUNA 15178), as text and binary.
 //!
-//! A header of thirteen fields, the heights profile by profile, and a trailer that is not read. Scales are metres. As text: `key =
-//! value` lines between the version and a line `*`; `BAD` was not measured. Binary: 81 bytes, little-endian; not measured are NaN, the infinities,
-//! the least value of signed and the largest of unsigned integers of 16 and 32 bits.
+//! A header of thirteen fields, the heights profile by profile, and a trailer that is not read. Scales are in metres.
+//! Text: `key = value` lines between the version and a line `*`; `BAD` marks a sample that was not measured. Binary: 81
+//! bytes, little-endian. Samples that were not measured are NaN, the infinities, the minimum of signed and the maximum
+//! of unsigned integers of 16 and 32 bits.
 
 use std::path::Path;
 
@@ -14,13 +15,13 @@ use regrind_core::geometry::Grid;
 
 /// Length of the binary header.
 const HEADER: usize = 81;
-/// Some instruments write two more words before the heights.
+/// Some instruments write two additional words before the heights.
 const EXTRA: usize = 8;
-/// The fields of the header that are read, as they are called in text.
+/// Fields of the header that are read, with their names in the text form.
 const FIELDS: [&str; 8] =
     ["NumPoints", "NumProfiles", "Xscale", "Yscale", "Zscale", "Compression", "DataType", "CheckType"];
 
-/// SDF, told by its first bytes.
+/// SDF format, detected by its first bytes.
 pub(super) const FORMAT: MapFormat = MapFormat {
     begins: is_sdf,
     read: |path| read_sdf(path).map(Into::into),
@@ -30,7 +31,7 @@ pub(super) const FORMAT: MapFormat = MapFormat {
 /// Reads an SDF map of at most 1 GiB.
 ///
 /// # Errors
-/// A file that is not readable, no SDF, malformed, compressed or cut; a number that is none.
+/// A file that is not readable, not SDF, malformed, compressed or cut; text in place of a number.
 pub fn read_sdf(path: impl AsRef<Path>) -> Result<HeightMap, FormatError> {
     let path = path.as_ref();
     let opened = open(path)?;
@@ -38,10 +39,10 @@ pub fn read_sdf(path: impl AsRef<Path>) -> Result<HeightMap, FormatError> {
     parse_sdf(path, &opened.read_all(path, MOST_BYTES)?)
 }
 
-/// Parses the bytes of an SDF file; `path` is only what messages call it.
+/// Parses the bytes of an SDF file; `path` only names the file in messages.
 ///
 /// # Errors
-/// Those of [`read_sdf`].
+/// The same as for [`read_sdf`].
 pub fn parse_sdf(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     check_version(path, bytes)?;
     if bytes[0] == b'a' { parse_text(path, bytes) } else { parse_binary(path, bytes) }
@@ -55,7 +56,7 @@ fn check_version(path: &Path, head: &[u8]) -> Result<(), FormatError> {
     Err(unexpected(path, "byte 0", "aISO-1.0 or bISO-1.0", excerpt(&head[..head.len().min(8)])))
 }
 
-/// Returns whether a file begins like SDF.
+/// Returns true if a file begins like SDF.
 fn is_sdf(head: &[u8]) -> bool {
     let version = head.get(..8).unwrap_or_default();
     matches!(version.first(), Some(b'a' | b'b')) && version[1..] == b"ISO-1.0"[..]
@@ -66,7 +67,7 @@ fn unexpected(path: &Path, place: &str, expected: &str, found: impl Into<String>
     FormatError::Unexpected { path: path.to_owned(), place, expected, found }
 }
 
-/// What is read of a header.
+/// Header fields that are used.
 struct Header {
     size: [usize; 2],
     /// Metres per step.
@@ -109,7 +110,7 @@ impl Header {
     ) -> Result<HeightMap, FormatError> {
         let [x, y, z] = self.scale_m.map(|scale| 1e3 * scale);
         let mut first_bad = None;
-        // An error ends the samples, and is what is wrong with the file.
+        // An error ends the samples and is reported as the fault of the file.
         let heights = samples.map_while(|sample| sample.map_err(|error| first_bad = Some(error)).ok());
         let [columns, rows] = self.size;
         let grid = Grid { columns, rows, first_mm: [0.0; 2], spacing_mm: [x, y] };
@@ -140,7 +141,7 @@ fn parse_binary(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     header.map(path, raw.chunks_exact(size).map(|at| Ok(binary_value(kind, at))))
 }
 
-/// Reads a height; `None` where it was not measured.
+/// Reads a height; returns `None` if it was not measured.
 fn binary_value(kind: u8, at: &[u8]) -> Option<f64> {
     let two = || at.first_chunk().copied().unwrap_or_default();
     let four = || at.first_chunk().copied().unwrap_or_default();

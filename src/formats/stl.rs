@@ -1,7 +1,8 @@
 //! Triangle meshes in STL, ascii and binary.
 //!
-//! STL repeats every vertex in every facet; vertices with the same coordinates, to the last bit, are welded to one. The facet
-//! normals of the file are ignored: they follow from the corners, and many programs write zeros. STL states no unit; mm is meant.
+//! STL repeats every vertex in every facet; vertices with bitwise equal coordinates are merged. The facet normals of
+//! the file are ignored: they follow from the corners, and many programs write zeros. STL states no unit; millimetres
+//! are assumed.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -12,33 +13,34 @@ use super::number::{any_number, is_believable};
 use super::whole::{MOST_BYTES, is_degenerate, open};
 use regrind_core::geometry::Point;
 
-/// Bytes before the first facet, and of one facet, in binary.
+/// Number of bytes before the first facet, and of one facet, in binary.
 const BINARY_HEADER: usize = 84;
 const BINARY_FACET: usize = 50;
 
-/// What an STL file holds.
+/// Content of an STL file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StlFile {
-    /// The welded vertices in the order in which they first occur, in millimetres.
+    /// The merged vertices in the order of their first occurrence, in millimetres.
     pub points: Vec<Point>,
     /// Corner indices of the triangles.
     pub triangles: Vec<[u32; 3]>,
-    /// How many facets were left out because they span no area.
+    /// Number of facets that were skipped because their area is 0.
     pub degenerate: usize,
 }
 
 /// Reads an STL file of at most 1 GiB.
 ///
-/// A file is binary if its length is the one its facet count asks for, whatever its first word is; else it is ascii if it
+/// A file is binary if its length matches its facet count, whatever its first word is. Otherwise it is ascii if it
 /// begins with `solid` and its beginning is text.
 ///
 /// # Errors
-/// A file that is not readable, no STL, malformed or cut; no facet with an area; a vertex that is not finite or beyond 1e7 mm.
+/// A file that is not readable, not STL, malformed or cut; no facet with an area; a vertex that is not finite or beyond
+/// 1e7 mm.
 pub fn read_stl(path: impl AsRef<Path>) -> Result<StlFile, FormatError> {
     let path = path.as_ref();
     let opened = open(path)?;
     if opened.length > opened.head.len() as u64 {
-        // Known from the head and the length alone, so that a large file of rubbish is not read.
+        // The beginning and the length decide, so that a large file of other content is not read.
         return match kind(path, &opened.head, opened.length)? {
             Kind::Binary => parse_stl(path, &opened.read_all(path, MOST_BYTES)?),
             Kind::Ascii => opened.parse(path, parse_ascii),
@@ -47,10 +49,10 @@ pub fn read_stl(path: impl AsRef<Path>) -> Result<StlFile, FormatError> {
     parse_stl(path, &opened.read_all(path, MOST_BYTES)?)
 }
 
-/// Parses the bytes of an STL file; `path` is only what messages call it.
+/// Parses the bytes of an STL file; `path` only names the file in messages.
 ///
 /// # Errors
-/// Those of [`read_stl`].
+/// The same as for [`read_stl`].
 pub fn parse_stl(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
     let kind = kind(path, bytes, bytes.len() as u64)?;
     let first_line = bytes[..bytes.len().min(80)].split(|&b| b == b'\n').next().unwrap_or_default();
@@ -61,7 +63,7 @@ pub fn parse_stl(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
     }
 }
 
-/// Returns whether a file of which the beginning and the length are known is STL beyond doubt.
+/// Returns true if the beginning and the length of a file prove that it is STL.
 pub(super) fn is_stl(head: &[u8], length: u64) -> bool {
     looks_ascii(head) || (facets(head).is_some_and(|n| n > 0) && binary_length(head) == Some(length))
 }
@@ -97,7 +99,7 @@ fn kind(path: &Path, head: &[u8], length: u64) -> Result<Kind, FormatError> {
     })
 }
 
-/// Returns the number of facets a binary header announces.
+/// Returns the number of facets that a binary header announces.
 fn facets(head: &[u8]) -> Option<u32> {
     head.get(80..BINARY_HEADER).and_then(|bytes| bytes.try_into().ok()).map(u32::from_le_bytes)
 }
@@ -106,7 +108,7 @@ fn binary_length(head: &[u8]) -> Option<u64> {
     facets(head).map(|n| BINARY_HEADER as u64 + u64::from(n) * BINARY_FACET as u64)
 }
 
-/// Returns whether a file begins with `solid` and goes on as text.
+/// Returns true if a file begins with `solid` and continues as text.
 fn looks_ascii(head: &[u8]) -> bool {
     let text = head.trim_ascii_start();
     let solid = text.get(..5).is_some_and(|word| word.eq_ignore_ascii_case(b"solid"));
@@ -120,7 +122,7 @@ fn parse_binary(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
     let mut mesh = Welder::with_capacity(facets.len());
     for (facet, record) in facets.enumerate() {
         let mut corners = [Point::origin(); 3];
-        // Twelve bytes of normal come first; two of attributes last.
+        // The first twelve bytes are the normal, the last two are attributes.
         for (k, four) in record[12..48].chunks_exact(4).enumerate() {
             let value = f64::from(f32::from_le_bytes([four[0], four[1], four[2], four[3]]));
             if !is_believable(value) {
@@ -154,7 +156,7 @@ fn parse_ascii(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
     }
 }
 
-/// The words of an ascii file.
+/// Words of an ascii file.
 struct Words<'a> {
     path: &'a Path,
     rest: &'a [u8],
@@ -162,7 +164,7 @@ struct Words<'a> {
 }
 
 impl<'a> Words<'a> {
-    /// Returns the next word; `expected` is for the message if there is none.
+    /// Returns the next word; `expected` is used in the message if there is none.
     fn next(&mut self, expected: &str) -> Result<&'a [u8], FormatError> {
         let blanks = self.rest.iter().take_while(|b| b.is_ascii_whitespace()).count();
         self.line += self.rest[..blanks].iter().filter(|&&b| b == b'\n').count() as u64;
@@ -176,7 +178,7 @@ impl<'a> Words<'a> {
         Ok(&word[..end])
     }
 
-    /// Takes one of three words and returns which.
+    /// Reads one of three words and returns which one.
     fn one_of(&mut self, wanted: [&str; 3]) -> Result<usize, FormatError> {
         let word = self.next(wanted[0])?;
         let found = wanted.iter().position(|w| word.eq_ignore_ascii_case(w.as_bytes()));
@@ -189,7 +191,7 @@ impl<'a> Words<'a> {
         if right { Ok(()) } else { Err(self.unexpected(&format!("`{wanted}`"), word, [wanted; 3])) }
     }
 
-    /// A word that merely begins as it should, at the very end, means that the file is cut.
+    /// An incomplete word at the very end means that the file is cut.
     fn unexpected(&self, expected: &str, word: &[u8], wanted: [&str; 3]) -> FormatError {
         let (path, place) = (self.path.to_owned(), format!("line {}", self.line));
         let begun = |w: &str| w.as_bytes().get(..word.len()).is_some_and(|part| part.eq_ignore_ascii_case(word));
@@ -243,9 +245,10 @@ impl<'a> Words<'a> {
     }
 }
 
-/// A mesh that grows facet by facet, its equal vertices made one.
+/// Mesh that is built facet by facet, with equal vertices merged.
 struct Welder {
-    /// Keyed by the bits of the coordinates. The standard hasher is keyed at random, so that no file can make it slow.
+    /// The keys are the bits of the coordinates. The standard hasher has a random key, so that no file can make it
+    /// slow.
     known: HashMap<[u64; 3], u32>,
     mesh: StlFile,
 }
@@ -257,7 +260,7 @@ impl Welder {
     }
 
     fn facet(&mut self, corners: [Point; 3]) {
-        // Adding zero makes -0 to 0, which is the same place.
+        // Adding zero turns -0 into 0, which is the same position.
         let corners = corners.map(|corner| corner.map(|v| v + 0.0));
         if is_degenerate(corners.each_ref()) {
             self.mesh.degenerate += 1;

@@ -1,28 +1,28 @@
-//! The figures of the form as `figures.json` lists them: each a median with the interval that holds it with 95 %, and beside it the same of
-//! what was measured, called raw.
+//! Figures of the form as `figures.json` lists them: each with its median and 95 % credible interval, and with the same
+//! figure of the measured deviations, called raw.
 
 use serde::Serialize;
 
 use regrind_core::form::{Figures, Iso10110, Slope, TakenOut, iso_10110_notation};
 use regrind_core::model::{AngleInterval, Form, Interval, IsoFigures};
 
-/// A figure of the form.
+/// Figure of the form.
 #[derive(Serialize)]
 pub(super) struct Told {
-    /// What it is called.
+    /// Name of the figure.
     name: &'static str,
-    /// As probably above as below.
+    /// Median of the posterior.
     median: f64,
-    /// Below it with a probability of 2.5 %; 0 where the figure is known from above alone.
+    /// Quantile of 2.5 %; 0 if only an upper bound of the figure is known.
     low: f64,
-    /// Above it with a probability of 2.5 %.
+    /// Quantile of 97.5 %.
     high: f64,
-    /// The same of what was measured, the scatter of the probe in it; none where it was not worked out.
+    /// The same figure of the measured deviations, which include the noise of the probe; `None` if it was not computed.
     raw: Option<f64>,
     unit: &'static str,
-    /// What was removed before.
+    /// Terms that were removed before.
     removed: String,
-    /// What it is, where its name does not tell.
+    /// Definition of the figure, if its name does not give it.
     made: String,
 }
 
@@ -35,7 +35,8 @@ const RMS_TOTAL: &str = "of what piston and tilt leave";
 const RMS_IRREGULARITY: &str = "of what piston, tilt and power leave";
 const RMS_VARYING: &str = "of the part of that which is not symmetric about the middle";
 
-/// Returns the figures of a form, in the order of a report: micrometres, nanometres for those of ISO 10110-5, microradians.
+/// Returns the figures of a form, in the order of a report: in micrometres, those of ISO 10110-5 in nanometres, slopes
+/// in microradians.
 pub(super) fn told(form: &Form, raw: Option<&Figures>, slope: Option<&Slope>, taken_out: &TakenOut) -> Vec<Told> {
     let removed = taken_out.removed(raw.map_or(&[], |raw| &raw.removed));
     let row = |name, [median, low, high]: [f64; 3], raw, unit, made: &str| Told {
@@ -92,7 +93,7 @@ fn values(of: Interval) -> [f64; 3] {
     [of.median_mm, of.low_mm, of.high_mm]
 }
 
-/// Returns the indication of ISO 10110-5 that the form meets in each of its values with a probability of 97.5 %.
+/// Returns the ISO 10110-5 indication that the form meets in each of its values with a probability of 97.5 %.
 pub(super) fn notation(of: &IsoFigures, wavelength_nm: f64) -> String {
     let most = |of: Interval| 1e6 * of.high_mm;
     iso_10110_notation(

@@ -1,4 +1,4 @@
-//! Reading a whole file of a structured format into memory, but no more of it than its beginning justifies.
+//! Reading of a complete file of a structured format into memory, after its beginning was checked.
 
 use std::fs::File;
 use std::io::Read;
@@ -9,17 +9,17 @@ use super::points::fill;
 use super::system;
 use regrind_core::geometry::Point;
 
-/// Largest mesh file that is read.
+/// Largest mesh file that is read, in bytes.
 pub(super) const MOST_BYTES: u64 = 1 << 30;
-/// Bytes that must be good before the rest is read.
+/// Number of bytes that must be valid before the rest is read.
 const HEAD: usize = 64 << 10;
 
-/// The beginning of a file, and the file to read on.
+/// Beginning of a file, with the open file for the rest.
 pub(super) struct Opened {
     file: File,
-    /// The length the system tells; 0 for a pipe.
+    /// Length that the system reports; 0 for a pipe.
     pub(super) length: u64,
-    /// The first bytes, at most 64 KiB.
+    /// First bytes, at most 64 KiB.
     pub(super) head: Vec<u8>,
 }
 
@@ -34,7 +34,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, FormatError> {
     Ok(Opened { file, length, head })
 }
 
-/// Reads a whole file, if it has no more bytes than `limit`.
+/// Reads a complete file, if it has at most `limit` bytes.
 ///
 /// # Errors
 /// A file that cannot be read or is too large.
@@ -43,7 +43,7 @@ pub fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
 }
 
 impl Opened {
-    /// Returns all bytes of the file, if there are no more than `limit`.
+    /// Returns all bytes of the file, if there are at most `limit`.
     pub(super) fn read_all(mut self, path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
         let too_large = |found| FormatError::TooLarge { path: path.to_owned(), found, limit, unit: "bytes" };
         if self.length > limit {
@@ -57,7 +57,8 @@ impl Opened {
         if found > limit { Err(too_large(found)) } else { Ok(self.head) }
     }
 
-    /// Parses the file, but first only its beginning, so that a gigabyte of rubbish costs neither time nor memory.
+    /// Parses the beginning of the file first and then the whole file, so that a gigabyte of invalid content costs
+    /// neither time nor memory.
     pub(super) fn parse<T>(
         self,
         path: &Path,
@@ -73,7 +74,7 @@ impl Opened {
     }
 }
 
-/// Returns whether three corners span no area.
+/// Returns true if three corners form a triangle of area 0.
 pub(super) fn is_degenerate(corners: [&Point; 3]) -> bool {
     let [a, b, c] = corners;
     (b - a).cross(&(c - a)).norm_squared() == 0.0

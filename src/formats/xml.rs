@@ -1,11 +1,12 @@
-//! Bounds of a document of XML, looked at before it is parsed: what takes a parser time that grows with the square of the document is refused.
+//! Limits of an XML document, checked before it is parsed: content for which a parser needs time quadratic in its
+//! length is rejected.
 
-/// Most attributes of an element, most declarations of namespaces in a document, and most elements within each other.
+/// Maximum number of attributes of an element, of namespace declarations in a document, and of nested elements.
 const MOST_ATTRIBUTES: usize = 256;
 const MOST_NAMESPACES: usize = 64;
 const MOST_DEPTH: usize = 128;
 
-/// What of a document is beyond its bounds: the line, what is allowed, and what is there.
+/// Exceeded limit of a document: the line, the limit and the value found.
 #[derive(Debug, PartialEq)]
 pub(super) struct Beyond {
     pub(super) line: usize,
@@ -13,7 +14,7 @@ pub(super) struct Beyond {
     pub(super) found: String,
 }
 
-/// Looks once through a document, which may be none, for more than a parser is to be given.
+/// Scans a document once, even if it is not XML, for content beyond the limits of the parser.
 pub(super) fn beyond_bounds(text: &str) -> Option<Beyond> {
     let bytes = text.as_bytes();
     let (mut at, mut depth, mut namespaces) = (0, 0_usize, 0);
@@ -52,9 +53,9 @@ pub(super) fn beyond_bounds(text: &str) -> Option<Beyond> {
     None
 }
 
-/// The beginning of an element.
+/// Start tag of an element.
 struct Tag {
-    /// Where it ends.
+    /// Position of its end.
     end: usize,
     attributes: usize,
     declarations: usize,
@@ -81,7 +82,7 @@ fn tag(bytes: &[u8], from: usize) -> Tag {
             }
             (None, _) => {}
         }
-        // What is refused need not be counted to its end.
+        // An element that is rejected need not be counted to its end.
         if tag.attributes > MOST_ATTRIBUTES {
             break;
         }

@@ -1,4 +1,4 @@
-//! The files of a run: on the disk first, on record then.
+//! Files of a run: each is written to the disk first, and recorded after that.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
@@ -13,36 +13,37 @@ use super::open::sync_folder;
 use super::system;
 use super::{ANCHOR, DATABASE, LOCK};
 
-/// A file of the run folder, as it stands in the journal.
+/// Journal entry of a file of the run folder.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Artefact {
-    /// Its path within the run folder, with `/` between names.
+    /// Path within the run folder, with `/` between names.
     pub name: String,
-    /// Its length.
+    /// Length in bytes.
     pub bytes: u64,
-    /// Its SHA-256 in small hexadecimal digits.
+    /// SHA-256 of the content, in lowercase hexadecimal digits.
     pub sha256: String,
 }
 
 impl Artefact {
-    /// Brings a file that was written into a run folder to the disk and reads what it holds. A large one takes its time.
+    /// Syncs a file that was written into a run folder to the disk, and returns its name, length and hash. This takes
+    /// time for a large file.
     ///
     /// # Errors
-    /// A name that is no plain relative path, a file that cannot be read, a disk that fails.
+    /// The name is not a plain relative path, the file cannot be read, or the disk fails.
     pub fn of(folder: &Path, name: &str) -> Result<Self, JournalError> {
         let path = path_within(folder, name)?;
         sync_file(&path)?;
         describe(&path, name)
     }
 
-    /// Reads what the file of a run folder holds, if that is what stands on record.
+    /// Reads a file of the run folder, and returns its content if it matches the recorded length and hash.
     ///
     /// # Errors
-    /// A file that cannot be read; [`JournalError::OtherFile`] for one that holds something else.
+    /// The file cannot be read; [`JournalError::OtherFile`] if its content differs from the record.
     pub fn read(&self, folder: &Path) -> Result<Vec<u8>, JournalError> {
         let path = path_within(folder, &self.name)?;
         let mut bytes = Vec::new();
-        // One that has grown is not read to its end.
+        // Reads at most one byte beyond the recorded length: a file that has grown is not read to its end.
         let file = File::open(&path).map_err(JournalError::file(&path, "reading it"))?;
         file.take(self.bytes + 1).read_to_end(&mut bytes).map_err(JournalError::file(&path, "reading it"))?;
         let is_same = bytes.len() as u64 == self.bytes && hex(&Sha256::digest(&bytes)) == self.sha256;
@@ -50,7 +51,8 @@ impl Artefact {
     }
 }
 
-/// Returns the path of a file within a run folder, if the name cannot lead out of it and is not one of the journal's own.
+/// Returns the path of a file within a run folder. Rejects a name that can lead out of the folder, and the names of the
+/// journal's own files.
 pub(super) fn path_within(folder: &Path, name: &str) -> Result<PathBuf, JournalError> {
     let plain = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));
     let own = [DATABASE, ANCHOR, LOCK].contains(&name) || name.starts_with(&format!("{DATABASE}-"));
@@ -60,35 +62,37 @@ pub(super) fn path_within(folder: &Path, name: &str) -> Result<PathBuf, JournalE
     Ok(folder.join(name))
 }
 
-/// What a file is called until it is whole. One that was cut off by a crash stays, and is written over by the next.
+/// Returns the name of a file while it is incomplete. A temporary file left by a crash stays until the next write
+/// overwrites it.
 pub(super) fn temporary_name(name: &str) -> String {
     format!(".{name}.tmp")
 }
 
-/// Brings bytes to the disk under a temporary name, then gives the file its name, then brings the name to the disk.
+/// Writes a file atomically: syncs the bytes to the disk under a temporary name, renames the file, then syncs the
+/// folder.
 pub(super) fn write_file(path: &Path, bytes: &[u8]) -> Result<(), JournalError> {
     let folder = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(folder).map_err(JournalError::file(folder, "creating the folder"))?;
     let temporary = path.with_file_name(temporary_name(&path.file_name().unwrap_or_default().to_string_lossy()));
     let written = fill(&temporary, bytes).and_then(|()| fs::rename(&temporary, path));
     if written.is_err() {
-        // The error that brought us here is the one to report.
+        // Report the first error, not that of the cleanup.
         let _ = fs::remove_file(&temporary);
     }
     written.map_err(JournalError::file(path, "writing it"))?;
     sync_folder(folder)?;
-    // The folder itself may be new.
+    // The folder itself can be new.
     folder.parent().map_or(Ok(()), sync_folder)
 }
 
 fn fill(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    // What an interrupted attempt left is written over: it never had its name.
+    // Overwrites the remains of an interrupted attempt, which never got the final name.
     let mut file = OpenOptions::new().write(true).create(true).truncate(true).open(path)?;
     file.write_all(bytes)?;
     file.sync_all()
 }
 
-/// Returns what a file holds.
+/// Reads a file and returns its name, length and hash.
 pub(super) fn describe(path: &Path, name: &str) -> Result<Artefact, JournalError> {
     let failed = JournalError::file(path, "reading it");
     let mut file = File::open(path).map_err(&failed)?;
@@ -107,7 +111,7 @@ pub(super) fn describe(path: &Path, name: &str) -> Result<Artefact, JournalError
     Ok(Artefact { name: name.to_owned(), bytes, sha256: hex(&digest.finalize()) })
 }
 
-/// Brings a file that somebody else wrote to the disk.
+/// Syncs to the disk a file that another part of the program wrote, and its folder.
 pub(super) fn sync_file(path: &Path) -> Result<(), JournalError> {
     system::sync_file(path).map_err(JournalError::file(path, "bringing it to the disk"))?;
     path.parent().map_or(Ok(()), sync_folder)

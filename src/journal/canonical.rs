@@ -1,14 +1,14 @@
-//! One text for one value, so that a hash means something.
+//! Canonical JSON (one text for one value), and the hashes computed from it.
 
 use std::fmt::Write;
 
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
-/// What separates this hash from every other use of SHA-256.
+/// Domain separator: keeps this hash distinct from every other use of SHA-256.
 const DOMAIN: &str = "regrind journal record 1\n";
 
-/// Writes a value as JSON with sorted keys and no blanks. Numbers stand as `serde_json` writes them.
+/// Returns a value as JSON with sorted keys and no whitespace. Numbers have the form that `serde_json` gives them.
 pub fn canonical_json(value: &Value) -> String {
     let mut text = String::new();
     write_value(&mut text, value);
@@ -28,7 +28,7 @@ fn write_value(text: &mut String, value: &Value) {
             text.push(']');
         }
         Value::Object(members) => {
-            // A map may keep the order of insertion if another crate asks serde_json for it.
+            // A map keeps the order of insertion if another crate enables that feature of serde_json.
             let mut sorted: Vec<_> = members.iter().collect();
             sorted.sort_by_key(|(key, _)| key.as_str());
             text.push('{');
@@ -50,7 +50,7 @@ fn write_value(text: &mut String, value: &Value) {
     }
 }
 
-/// Writes a string as JSON does.
+/// Appends a string in its JSON form.
 pub(super) fn write_string(text: &mut String, string: &str) {
     let is_plain = |byte: u8| byte >= 0x20 && byte != b'"' && byte != b'\\';
     if string.bytes().all(is_plain) {
@@ -61,12 +61,12 @@ pub(super) fn write_string(text: &mut String, string: &str) {
     }
 }
 
-/// Returns the SHA-256 of bytes in small hexadecimal digits.
+/// Returns the SHA-256 of bytes, in lowercase hexadecimal digits.
 pub fn sha256_hex(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
 }
 
-/// Returns the hash that chains a record to the one before.
+/// Returns the hash of a record, which chains it to the record before.
 pub(super) fn chain(prev_hash: &str, text: &str) -> String {
     let mut digest = Sha256::new();
     for part in [DOMAIN, prev_hash, "\n", text] {
@@ -75,7 +75,7 @@ pub(super) fn chain(prev_hash: &str, text: &str) -> String {
     hex(&digest.finalize())
 }
 
-/// Returns the bytes of so many pairs of hexadecimal digits, small ones only: one value has one text.
+/// Returns the `N` bytes of `2 N` hexadecimal digits. Accepts lowercase digits only, so that one value has one text.
 pub(super) fn unhex<const N: usize>(digits: &str) -> Option<[u8; N]> {
     let nibble = |digit: u8| match digit {
         b'0'..=b'9' => Some(digit - b'0'),

@@ -1,15 +1,16 @@
-//! The time of day, as records and file names have it.
+//! Time of day in the format of records and file names.
 
 use std::time::SystemTime;
 
-/// Returns a time of day in UTC by RFC 3339, always with nine digits behind the second, so that such texts sort as their times do.
+/// Returns a time of day in UTC, RFC 3339, always with nine digits after the decimal point, so that the texts sort in
+/// the order of their times.
 ///
-/// A time before 1970, which a clock that was never set may show, is told as the beginning of 1970.
+/// Returns the beginning of 1970 for every earlier time, which a clock that was never set can show.
 pub fn utc(at: SystemTime) -> String {
     humantime::format_rfc3339_nanos(at.max(SystemTime::UNIX_EPOCH)).to_string()
 }
 
-/// Returns a time of day as [`utc`] does, to the second.
+/// Returns a time of day in the format of [`utc`], without fractions of a second.
 pub fn utc_to_the_second(at: SystemTime) -> String {
     humantime::format_rfc3339_seconds(at.max(SystemTime::UNIX_EPOCH)).to_string()
 }

@@ -1,4 +1,4 @@
-//! A record that was kept elsewhere, on its way back into a run folder, where it is read and proven as every other.
+//! Restores a record that was kept elsewhere into a run folder, where it is read and verified like every other record.
 
 use std::path::Path;
 
@@ -12,8 +12,9 @@ use super::verify::Anchor;
 use super::{ANCHOR, open, system};
 
 impl Record {
-    /// Reads a record from the text that was hashed and the hashes around it; nothing where the text is not one that the journal writes, to
-    /// the byte. Whether the hash is that of the text is not asked: `verify` does.
+    /// Parses a record from its hashed text, its own hash and the hash of the record before it. Returns `None` if the
+    /// text is not byte for byte a text that the journal writes. Does not check that the hash matches the text:
+    /// `verify` does.
     pub fn of_text(text: &str, prev_hash: &str, hash: &str) -> Option<Self> {
         let value: Value = serde_json::from_str(text).ok()?;
         let word = |key: &str| value[key].as_str().map(str::to_owned);
@@ -41,11 +42,11 @@ impl Record {
     }
 }
 
-/// Puts the records of a run into a folder, which is made, with what is kept as their anchor. They stand there as they were given: `verify`
-/// tells whether they can be believed. Files on record are put beside them by [`restore_file`].
+/// Creates a run folder and writes the given records and anchor into it. The records are stored as given: `verify`
+/// checks whether they are authentic. [`restore_file`] adds the recorded files.
 ///
 /// # Errors
-/// A folder that is in use or cannot be written; two records of one number, or a gap between two.
+/// The folder is in use or cannot be written; two records have the same number, or a number is missing between two.
 pub fn restore(
     folder: &Path,
     records: impl IntoIterator<Item = Record>,
@@ -71,10 +72,10 @@ pub fn restore(
     }
 }
 
-/// Puts a file on record back into a run folder.
+/// Writes a recorded file back into a run folder.
 ///
 /// # Errors
-/// A name that leads out of the folder, a folder that cannot be written.
+/// The name leads out of the folder or is a file of the journal itself, or the folder cannot be written.
 pub fn restore_file(folder: &Path, name: &str, content: &[u8]) -> Result<(), JournalError> {
     write_file(&path_within(folder, name)?, content)
 }

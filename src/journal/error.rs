@@ -1,11 +1,11 @@
-//! Why a journal could not be opened, written or believed, with the remedy.
+//! Errors of opening, writing and verifying a journal, each with its remedy.
 
 use std::io;
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-/// Why a journal could not be opened, written or believed.
+/// Error of opening, writing or verifying a journal.
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the message of each tells what its fields are")]
 #[non_exhaustive]
@@ -15,7 +15,7 @@ pub enum JournalError {
         "{path}: a run folder must be new or empty, and this one is not; give the run another name, or resume the run that is there"
     )]
     Exists { path: PathBuf },
-    /// There is no journal.
+    /// The folder has no journal.
     #[error("{path}: there is no journal.sqlite in this folder; give the folder of a run")]
     Absent { path: PathBuf },
     /// The file is not a journal.
@@ -26,7 +26,7 @@ pub enum JournalError {
         "{path}: the journal has layout {found}, and this program knows {limit}; use the version of Regrind that wrote it or a later one"
     )]
     Newer { path: PathBuf, found: u32, limit: u32 },
-    /// Somebody else drives the run.
+    /// Another process drives the run.
     #[error("{path}: another process drives this run; wait for it, or order it to hold or stop")]
     Busy { path: PathBuf },
     /// Another run has the machine.
@@ -34,7 +34,7 @@ pub enum JournalError {
         "{address}: another run has this machine: {holder}; wait for it, or stop it with `regrind stop` and its folder"
     )]
     MachineTaken { address: String, holder: String },
-    /// The folder in which the locks of machines lie is not what it should be: somebody else may have laid it there.
+    /// The folder for the locks of machines is not safe to use: another user could have created it.
     #[error("{path}: the locks of machines cannot lie in it: {what}; {remedy}")]
     LockFolder { path: PathBuf, what: String, remedy: String },
     /// The run is over.
@@ -45,15 +45,15 @@ pub enum JournalError {
         "{path}: {action} failed: {source}; check that the folder exists, is yours to write and its disk is in order"
     )]
     File { path: PathBuf, action: &'static str, source: io::Error },
-    /// No room.
+    /// The disk is full.
     #[error("{path}: the disk is full; free space on it and resume the run")]
     DiskFull { path: PathBuf },
-    /// A setting that the promises rest on did not hold.
+    /// The database did not accept a setting that the guarantees depend on.
     #[error(
         "{path}: the database did not take {setting} = {wanted} (it says {found}); put the run folder on a local disk"
     )]
     Setting { path: PathBuf, setting: &'static str, wanted: &'static str, found: String },
-    /// The database said no.
+    /// The database reported an error.
     #[error("{path}: the database failed: {source}; check that the folder is yours to write and its disk is in order")]
     Database { path: PathBuf, source: rusqlite::Error },
     /// The journal was changed, or the disk has damaged it.
@@ -61,39 +61,39 @@ pub enum JournalError {
         "{path}: the journal is broken at record {seq}: {what}; keep the folder as it is and compare it with its copies"
     )]
     Broken { path: PathBuf, seq: u64, what: String },
-    /// The record is whole, and not signed by whom the given keys belong to.
+    /// The record is intact, but it is not signed with one of the given keys.
     #[error(
         "{path}: the record is whole, and who wrote it is not proven: {what}; give the keys of all who drove the run, or leave --key out, \
          which proves no author"
     )]
     NoAuthor { path: PathBuf, what: String },
-    /// A file that is on record holds something else than it did.
+    /// The content of a recorded file differs from the record.
     #[error(
         "{path}: it is not the file that is on record: nothing of it was used; put that one back, from a copy of the run"
     )]
     OtherFile { path: PathBuf },
-    /// The record lies no longer where it is written: what is written now would be lost with it.
+    /// A file of the record is no longer at its path: everything written to it now would be lost.
     #[error(
         "{path}: this file of the record was deleted, renamed or exchanged while the run is on; put it back where it was, or stop the run"
     )]
     Gone { path: PathBuf },
-    /// The file of an audit key holds none.
+    /// The file of an audit key contains no valid key.
     #[error(
         "{path}: this is no audit key: {what}; bring it back from a copy, or put it away and make another with `regrind audit key`"
     )]
     Key { path: PathBuf, what: &'static str },
-    /// Others may read the audit key.
+    /// Other users can read or exchange the audit key.
     #[error(
         "{path}: others may read or exchange this audit key ({how}): {remedy}, and make another if somebody may have it"
     )]
     KeyIsOpen { path: PathBuf, how: String, remedy: String },
-    /// A name that may lead out of the run folder.
+    /// The name could lead out of the run folder.
     #[error("`{name}` cannot be the name of a file in a run folder; give a relative path of plain names")]
     Name { name: String },
-    /// The file is on record already, with another content.
+    /// The file is already on record with a different content.
     #[error("{path}: this file is on record with another content; what is on record is never written over")]
     Recorded { path: PathBuf },
-    /// An entry that cannot stand.
+    /// The entry is not allowed at this place of the journal.
     #[error("a record of kind {kind} {what}; this is a fault of the program itself, please report it")]
     Entry { kind: &'static str, what: &'static str },
     /// All command numbers are used up.
@@ -102,17 +102,18 @@ pub enum JournalError {
 }
 
 impl JournalError {
-    /// Returns whether the disk is full.
+    /// Returns true if the disk is full.
     pub fn is_disk_full(&self) -> bool {
         matches!(self, Self::DiskFull { .. })
     }
 
-    /// Returns whether the same may be written later: the disk is full, busy or out of reach, and nothing is wrong with what is written.
+    /// Returns true if the same write can succeed later: the disk is full, busy or out of reach, and the entry itself
+    /// is valid.
     pub fn may_pass(&self) -> bool {
         matches!(self, Self::DiskFull { .. } | Self::File { .. } | Self::Database { .. } | Self::Gone { .. })
     }
 
-    /// Names what an operation of the system failed for.
+    /// Returns a function that converts an I/O error at `path`, during `action`, to a journal error.
     pub(super) fn file(path: &Path, action: &'static str) -> impl Fn(io::Error) -> Self + use<> {
         let path = path.to_owned();
         move |source| match source.kind() {
@@ -121,7 +122,7 @@ impl JournalError {
         }
     }
 
-    /// Names the database that failed.
+    /// Returns a function that converts an error of the database at `path` to a journal error.
     pub(super) fn database(path: &Path) -> impl Fn(rusqlite::Error) -> Self + use<> {
         let path = path.to_owned();
         move |source| match source.sqlite_error_code() {

@@ -1,22 +1,23 @@
-//! A file that one program has at a time.
+//! A file that one process locks at a time.
 
 use std::fs::{File, TryLockError};
 use std::thread;
 use std::time::Duration;
 
-/// A locked file, free again as soon as this is dropped.
+/// Exclusively locked file. Dropping it releases the lock.
 #[derive(Debug)]
 pub struct HeldFile(File);
 
-/// Who only looks whether a run is driven has its lock for a moment; a holder has it for hours.
+/// Number of attempts to lock. A process that only checks whether a run is driven holds the lock for a moment; a
+/// process that drives the run holds it for hours.
 const TRIES: usize = 20;
 const BETWEEN_TRIES: Duration = Duration::from_millis(5);
 
 impl HeldFile {
-    /// Locks a file, or says that another has it.
+    /// Locks a file. Retries for a short time if another process holds the lock.
     ///
     /// # Errors
-    /// A file that somebody holds, or that cannot be locked.
+    /// Another process holds the lock, or the file cannot be locked.
     pub fn take(file: File) -> Result<Self, TryLockError> {
         Self::take_waiting(file, || thread::sleep(BETWEEN_TRIES))
     }
@@ -35,7 +36,8 @@ impl HeldFile {
 
 impl Drop for HeldFile {
     fn drop(&mut self) {
-        // Closing would not do: a child that another thread has just forked shares the lock until its exec.
+        // Closing the file is not sufficient: a child process that another thread has just forked shares the lock until
+        // its exec.
         let _ = self.0.unlock();
     }
 }
@@ -49,7 +51,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let open = || File::create(folder.path().join("lock")).unwrap();
         let file = open();
-        // What a child has between its fork and its exec.
+        // A child process has this handle between its fork and its exec.
         let of_a_child = file.try_clone().unwrap();
         let held = HeldFile::take(file).unwrap();
         assert!(matches!(open().try_lock(), Err(TryLockError::WouldBlock)));

@@ -1,4 +1,5 @@
-//! The key with which a computer signs the head of its records, and the public half by which others know it.
+//! The key with which a computer signs the head of its records, and the public key with which others verify the
+//! signatures.
 
 use std::fmt::{self, Debug, Display, Formatter};
 use std::fs;
@@ -15,33 +16,36 @@ use super::error::JournalError;
 use super::open::sync_folder;
 use super::system;
 
-/// Said in the first line of the file, for who finds it.
+/// First line of the key file; explains the file to a person who finds it.
 const FIRST_LINE: &str =
     "# Audit key of Regrind (Ed25519). Secret: who has this file can sign records in this computer's name.";
-/// More is no key.
+/// Maximum length of a key file, in bytes.
 const MOST_BYTES: u64 = 4096;
 
-/// The public half of an audit key: what a record names, and quality keeps. Shown as 64 small hexadecimal digits.
+/// Public half of an audit key. A record names it, and the quality department keeps it. Displayed as 64 lowercase
+/// hexadecimal digits.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct PublicKey([u8; 32]);
 
 impl PublicKey {
-    /// Returns what two people compare: the first 16 digits of the key's SHA-256, in groups of four.
+    /// Returns the fingerprint that two people compare: the first 16 hexadecimal digits of the SHA-256 of the key, in
+    /// groups of four.
     pub fn fingerprint(&self) -> String {
         let digits = hex(&Sha256::digest(self.0)[..8]);
         (0..4).map(|k| &digits[4 * k..4 * k + 4]).collect::<Vec<_>>().join(" ")
     }
 
-    /// Returns whether the owner of this key signed a message: Ed25519 after RFC 8032, the signature in 128 hexadecimal digits.
+    /// Returns true if the owner of this key signed a message: Ed25519 after RFC 8032. The signature has 128 lowercase
+    /// hexadecimal digits.
     pub fn has_signed(&self, message: &[u8], signature: &str) -> bool {
         let Some(signature) = unhex::<64>(signature).map(Signature::new) else { return false };
         ed25519_compact::PublicKey::new(self.0).verify(message, &signature).is_ok()
     }
 
-    /// Reads a public key from a text: 64 hexadecimal digits, or what `regrind audit key` prints, with `--json` or without.
+    /// Parses a public key: 64 hexadecimal digits, or the output of `regrind audit key`, with or without `--json`.
     ///
     /// # Errors
-    /// A text that names none.
+    /// The text contains no public key.
     #[expect(clippy::result_unit_err, reason = "there is one way to be none")]
     pub fn from_text(text: &str) -> Result<Self, ()> {
         let text = text.trim();
@@ -80,7 +84,7 @@ impl Serialize for PublicKey {
     }
 }
 
-/// The key of a computer, both halves.
+/// Key pair of a computer: the secret and the public half.
 #[derive(Clone)]
 pub struct AuditKey {
     pair: KeyPair,
@@ -88,13 +92,13 @@ pub struct AuditKey {
 
 impl Debug for AuditKey {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        // The secret half is for no log.
+        // The secret half must not appear in a log.
         write!(f, "AuditKey({})", self.public())
     }
 }
 
 impl AuditKey {
-    /// Returns a new key, by the random numbers of the operating system.
+    /// Returns a new key from the random numbers of the operating system.
     pub fn new() -> Self {
         Self::from_seed(rand::random())
     }
@@ -108,16 +112,17 @@ impl AuditKey {
         PublicKey(*self.pair.pk)
     }
 
-    /// Signs a message; returns 128 hexadecimal digits. The same message always gets the same signature. What it is for stands in its first
-    /// line, so that a signature of one thing is never taken for that of another.
+    /// Signs a message and returns the signature as 128 hexadecimal digits. Deterministic: the same message always
+    /// gives the same signature. The first line of each message states its purpose, so that a signature for one purpose
+    /// is never valid for another.
     pub fn sign(&self, message: &[u8]) -> String {
         hex(self.pair.sk.sign(message, None).as_ref())
     }
 
-    /// Reads the key of a file.
+    /// Reads the key from a file.
     ///
     /// # Errors
-    /// No such file, one that others may read, one that holds no key.
+    /// The file does not exist, other users can read or exchange it, or it contains no valid key.
     pub fn read(path: &Path) -> Result<Self, JournalError> {
         let failed = JournalError::file(path, "reading it");
         let broken = |what| JournalError::Key { path: path.to_owned(), what };
@@ -148,19 +153,19 @@ impl AuditKey {
         }
     }
 
-    /// Makes a key and its file, which nobody else may read. The folder is made if it is not there. A file that is there is never
-    /// written over.
+    /// Creates a key and its file, which only the owner can read. Creates the folder if it does not exist. Never
+    /// overwrites an existing file.
     ///
     /// # Errors
-    /// A file of that name, a folder that cannot be written, a full disk.
+    /// A file of that name exists, the folder cannot be written, or the disk is full.
     pub fn make(path: &Path) -> Result<Self, JournalError> {
         let key = Self::new();
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         system::create_owners_folder(folder).map_err(JournalError::file(folder, "creating the folder"))?;
         let temporary = folder.join(format!(".audit-key-{:016x}.tmp", rand::random::<u64>()));
-        // A link, and no new name for the file: that would take the place of a key that is there.
+        // A hard link, not a rename: a rename would replace an existing key.
         let written = key.write(&temporary).and_then(|()| fs::hard_link(&temporary, path));
-        // The error that brought us here is the one to report.
+        // Report the first error, not that of the cleanup.
         let _ = fs::remove_file(&temporary);
         written.map_err(JournalError::file(path, "creating it"))?;
         sync_folder(folder)?;
@@ -187,7 +192,7 @@ mod tests {
 
     #[test]
     fn signatures_are_those_of_rfc_8032() {
-        // Test 2 of section 7.1.
+        // RFC 8032, section 7.1, test 2.
         let seed = unhex("4ccd089b28ff96da9db6c346ec114e0f5b8a319f35aba624da8cf6ed4fb8a6fb").unwrap();
         let key = AuditKey::from_seed(seed);
         assert_eq!(key.public().to_string(), "3d4017c3e843895a92b70aa74d1b7ebc9c982ccf2ec4968cc0cd55f12af4660c");

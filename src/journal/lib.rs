@@ -1,24 +1,27 @@
-//! The record of truth of one run: what was asked, decided and done, in the order in which it became known.
+//! The journal of one run: every request, decision and action, in the order in which it became known.
 //!
-//! A run folder holds `journal.sqlite`, and the journal refers to the other files of the folder by their SHA-256. A record that
-//! was acknowledged is on the disk: the database writes ahead (WAL) with `synchronous = FULL`, set and read back. There is one
-//! writer: it holds `.lock` in the folder for as long as it lives.
+//! A run folder holds `journal.sqlite`. The journal refers to the other files of the folder by their SHA-256. An
+//! acknowledged record is on the disk: the database uses a write-ahead log (WAL) with `synchronous = FULL`, which is
+//! set and read back. There is one writer. It holds `.lock` in the folder for as long as it lives.
 //!
-//! Records form a chain. Each holds the hash of the one before, and its own hash is
-//! `SHA-256("regrind journal record 1\n" || prev_hash || "\n" || text)`, with `prev_hash` in 64 small hexadecimal digits and `text` the JSON
-//! object of its other fields with sorted keys and no blanks, the payload as it stands in the database. So any change,
-//! deletion, insertion or reordering is found by [`verify`]. A cut of the tail is found with an [`Anchor`]: the number of records
-//! and the hash of the last, kept in `journal.anchor` and wherever else somebody wrote it down.
+//! Records form a hash chain. Each record holds the hash of the record before it. Its own hash is `SHA-256("regrind
+//! journal record 1\n" || prev_hash || "\n" || text)`. `prev_hash` has 64 lowercase hexadecimal digits. `text` is the
+//! JSON object of the other fields of the record, with sorted keys and no whitespace; the payload is the text in the
+//! database, unchanged. [`verify`] therefore finds every change, deletion, insertion and reordering. A cut of the tail
+//! is found with an [`Anchor`]: the number of records and the hash of the last one. The anchor is kept in
+//! `journal.anchor`, and in every other place where somebody stored a copy.
 //!
-//! Where the computer has an [`AuditKey`], the head is signed with it (Ed25519) every [`SEALED_EVERY`] records and at the end, in a
-//! record of its own, and the anchor is moved along with each: who wants to change what was written has to have the key too.
+//! If the computer has an [`AuditKey`], the journal signs its head with that key (Ed25519) every [`SEALED_EVERY`]
+//! records and at the end. Each signature is a record of its own, and the anchor is updated with it. To change the
+//! history without detection, an attacker also needs the key.
 //!
-//! All of it stands in docs/journal.md, for who wants to prove a record without this program.
+//! docs/journal.md specifies the format, so that a record can be verified without this program.
 //!
-//! Calls block until the disk has answered; the drive calls from a thread of its own. What a call that failed was to write may be given again,
-//! and stands once.
+//! Calls block until the disk has answered. The drive therefore calls from a thread of its own. Writes are idempotent:
+//! after a failed call the same entry can be given again, and it is recorded once.
 //!
-//! All this is tried on a disk that fails, beneath SQLite, by tests/failing_disk: docs/reliability.md says what is, and what is not.
+//! tests/failing_disk tests this with a failing disk below SQLite. docs/reliability.md lists what is tested and what is
+//! not.
 
 mod artefact;
 mod canonical;
@@ -55,14 +58,15 @@ use std::time::SystemTime;
 
 use rusqlite::Connection;
 
-/// The database in a run folder.
+/// Name of the database file in a run folder.
 pub const DATABASE: &str = "journal.sqlite";
-/// The anchor in a run folder.
+/// Name of the anchor file in a run folder.
 pub const ANCHOR: &str = "journal.anchor";
-/// The lock in a run folder.
+/// Name of the lock file in a run folder.
 pub const LOCK: &str = ".lock";
 
-/// When the files that hold a record were changed last, and how long they are: another one, where something was put on it.
+/// Modification time and length in bytes of the database and of its log. A stamp differs from an earlier one if a
+/// record was added in between.
 pub type Stamp = [Option<(SystemTime, u64)>; 2];
 
 /// Returns the stamp of a run folder.
@@ -73,8 +77,8 @@ pub fn stamp(folder: &Path) -> Stamp {
     })
 }
 
-/// A journal that is only read. It may be read while another process writes it. Who writes it himself reads it by [`Journal::records`]: a
-/// process that closes a file gives back all locks that it has on it.
+/// Read-only journal. It can be read while another process writes it. The process that writes the journal must read it
+/// with [`Journal::records`] instead: when a process closes a file, it releases all locks that it has on that file.
 #[derive(Debug)]
 pub struct Reader {
     connection: Connection,
@@ -85,7 +89,7 @@ impl Reader {
     /// Opens the journal of a run folder for reading.
     ///
     /// # Errors
-    /// No journal there, or a file that is none.
+    /// The folder has no journal, or the file is not a journal.
     pub fn open(folder: impl AsRef<Path>) -> Result<Self, JournalError> {
         let folder = folder.as_ref().to_owned();
         Ok(Self { connection: open::read_only(&folder)?, folder })
@@ -96,15 +100,15 @@ impl Reader {
         &self.folder
     }
 
-    /// Returns the records from a number on, in order.
+    /// Returns the records from number `from` on, in order.
     pub fn records(&self, from: u64) -> Records<'_> {
         Records::new(&self.connection, &self.folder, from)
     }
 
-    /// Returns the last record; none where there is no record.
+    /// Returns the last record, or `None` if there is no record.
     ///
     /// # Errors
-    /// A record that cannot be read.
+    /// The last record cannot be read.
     pub fn last(&self) -> Result<Option<Record>, JournalError> {
         let failed = JournalError::database(&self.folder);
         let number = self.connection.query_row("SELECT max(seq) FROM record", [], |row| row.get::<_, Option<i64>>(0));
@@ -114,7 +118,7 @@ impl Reader {
         }
     }
 
-    /// Returns the least number of a record that stands before the first; none in a journal that was left as it is.
+    /// Returns the lowest record number below 1, or `None` if there is none. An unchanged journal has none.
     fn number_before_the_first(&self) -> Result<Option<i64>, JournalError> {
         let least = self.connection.query_row("SELECT min(seq) FROM record WHERE seq < 1", [], |row| row.get(0));
         least.map_err(JournalError::database(&self.folder))

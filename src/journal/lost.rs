@@ -1,4 +1,5 @@
-//! What the folder of a run shows that its record does not have: the last records stand in the log of the database only, and go with it.
+//! Detects lost records from the files of a run folder: the newest records are only in the write-ahead log of the
+//! database, and are lost with it.
 
 use std::fs::{self, File};
 use std::io::Read;
@@ -8,27 +9,30 @@ use super::error::JournalError;
 use super::verify::read_anchor;
 use super::{ANCHOR, DATABASE};
 
-/// Bytes of the header of a log, and of that of a frame in it (sqlite.org/fileformat.html, "The Write-Ahead Log").
+/// Length in bytes of the header of the log, and of the header of a frame in it (sqlite.org/fileformat.html, "The
+/// Write-Ahead Log").
 const LOG_HEADER: usize = 32;
 const FRAME_HEADER: usize = 24;
-/// How a log begins, with checksums over words of either order; its version, and the pages that a database can have.
+/// Magic numbers at the start of a log (checksums over little-endian or big-endian words), its version, and the allowed
+/// page sizes in bytes.
 const MAGIC: [u32; 2] = [0x377f_0682, 0x377f_0683];
 const LOG_VERSION: u32 = 3_007_000;
 const PAGES: std::ops::RangeInclusive<usize> = 512..=65_536;
-/// Most bytes of a log that are looked at.
+/// Maximum number of bytes of the log that are examined.
 const MOST_OF_LOG: u64 = 256 << 20;
 
-/// Says why records of a run that has no end may be lost, of which the program that wrote them had seen that they are on the disk; none where nothing
-/// shows it. Nothing may drive the run.
+/// Returns why acknowledged records of an unfinished run could be lost, or `None` if there is no sign of a loss. The
+/// program that wrote these records had seen that they were on the disk. Call this only while no process drives the
+/// run.
 ///
 /// # Errors
-/// A file that cannot be read; an anchor that is none.
+/// A file cannot be read, or the anchor is invalid.
 pub fn may_be_lost(folder: &Path) -> Result<Option<String>, JournalError> {
     if read_anchor(folder)?.is_none() {
         return Ok(Some(format!("{ANCHOR} is missing, which is written as a run begins")));
     }
     let log = folder.join(format!("{DATABASE}-wal"));
-    // Whoever reads a database whose log is gone makes an empty one.
+    // A reader that opens a database without a log creates an empty log.
     if !fs::metadata(&log).is_ok_and(|found| found.is_file() && found.len() > 0) {
         return Ok(Some(format!(
             "{DATABASE}-wal is missing or empty, which a program that ends in the middle of a run leaves behind"
@@ -40,15 +44,16 @@ pub fn may_be_lost(folder: &Path) -> Result<Option<String>, JournalError> {
     Ok(damage(&bytes).map(|what| format!("{DATABASE}-wal is damaged: {what}")))
 }
 
-/// Returns the highest number of a cycle of which there are files in the folder of a run; 0 where there is none.
+/// Returns the highest cycle number for which the run folder has files, or 0 if there are none.
 pub fn newest_cycle(folder: &Path) -> u32 {
     let names = fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.file_name());
     let number = |name: std::ffi::OsString| name.to_str()?.strip_prefix("cycle-")?.parse().ok();
     names.filter_map(number).max().unwrap_or(0)
 }
 
-/// Says that changes which were on the disk stand in a log behind a place that does not hold; none where all hold, or what does not is the end
-/// that a cut of the power left: a transaction is on the disk before the first frame of the next one is written.
+/// Returns a message if the log has committed changes that were on the disk after a damaged place. Returns `None` if
+/// all frames are valid, or if the invalid part is only the end that a power failure left: a transaction is on the disk
+/// before the first frame of the next transaction is written.
 fn damage(log: &[u8]) -> Option<String> {
     if log.len() <= LOG_HEADER {
         return None;
@@ -68,13 +73,14 @@ fn damage(log: &[u8]) -> Option<String> {
         [a, b]
     };
     let mut so_far = sum([0, 0], &log[..24]);
-    // It is on the disk before the first frame is written.
+    // SQLite syncs the header before it writes the first frame.
     if !is_header || so_far != [word(24), word(28)] {
         return Some("its first bytes do not hold, and nothing behind them is read".to_owned());
     }
     let (mut holds, mut committed, mut synced) = (true, 0, 0);
     for frame in log[LOG_HEADER..].chunks_exact(FRAME_HEADER + page) {
-        // Frames of an earlier filling of the log have other numbers; so has one whose header is damaged, and then those behind it do not hold.
+        // Frames of an earlier use of the log have other salts. A frame with a damaged header can also have other
+        // salts; then the frames after it do not match either.
         let is_of_this = frame[8..16] == log[16..24];
         if holds {
             let sum = sum(sum(so_far, &frame[..8]), &frame[FRAME_HEADER..]);
@@ -101,7 +107,7 @@ mod tests {
     use super::super::write::{Header, Journal};
     use super::*;
 
-    /// The folder of a run that broke off, with what its log holds.
+    /// Creates the folder of an interrupted run, and returns the content of its log.
     fn broken_off(records: u64) -> (tempfile::TempDir, std::path::PathBuf, Vec<u8>) {
         let home = tempfile::tempdir().unwrap();
         let driven = home.path().join("driven");
@@ -118,7 +124,7 @@ mod tests {
         for k in 0..records {
             journal.append(Entry::new(Kind::Note, k, 1, json!({ "k": k }))).unwrap();
         }
-        // As a kill leaves it: copied while it is open.
+        // Copies the folder while the journal is open: the same state as after a kill.
         let folder = home.path().join("run");
         fs::create_dir(&folder).unwrap();
         for entry in fs::read_dir(&driven).unwrap().map(Result::unwrap) {
@@ -137,7 +143,7 @@ mod tests {
             fs::write(&path, bytes).unwrap();
             may_be_lost(&folder).unwrap()
         };
-        // Nothing of it is committed behind what a cut of the power tears at the end.
+        // A power failure that tears the end of the log leaves no committed change after the torn place.
         assert_eq!(told(&log[..log.len() - 700]), None);
         let mut flipped = log.clone();
         flipped[LOG_HEADER + FRAME_HEADER + 77] ^= 1;
@@ -146,7 +152,8 @@ mod tests {
         let mut header = log.clone();
         header[17] ^= 1;
         assert!(told(&header).is_some(), "one flipped bit in the header");
-        // A frame that is not read any more, whatever of it is damaged, and a block of zeros, as a bad sector or a lost extent is read.
+        // A frame that is no longer read, whichever part of it is damaged; and a block of zeros, as read from a bad
+        // sector or a lost extent.
         let frame = FRAME_HEADER + u32::from_be_bytes(log[8..12].try_into().unwrap()) as usize;
         for at in [LOG_HEADER + 8, LOG_HEADER + frame * 5 + 9, LOG_HEADER + frame * 5 + 20] {
             let mut damaged = log.clone();
@@ -158,7 +165,8 @@ mod tests {
             damaged[zeros.clone()].fill(0);
             assert!(told(&damaged).is_some(), "{zeros:?} zero");
         }
-        // The power went while the last transaction was written: its end is there, and something before it is not.
+        // The power failed during the write of the last transaction: its end is there, and a part before the end is
+        // missing.
         let last = log.len() - frame;
         let mut torn = log.clone();
         torn[last - frame + FRAME_HEADER + 3] ^= 1;

@@ -1,7 +1,8 @@
-//! A machine serves one run at a time: on this computer by a lock, which goes away with the process that holds it.
+//! Locks that let a machine serve only one run at a time on this computer. The lock ends with the process that holds
+//! it.
 //!
-//! The file of the lock also keeps the last epoch that a client of this computer had for the machine, so that the next one is higher
-//! whatever the clock says.
+//! The lock file also keeps the last epoch that a client of this computer used for the machine. The next epoch is
+//! therefore higher, whatever the clock shows.
 
 use std::fs::{File, TryLockError};
 use std::io::{Read, Seek, Write};
@@ -12,54 +13,55 @@ use super::held::HeldFile;
 use super::system::{LockFile, LockFolder};
 use super::{sha256_hex, system};
 
-/// A machine that no other run on this computer can take while this lives.
+/// Lock of a machine. While it lives, no other run on this computer can take the machine.
 ///
-/// Two files are locked: one of the machine for every user, and one of this user's alone. Where somebody else has laid something in the place of the first
-/// that is no lock, that is told, and the second keeps the runs of this user apart all the same.
+/// Two files are locked: one that all users share, and one of this user only. If another user put something else in the
+/// place of the shared file, a note reports it, and the file of this user still keeps the runs of this user apart.
 #[derive(Debug)]
 pub struct MachineLock {
-    /// Both files: held, not read.
+    /// Both locked files. They are held, not read.
     held: Vec<HeldFile>,
-    /// The files that tell the holder and the epoch.
+    /// The files that store the holder and the epoch.
     told: Vec<File>,
     holder: String,
     last_epoch: u32,
     notes: Vec<String>,
-    /// The place of a door beside the file of this user.
+    /// Path of the control socket next to the lock file of this user.
     door: PathBuf,
 }
 
 const FOLDER: &str = "regrind-machines";
-/// Begins the line of the lock's file that keeps the epoch.
+/// Prefix of the line that stores the epoch in the lock file.
 const EPOCH: &str = "epoch ";
-/// Epochs are seconds of a clock in so many bits: whatever is higher was written by somebody else.
+/// Number of bits of an epoch, which is a clock time in seconds. A higher value was not written by a client of this
+/// computer.
 const EPOCH_BITS: u32 = 31;
-/// Most bytes that are read of what is told beside a lock.
+/// Maximum number of bytes that are read of the holder and the epoch.
 const MOST_TOLD: u64 = 4096;
-/// So many files of a user are tried, where others have laid something in their place.
+/// Number of file names of this user that are tried if others occupied some of them.
 const OWN_FILES: usize = 16;
-/// So often a file is opened anew that was taken away while it was being locked.
+/// Number of attempts to open a file again if it was removed while it was being locked.
 const TRIES: usize = 5;
-/// Ends the name of a door beside a lock.
+/// Extension of the file name of the control socket next to a lock.
 const DOOR: &str = "sock";
-/// Parts the run that has a machine from the process that has it, in what is told beside a lock.
+/// Separator between the run and the process in the stored holder.
 const PROCESS: &str = ", process ";
 
-/// How a file of a machine is opened.
+/// Function that opens a lock file of a machine.
 type Opens = fn(&LockFolder, &str) -> Result<LockFile, String>;
 
 impl MachineLock {
-    /// Takes a machine, by the address by which every run would call it, for a run.
+    /// Locks a machine for a run. `address` identifies the machine, and must be the same text in every run.
     ///
     /// # Errors
-    /// A machine that another run has, which is named; no folder for locks that can be used.
+    /// Another run has the machine (the error names it), or no folder for locks can be used.
     pub fn take(address: &str, run: &Path) -> Result<Self, JournalError> {
-        // Where no place is for all, the user's own is better than none.
+        // If there is no place that all users share, the user's own place is better than no lock.
         Self::take_in(&system::place_of_locks(FOLDER).unwrap_or_else(std::env::temp_dir), address, run)
     }
 
-    /// Returns an epoch for the client of these machines: higher than every one that a client of this computer had for any of them, and
-    /// not below the clock. The machines' files keep it.
+    /// Returns an epoch for the client of these machines: higher than every epoch that a client of this computer used
+    /// for any of them, and not below `clock`, in seconds. Stores it in the files of the machines.
     pub fn epoch<'a>(machines: impl IntoIterator<Item = &'a Self> + Clone, clock: u32) -> u32 {
         let last = machines.clone().into_iter().map(|machine| machine.last_epoch).max().unwrap_or(0);
         let epoch = clock.max(last.saturating_add(1));
@@ -67,13 +69,14 @@ impl MachineLock {
         epoch
     }
 
-    /// Returns where the cell that has this machine can be reached though the folder of its run is gone: a place beside the lock.
+    /// Returns the path of the control socket next to the lock. There the cell that has this machine can be reached
+    /// even if its run folder is gone.
     pub fn door(&self) -> &Path {
         &self.door
     }
 
-    /// Returns the cells of this user that have machines on this computer: the folder of the run, and the place of the door beside its lock. A cell that
-    /// was killed may be among them: nobody is behind its door.
+    /// Returns the cells of this user that have machines on this computer: the folder of the run, and the path of the
+    /// control socket next to its lock. The list can contain a killed cell, whose socket has no listener.
     pub fn doors() -> Vec<(PathBuf, PathBuf)> {
         system::place_of_locks(FOLDER).map_or_else(Vec::new, |place| Self::doors_in(&place.join(FOLDER)))
     }
@@ -92,7 +95,8 @@ impl MachineLock {
         doors.filter_map(|door| Some((run_of(&door)?, door))).collect()
     }
 
-    /// Returns what was found in the place of its files that should not be there: nothing of it was followed or believed.
+    /// Returns notes about unexpected files found in the place of the lock files. These files are neither followed nor
+    /// trusted.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
@@ -136,7 +140,8 @@ impl MachineLock {
         Err(JournalError::LockFolder { path, what: lock.notes.join("; "), remedy })
     }
 
-    /// Locks a file and takes the epoch that it keeps; says why that is not done where something else lies in its place.
+    /// Locks a file and reads the epoch that it stores. Returns the reason in the inner `Err` if something else is in
+    /// its place.
     fn hold(
         &mut self,
         folder: &LockFolder,
@@ -160,7 +165,8 @@ impl MachineLock {
                 }
                 Err(TryLockError::Error(error)) => return Err(JournalError::file(&path, "locking it")(error)),
             };
-            // Somebody may have taken its name away meanwhile, and whoever comes next would lock another one.
+            // Another process can have removed the name in the meantime. The next process would then lock a different
+            // file.
             if !folder.is_still(name, &file) {
                 continue;
             }
@@ -176,7 +182,7 @@ impl MachineLock {
         Ok(Err("it is taken away again and again".to_owned()))
     }
 
-    /// Takes the epoch that a file keeps, unless no client of this computer can have had it.
+    /// Reads the stored epoch. Rejects a value that no client of this computer can have used.
     fn believe(&mut self, kept: &str, path: &Path) {
         for text in kept.lines().filter_map(|line| line.strip_prefix(EPOCH)) {
             match text.trim().parse::<u32>() {
@@ -190,11 +196,12 @@ impl MachineLock {
         self.notes.push(format!("{}: {what}; it was left alone", path.display()));
     }
 
-    /// Who holds it is for people, and the machine itself tells of its last epoch too: where it cannot be written the lock is one all the same.
+    /// Writes the holder and the epoch. Ignores write errors: the holder is information for people, the machine itself
+    /// also reports its last epoch, and the lock is valid without them.
     fn write(&self, epoch: u32) {
         let text = format!("{}\n{EPOCH}{epoch}\n", self.holder);
         for mut file in &self.told {
-            // Never empty in between: what was kept outlives a program that is killed here.
+            // The file is never empty in between: a process that is killed here does not lose the stored epoch.
             let _ = file
                 .rewind()
                 .and_then(|()| file.write_all(text.as_bytes()))
@@ -203,7 +210,7 @@ impl MachineLock {
     }
 }
 
-/// Another handle of a file, for its lock.
+/// Returns another handle of a file, for its lock.
 fn again(file: &File, path: &Path) -> Result<File, JournalError> {
     file.try_clone().map_err(JournalError::file(path, "opening it"))
 }
@@ -240,7 +247,7 @@ mod tests {
         let folder = place.path().join(FOLDER);
         assert_eq!(MachineLock::doors_in(&folder), []);
         std::fs::write(lock.door(), "").unwrap();
-        // Another door, beside which no lock lies.
+        // Another socket, without a lock file next to it.
         std::fs::write(folder.join("other.sock"), "").unwrap();
         assert_eq!(MachineLock::doors_in(&folder), [(run.to_owned(), lock.door().to_owned())]);
         assert_eq!(MachineLock::doors_in(&place.path().join("absent")), []);
@@ -266,7 +273,7 @@ mod tests {
     }
 }
 
-/// Somebody else was there first.
+/// Tests with files that another user put in place first.
 #[cfg(all(test, unix))]
 mod strangers {
     use std::fs;
@@ -281,7 +288,8 @@ mod strangers {
         format!("{}.lock", &sha256_hex(ADDRESS.as_bytes())[..16])
     }
 
-    /// A place for all with the folder of the locks in it, and a file of the owner that nobody else may have changed.
+    /// Creates a shared place with the folder of the locks in it, and a file of the owner that no other user may cause
+    /// to change.
     fn place() -> (tempfile::TempDir, PathBuf, PathBuf) {
         let place = tempfile::tempdir().unwrap();
         let (folder, precious) = (place.path().join(FOLDER), place.path().join("precious"));
@@ -292,7 +300,8 @@ mod strangers {
         (place, folder, precious)
     }
 
-    /// Takes the machine, sees that a second run of this user does not, and that nothing of what lay there was touched.
+    /// Takes the machine, and checks that a second run of this user cannot take it, and that the owner's file is
+    /// unchanged.
     fn taken(place: &Path, precious: &Path) -> MachineLock {
         let take = || MachineLock::take_in(place, ADDRESS, Path::new("runs/a"));
         let lock = take().unwrap();
@@ -321,7 +330,7 @@ mod strangers {
             let lock = taken(place.path(), &precious);
             assert!(lock.notes().len() == 1 && lock.notes()[0].contains(what), "{what}: {:?}", lock.notes());
         }
-        // The file of this user alone, too.
+        // The same for the lock file of this user only.
         let (place, folder, precious) = place();
         let own = format!("{}.{}.lock", &sha256_hex(ADDRESS.as_bytes())[..16], LockFolder::own_mark());
         symlink(&precious, folder.join(own)).unwrap();
@@ -387,7 +396,7 @@ mod strangers {
         }
     }
 
-    /// A child that is another user, where only root can be one.
+    /// Returns a command that runs as another user. Only root can start it.
     fn stranger(program: &str, arguments: &[&std::ffi::OsStr]) -> std::process::Command {
         use std::os::unix::process::CommandExt;
         let mut command = std::process::Command::new(program);
@@ -435,7 +444,7 @@ mod strangers {
             let done = stranger(program, &arguments).stderr(std::process::Stdio::null()).status().unwrap();
             assert!(!done.success(), "{program}");
         }
-        // He may spoil the lock of all users, and takes the machine from nobody by that.
+        // The other user can damage the shared lock file, but cannot release the machine that way.
         assert!(
             stranger("truncate", &["-s".as_ref(), "9999".as_ref(), folder.join(name()).as_os_str()])
                 .status()

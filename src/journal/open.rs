@@ -1,4 +1,4 @@
-//! Opening the database: is it ours, and does it keep what it promises?
+//! Opens the database, and checks that it is a journal and that its settings give the promised durability.
 
 use std::fs::{self, File};
 use std::io::Read;
@@ -12,11 +12,11 @@ use super::DATABASE;
 use super::error::JournalError;
 use super::system;
 
-/// `RGrd`: says in the header of the file whose database this is.
+/// Application id `RGrd` in the header of the file; identifies a journal of Regrind.
 const APPLICATION_ID: u32 = 0x5247_7264;
-/// How long a write waits for another process to let go of the file; who records tries again.
+/// Timeout of a write while another process locks the file. The caller of a failed write tries again.
 const BUSY_FOR: Duration = Duration::from_millis(200);
-/// The layout of the tables and what stands in them. 1 knew no seals, and is read as well.
+/// Version of the table layout and its content. Version 1 has no seals; it can still be read.
 const LAYOUT: u32 = 2;
 
 pub(super) const SCHEMA: &str = "
@@ -44,7 +44,7 @@ CREATE TRIGGER record_follows_the_last BEFORE INSERT ON record
     BEGIN SELECT RAISE(ABORT, 'records follow the last'); END;
 ";
 
-/// Makes the database of a new run.
+/// Creates the database of a new run.
 pub(super) fn create(folder: &Path) -> Result<Connection, JournalError> {
     let path = folder.join(DATABASE);
     let failed = JournalError::database(&path);
@@ -56,7 +56,8 @@ pub(super) fn create(folder: &Path) -> Result<Connection, JournalError> {
     Ok(connection)
 }
 
-/// Has the log stay when the database is closed, or has it brought in: that of a run which broke off stays, however its program ended.
+/// Sets whether the write-ahead log stays when the database is closed (true), or is written into the database (false).
+/// The log of an interrupted run stays, however its program ended.
 pub(super) fn keep_the_log(connection: &Connection, keeps: bool) -> rusqlite::Result<()> {
     connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, keeps).map(drop)
 }
@@ -73,21 +74,23 @@ pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
     bring_in_the_log(&connection).map_err(&failed)?;
     keep_the_log(&connection, true).map_err(&failed)?;
     if layout < LAYOUT {
-        // What is written from here on, an earlier version may not know.
+        // An earlier version may not know the records that are written from here on.
         connection.execute_batch(&format!("PRAGMA user_version = {LAYOUT};")).map_err(&failed)?;
     }
     Ok(connection)
 }
 
-/// Writes all that the log holds into the database, and begins the log anew. Where a sync has failed before, the system may have given up
-/// bringing a part of the log to the disk, and show it all the same; what is written behind such a part is not found again
-/// after a power cut. While somebody reads, the log stays as it is.
+/// Writes the whole log into the database, and restarts the log. After a failed sync the operating system can drop a
+/// part of the log that is not yet on the disk, and still show it to readers. Records written after that part cannot be
+/// read after a power failure. While another process reads, the log stays as it is.
 fn bring_in_the_log(connection: &Connection) -> rusqlite::Result<()> {
-    // The file of the log stays as long as it is: that a run which broke off has none, or an empty one, says that somebody took it away.
+    // RESTART keeps the length of the log file. A missing or empty log of an interrupted run therefore shows that
+    // somebody removed it.
     run(connection, "PRAGMA wal_checkpoint(RESTART)")
 }
 
-/// Sees that the tables are those of a record, and nothing else: a view in the place of a table can show anything, and without end.
+/// Checks that the schema has the tables of a journal and nothing else. A view in the place of a table can return any
+/// content, without end.
 fn check_schema(connection: &Connection, path: &Path) -> Result<(), JournalError> {
     let failed = JournalError::database(path);
     let mut statement = connection.prepare("SELECT type, name, sql FROM sqlite_schema").map_err(&failed)?;
@@ -97,7 +100,7 @@ fn check_schema(connection: &Connection, path: &Path) -> Result<(), JournalError
     while let Some(row) = rows.next().map_err(&failed)? {
         let (kind, name): (String, String) = (row.get(0).map_err(&failed)?, row.get(1).map_err(&failed)?);
         let sql: Option<String> = row.get(2).map_err(&failed)?;
-        // SQLite makes an index of its own for what is unique.
+        // SQLite creates an index of its own for each UNIQUE column.
         let is_automatic = sql.is_none() && kind == "index" && name.starts_with("sqlite_autoindex_record_");
         if !is_automatic && !sql.is_some_and(|sql| statements().any(|known| known == words(&sql))) {
             return Err(foreign("it has a table, view, index or trigger that a record has not"));
@@ -107,9 +110,9 @@ fn check_schema(connection: &Connection, path: &Path) -> Result<(), JournalError
     if has_table { Ok(()) } else { Err(foreign("it has no table of records")) }
 }
 
-/// The statements of the schema, as the database keeps them.
+/// Returns the statements of the schema in the form in which the database stores them.
 fn statements() -> impl Iterator<Item = String> {
-    // That of a trigger has a semicolon within.
+    // The statement of a trigger contains a semicolon, so the schema is not split at semicolons.
     SCHEMA
         .split("\nCREATE ")
         .skip(1)
@@ -120,7 +123,7 @@ fn words(sql: &str) -> String {
     sql.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// Opens the database of a run for reading, also where the folder cannot be written.
+/// Opens the database of a run for reading. Works also if the folder is not writable.
 pub(super) fn read_only(folder: &Path) -> Result<Connection, JournalError> {
     let path = folder.join(DATABASE);
     recognise(folder, &path)?;
@@ -129,7 +132,7 @@ pub(super) fn read_only(folder: &Path) -> Result<Connection, JournalError> {
     let tried = Connection::open_with_flags(&path, flags).and_then(|c| reads(&c).map(|()| c));
     let is_beside = |what: &str| folder.join(format!("{DATABASE}-{what}")).exists();
     let connection = match tried {
-        // Only a writer can take back what the file holds and was never committed.
+        // Only a writer can roll back uncommitted content of the file.
         Err(error) if is_unopenable(&error) && is_beside("journal") => {
             return Err(JournalError::Foreign {
                 path,
@@ -137,7 +140,8 @@ pub(super) fn read_only(folder: &Path) -> Result<Connection, JournalError> {
             });
         }
         Err(error) if is_unopenable(&error) && !is_beside("wal") => {
-            // A write-ahead database wants to make files beside it. Where it cannot, and there is nothing ahead, it is read as it is.
+            // A WAL database needs files next to it. If they cannot be created and there is no log, the database is
+            // read as it is.
             let address = address(&path);
             let flags = flags | OpenFlags::SQLITE_OPEN_URI;
             Connection::open_with_flags(address, flags).and_then(|c| reads(&c).map(|()| c))
@@ -161,7 +165,7 @@ fn is_unopenable(error: &rusqlite::Error) -> bool {
     )
 }
 
-/// Returns the address of a file that nobody changes.
+/// Returns the URI that opens a file as immutable.
 fn address(path: &Path) -> String {
     let mut address = "file:".to_owned();
     for byte in path.as_os_str().as_encoded_bytes() {
@@ -173,8 +177,8 @@ fn address(path: &Path) -> String {
     address + "?immutable=1"
 }
 
-/// Looks at the header of the file before SQLite may touch it; returns the layout. Whoever closes a file gives back all locks that his process
-/// has on it, so this is for nobody who writes the same journal.
+/// Checks the header of the file before SQLite opens it, and returns the layout version. A process that writes this
+/// journal must not call it: when a process closes a file, it releases all locks that it has on that file.
 fn recognise(folder: &Path, path: &Path) -> Result<u32, JournalError> {
     if !path.is_file() {
         return Err(JournalError::Absent { path: folder.to_owned() });
@@ -202,11 +206,11 @@ fn recognise(folder: &Path, path: &Path) -> Result<u32, JournalError> {
     }
 }
 
-/// Sets what the promises rest on, and reads it back.
+/// Applies the settings that the guarantees depend on, and reads each one back.
 fn configure(connection: &Connection, path: &Path) -> Result<(), JournalError> {
     connection.busy_timeout(BUSY_FOR).map_err(JournalError::database(path))?;
     set(connection, path, "journal_mode", "wal")?;
-    // FULL is 2: with less the last records could be lost when the power fails.
+    // 2 is FULL: a lower level can lose the last records in a power failure.
     set(connection, path, "synchronous", "2")?;
     set(connection, path, "foreign_keys", "1")?;
     harden(connection, path)
@@ -226,7 +230,8 @@ fn set(connection: &Connection, path: &Path, setting: &'static str, wanted: &'st
     if found == wanted { Ok(()) } else { Err(JournalError::Setting { path: path.to_owned(), setting, wanted, found }) }
 }
 
-/// Runs a statement to its end, whatever it gives. A setting that is written into the file tells its value first, and fails then.
+/// Runs a statement to its end and ignores its rows. A setting that is stored in the file returns its value first, and
+/// can fail after that.
 fn run(connection: &Connection, sql: &str) -> rusqlite::Result<()> {
     let mut statement = connection.prepare(sql)?;
     let mut rows = statement.query([])?;
@@ -242,13 +247,13 @@ fn text_of(value: rusqlite::types::ValueRef<'_>) -> String {
     }
 }
 
-/// Makes names in a folder last.
+/// Syncs the names in a folder to the disk.
 pub(super) fn sync_folder(folder: &Path) -> Result<(), JournalError> {
     let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
     system::sync_folder(folder).map_err(JournalError::file(folder, "bringing it to the disk"))
 }
 
-/// Returns whether a folder is absent or empty.
+/// Returns true if a folder is absent or empty.
 pub(super) fn is_free(folder: &Path) -> Result<bool, JournalError> {
     match fs::read_dir(folder) {
         Ok(mut entries) => Ok(entries.next().is_none()),
@@ -257,15 +262,16 @@ pub(super) fn is_free(folder: &Path) -> Result<bool, JournalError> {
     }
 }
 
-/// Whether every user of this computer may look into the folder of a run: a reader can hold its record up.
+/// Returns true if every user of this computer can read the run folder: a reader can block the writing of its record.
 pub fn is_open_to_all(folder: &Path) -> bool {
     system::is_open_to_all(folder)
 }
 
-/// Returns how much room is left for the user of this program on the disk of a folder, or of the nearest one above it that is there.
+/// Returns the free space, in bytes, that the user of this program has on the disk of a folder. For a folder that does
+/// not exist, the nearest existing folder above it is used.
 ///
 /// # Errors
-/// A folder that cannot be looked at.
+/// The free space cannot be queried.
 pub fn free_bytes(folder: &Path) -> Result<u64, JournalError> {
     let whole = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
     let there = whole.ancestors().find(|folder| folder.is_dir()).unwrap_or(&whole);

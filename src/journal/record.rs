@@ -1,4 +1,4 @@
-//! One record, and the way through all of them.
+//! One record, and the iteration over all records.
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -13,27 +13,28 @@ use serde_json::Value;
 use super::canonical::{canonical_json, chain, write_string};
 use super::error::JournalError;
 
-/// What a record tells.
+/// Kind of a record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
-    /// The first record of a run.
+    /// First record of a run.
     Begin,
     /// The journal was opened again after a crash or a hold.
     Reopen,
-    /// A command, before it is carried out. Has a command number.
+    /// A command, recorded before it is executed. Has a command number.
     Intent,
-    /// What became of a command. Has the number of its intent.
+    /// Result of a command. Has the command number of its intent.
     Outcome,
-    /// An event that the cell took in.
+    /// An event that the cell received.
     Event,
     /// A file of the run folder and its SHA-256.
     Artefact,
-    /// Anything else that somebody should read.
+    /// Any other message for the reader.
     Note,
-    /// The number of records before it and the hash of the last, signed. The journal writes it by itself.
+    /// Signature of the number of records before it and the hash of the last of them. Only the journal itself writes
+    /// it.
     Seal,
-    /// The last record of a run, with the number of records before it. Where the run is signed, its seal follows, and nothing else.
+    /// End of a run, with the number of records before it. If the run is signed, exactly one seal follows.
     End,
 }
 
@@ -51,7 +52,7 @@ impl Kind {
         Self::End,
     ];
 
-    /// Returns the word in the database.
+    /// Returns the word that the database stores.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Begin => "begin",
@@ -75,82 +76,83 @@ impl FromStr for Kind {
     }
 }
 
-/// What is to be recorded.
+/// Content of a record to be written.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Entry {
-    /// Time since the run began, of a clock that only goes on, in nanoseconds.
+    /// Time since the run began, in nanoseconds, of a monotonic clock.
     pub mono_ns: u64,
-    /// Who: a person, a machine or the cell.
+    /// Person or machine that acts, or the cell.
     pub actor: String,
-    /// Where: a terminal, a computer, an address.
+    /// Place of the actor: a terminal, a computer or an address.
     pub station: String,
-    /// What this record tells.
+    /// Kind of the record.
     pub kind: Kind,
-    /// The cycle; 0 before the first.
+    /// Number of the cycle; 0 before the first.
     pub cycle: u32,
-    /// The number of the command that this belongs to. An intent is given its number by [`super::Journal::intend`].
+    /// Number of the command that this record belongs to. [`super::Journal::intend`] assigns the number of an intent.
     pub command_id: Option<u32>,
-    /// Why, in words; may be empty.
+    /// Reason in words; can be empty.
     pub reason: String,
-    /// The content.
+    /// Content of the record.
     pub payload: Value,
 }
 
 impl Entry {
-    /// Returns an entry of the cell itself, with the name of this program as its station.
+    /// Returns an entry of the cell itself, with this program as its station.
     pub fn new(kind: Kind, mono_ns: u64, cycle: u32, payload: Value) -> Self {
         let (actor, station) = ("cell".to_owned(), "regrind".to_owned());
         Self { mono_ns, actor, station, kind, cycle, command_id: None, reason: String::new(), payload }
     }
 }
 
-/// What stands in the journal.
+/// Record of the journal.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Record {
-    /// The number of the record, from 1.
+    /// Number of the record, from 1.
     pub seq: u64,
-    /// The time of day, RFC 3339 in UTC. Records are ordered by `seq`, never by this.
+    /// Time of day, RFC 3339 in UTC. Records are ordered by `seq`, never by this time.
     pub utc: String,
-    /// A random word for each opening of the journal; `mono_ns` compares only within one.
+    /// Random identifier of one opening of the journal. Values of `mono_ns` are comparable only within the same
+    /// opening.
     pub boot_id: String,
     /// Time since the run began, in nanoseconds.
     pub mono_ns: u64,
-    /// Who.
+    /// Person or machine that acts, or the cell.
     pub actor: String,
-    /// Where.
+    /// Place of the actor.
     pub station: String,
-    /// What this record tells.
+    /// Kind of the record.
     pub kind: Kind,
-    /// The serial number of the part.
+    /// Serial number of the part.
     pub part: String,
-    /// The cycle; 0 before the first.
+    /// Number of the cycle; 0 before the first.
     pub cycle: u32,
-    /// The number of the command that this belongs to.
+    /// Number of the command that this record belongs to.
     pub command_id: Option<u32>,
-    /// Why, in words.
+    /// Reason in words.
     pub reason: String,
-    /// The content, canonical JSON.
+    /// Content, in canonical JSON.
     pub payload: String,
-    /// The hash of the record before; 64 zeros for the first.
+    /// Hash of the record before; 64 zeros for the first record.
     pub prev_hash: String,
-    /// The hash of this record.
+    /// Hash of this record.
     pub hash: String,
 }
 
 impl Record {
-    /// Returns whether this is what an entry became.
+    /// Returns true if this record was made from an entry. Compares kind, cycle, actor, station, time and payload.
     pub(super) fn is_of(&self, entry: &Entry) -> bool {
         (self.kind, self.cycle, &self.actor, &self.station) == (entry.kind, entry.cycle, &entry.actor, &entry.station)
             && self.mono_ns == entry.mono_ns.min(i64::MAX as u64)
             && self.payload == canonical_json(&entry.payload)
     }
 
-    /// Returns the content as a value; null if it is not JSON.
+    /// Returns the content as a JSON value, or null if it is not JSON.
     pub fn value(&self) -> Value {
         serde_json::from_str(&self.payload).unwrap_or(Value::Null)
     }
 
-    /// Puts it behind those of a database that holds it against them.
+    /// Inserts the record after the last one. The database rejects a record that does not follow the last one.
     pub(super) fn put_into(&self, connection: &Connection) -> rusqlite::Result<()> {
         let sql = format!(
             "INSERT INTO record ({COLUMNS}) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10, ?11, ?12, ?13, ?14)"
@@ -175,7 +177,7 @@ impl Record {
         statement.execute(values).map(drop)
     }
 
-    /// Returns the text that is hashed: all fields but the hashes, as JSON with sorted keys.
+    /// Returns the text that is hashed: all fields except the hashes, as JSON with sorted keys.
     pub fn text(&self) -> String {
         let mut text = String::with_capacity(self.payload.len() + 256);
         let string = |text: &mut String, key: &str, value: &str| {
@@ -203,18 +205,18 @@ impl Record {
         text
     }
 
-    /// Returns the hash that this record should have.
+    /// Computes the hash that this record must have.
     pub(super) fn hash_due(&self) -> String {
         chain(&self.prev_hash, &self.text())
     }
 
-    /// Returns the names of the columns as a row of CSV (RFC 4180), without its end of line.
+    /// Returns the column names as a row of CSV (RFC 4180), without the line ending.
     pub fn csv_head() -> String {
         COLUMNS.replace(", ", ",")
     }
 
-    /// Returns the record as a row of CSV (RFC 4180), without its end of line: every field as it is, the payload as its JSON text,
-    /// and nothing where there is no command number.
+    /// Returns the record as a row of CSV (RFC 4180), without the line ending. Every field is unchanged. The payload is
+    /// its JSON text. A missing command number is an empty field.
     pub fn csv_row(&self) -> String {
         let id = self.command_id.map_or(String::new(), |id| id.to_string());
         let (seq, mono_ns, cycle) = (self.seq.to_string(), self.mono_ns.to_string(), self.cycle.to_string());
@@ -238,7 +240,8 @@ impl Record {
         fields.map(csv_field).join(",")
     }
 
-    /// Tells what is wrong with this record as the one that comes behind `records` others, of which the last has the hash `head`.
+    /// Returns the fault of this record as the successor of `records` records, of which the last has the hash `head`;
+    /// `None` if it has no fault.
     pub(super) fn flaw_behind(&self, records: u64, head: &str) -> Option<String> {
         let due = records + 1;
         if self.seq != due {
@@ -255,7 +258,7 @@ impl Record {
         }
     }
 
-    /// Returns the record as one line of JSON: the text that is hashed, and the hashes.
+    /// Returns the record as one line of JSON: the fields of the hashed text, then the hashes.
     pub fn json_line(&self) -> String {
         let mut line = self.text();
         line.pop();
@@ -271,11 +274,11 @@ fn csv_field(field: &str) -> Cow<'_, str> {
     }
 }
 
-/// The columns, in the order in which they are read and written.
+/// Columns, in the order in which they are read and written.
 pub(super) const COLUMNS: &str =
     "seq, utc, boot_id, mono_ns, actor, station, kind, part, cycle, command_id, reason, payload, prev_hash, hash";
 
-/// Reads a number that is never negative.
+/// Reads a nonnegative integer from a column.
 pub(super) fn whole(row: &Row<'_>, column: usize) -> rusqlite::Result<u64> {
     let number: i64 = row.get(column)?;
     u64::try_from(number).map_err(|_| rusqlite::Error::IntegralValueOutOfRange(column, number))
@@ -302,20 +305,20 @@ fn record_of(row: &Row<'_>) -> rusqlite::Result<Record> {
     })
 }
 
-/// Most records that are read at once.
+/// Maximum number of records that are read at once.
 const LARGEST_PAGE: u32 = 512;
 
-/// The records of a journal, in order. They are read a page at a time, and nothing is held open between two pages, so that a
-/// writer is never kept waiting and what it adds meanwhile is found.
+/// Iterator over the records of a journal, in order. It reads one page at a time and keeps no transaction open between
+/// two pages. So it never blocks a writer, and it finds the records that a writer adds in the meantime.
 #[derive(Debug)]
 pub struct Records<'j> {
     connection: &'j Connection,
     folder: PathBuf,
-    /// What is read and not yet given.
+    /// Records that are read and not yet returned.
     page: VecDeque<Result<Record, JournalError>>,
-    /// The number to read on from.
+    /// Number of the next record to read.
     next: u64,
-    /// The size of the next page: who wants one record pays for one.
+    /// Number of records of the next page. It grows from 1, so that a single record costs one row.
     size: u32,
     over: bool,
 }
@@ -325,7 +328,7 @@ impl<'j> Records<'j> {
         Self { connection, folder: folder.to_owned(), page: VecDeque::new(), next: from.max(1), size: 1, over: false }
     }
 
-    /// Reads the next page. An error ends it and stands behind the records before it.
+    /// Reads the next page. An error ends the iteration, and is returned after the records that were read before it.
     fn turn(&mut self) {
         if let Err(error) = self.read() {
             self.page.push_back(Err(error));
@@ -370,7 +373,7 @@ impl Iterator for Records<'_> {
     }
 }
 
-/// The database counts with a sign; 292 years of nanoseconds fit.
+/// Converts to the signed integer of the database. 292 years of nanoseconds fit.
 pub(super) fn signed(number: u64) -> i64 {
     i64::try_from(number).unwrap_or(i64::MAX)
 }

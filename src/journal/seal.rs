@@ -1,4 +1,4 @@
-//! A seal: the head of the journal at some record, signed by the key that the run names.
+//! Seal: signature of the head of the journal at one record, made with the key that the run names.
 
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -6,22 +6,22 @@ use serde_json::json;
 use super::canonical::canonical_json;
 use super::key::{AuditKey, PublicKey};
 
-/// Records from one seal to the next, and from one anchor to the next where nothing is signed.
+/// Number of records from one seal to the next. In an unsigned journal, number of records from one anchor to the next.
 pub const SEALED_EVERY: u64 = 256;
 
-/// What separates this signature from every other use of the key.
+/// Domain separator: keeps this signature distinct from every other use of the key.
 const DOMAIN: &str = "regrind journal seal 1\n";
 
-/// The payload of a record of kind `seal`.
+/// Payload of a record of kind `seal`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Seal {
-    /// The number of records before it.
+    /// Number of records before the seal.
     pub(super) records: u64,
-    /// The hash of the last of them.
+    /// Hash of the last of these records.
     pub(super) head: String,
-    /// Who signed.
+    /// Public key of the signer, 64 hexadecimal digits.
     pub(super) key: String,
-    /// The signature.
+    /// Signature, 128 hexadecimal digits.
     pub(super) signature: String,
 }
 
@@ -32,13 +32,13 @@ impl Seal {
     }
 }
 
-/// Returns what is signed: it names the run, so that a seal cannot be carried over into another.
+/// Returns the message that is signed. It names the run, so that a seal is not valid in another run.
 fn message(run: &str, records: u64, head: &str) -> Vec<u8> {
     let text = canonical_json(&json!({ "head": head, "records": records, "run": run }));
     [DOMAIN, &text].concat().into_bytes()
 }
 
-/// Returns whether a key has signed the head of a run.
+/// Returns true if a key has signed the head of a run.
 pub(super) fn is_signed(key: &PublicKey, run: &str, records: u64, head: &str, signature: &str) -> bool {
     key.has_signed(&message(run, records, head), signature)
 }

@@ -1,4 +1,4 @@
-//! Is the journal what was written?
+//! Verifies that a journal is what was written.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -15,31 +15,32 @@ use super::record::{Kind, Record};
 use super::seal::{Seal, is_signed};
 use super::{ANCHOR, DATABASE, LOCK, Reader};
 
-/// How long the journal was at some time, and the hash of its last record then. Kept elsewhere it proves that nothing was cut.
+/// Length of the journal at some time, and the hash of its last record then. A copy kept elsewhere proves that no
+/// record up to this one was cut off.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Anchor {
-    /// The number of records.
+    /// Number of records.
     pub records: u64,
-    /// The hash of the last.
+    /// Hash of the last record.
     pub head: String,
-    /// The run, where the head was signed; what was not signed leaves this and what follows out.
+    /// Name of the run, if the head is signed. An anchor without a signature omits this field and the fields below.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub run: Option<String>,
-    /// Who signed, 64 hexadecimal digits.
+    /// Public key of the signer, 64 hexadecimal digits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub key: Option<String>,
-    /// The signature, 128 hexadecimal digits.
+    /// Signature, 128 hexadecimal digits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub signature: Option<String>,
 }
 
 impl Anchor {
-    /// Returns an anchor that nobody signed.
+    /// Returns an anchor without a signature.
     pub fn new(records: u64, head: String) -> Self {
         Self { records, head, run: None, key: None, signature: None }
     }
 
-    /// Returns what a seal says.
+    /// Returns the anchor with the content of a seal.
     pub(super) fn sealed(run: &str, seal: &Seal) -> Self {
         Self {
             records: seal.records,
@@ -51,62 +52,63 @@ impl Anchor {
     }
 }
 
-/// What a journal is held against, besides itself and the anchor beside it.
+/// External evidence to verify a journal against, in addition to the journal itself and the anchor in its folder.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Against {
-    /// An anchor that was kept elsewhere.
+    /// Anchor that was kept elsewhere.
     pub anchor: Option<Anchor>,
-    /// The keys that may have signed; with none, whichever the journal names.
+    /// Keys that are trusted to sign. If empty, every key that the journal names is accepted.
     pub keys: Vec<PublicKey>,
 }
 
-/// What a journal that can be believed holds.
+/// Result of the verification of an intact journal.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Verified {
-    /// The number of records.
+    /// Number of records.
     pub records: u64,
-    /// The hash of the last.
+    /// Hash of the last record.
     pub head: String,
-    /// Up to which record an anchor proves that nothing was cut; 0 if there is no anchor.
+    /// Number of the last record up to which an anchor proves that nothing was cut; 0 without an anchor.
     pub anchored: u64,
-    /// Whether the run came to its end; the end of one that did not proves nothing behind its anchor.
+    /// True if the run has its end record. If it has none, nothing proves that records after the anchor are complete.
     pub closed: bool,
-    /// The files on record, all there and unchanged.
+    /// Number of recorded files. All of them exist and are unchanged.
     pub artefacts: u64,
-    /// The numbers of the commands without an outcome.
+    /// Numbers of the commands without an outcome.
     pub open_intents: Vec<u32>,
-    /// Whether a process drives the run now, so that its end is still to come.
+    /// True if a process drives the run now, so that its end is still to come.
     pub under_way: bool,
-    /// Files of the folder that stand in no record, in order; the journal's own left out.
+    /// Files of the folder that are in no record, sorted, without the journal's own files.
     pub unrecorded: Vec<String>,
-    /// The keys that the run signed with, in the order in which the record names them; none if it is not signed.
+    /// Keys that the run signed with, in the order in which the record names them; empty if the run is not signed.
     pub keys: Vec<PublicKey>,
-    /// The number of seals.
+    /// Number of seals.
     pub seals: u64,
-    /// Up to which record a signature reaches; 0 if none does.
+    /// Number of the last record that a signature covers; 0 if none does.
     pub signed: u64,
 }
 
 impl Verified {
-    /// Returns whether the run names a key and has its end, and that is not sealed: who has no key may have written it. Where a process drives
-    /// the run, the seal may still be on its way.
+    /// Returns true if the run names a key and has its end record, but the end is not sealed: somebody without the key
+    /// could have written the end. While a process drives the run, the seal can still follow.
     pub fn lacks_last_seal(&self) -> bool {
         !self.keys.is_empty() && self.closed && self.signed + 1 != self.records
     }
 }
 
-/// Verifies the journal of a run folder, the files on record, and the anchor beside it.
+/// Verifies the journal of a run folder, the recorded files, and the anchor in the folder.
 ///
 /// # Errors
-/// [`JournalError::Broken`] with the first record that cannot be believed; a journal that cannot be read.
+/// [`JournalError::Broken`] with the first record that fails; the journal cannot be read.
 pub fn verify(folder: impl AsRef<Path>) -> Result<Verified, JournalError> {
     verify_against(folder, &Against::default())
 }
 
-/// Verifies a journal as [`verify`] does, and against what was kept elsewhere.
+/// Verifies a journal as [`verify`] does, and also against external evidence.
 ///
 /// # Errors
-/// Those of [`verify`]; [`JournalError::NoAuthor`] where all of it can be believed but that one of the keys signed it.
+/// Those of [`verify`]; [`JournalError::NoAuthor`] if the journal is intact, but not signed with one of the trusted
+/// keys.
 pub fn verify_against(folder: impl AsRef<Path>, against: &Against) -> Result<Verified, JournalError> {
     let folder = folder.as_ref();
     let beside = read_anchor(folder)?;
@@ -114,15 +116,15 @@ pub fn verify_against(folder: impl AsRef<Path>, against: &Against) -> Result<Ver
     examine(folder, &anchors, &against.keys)
 }
 
-/// Returns the anchor beside a journal; none where there is none.
+/// Returns the anchor in a run folder, or `None` if there is none.
 ///
 /// # Errors
-/// A file that cannot be read, or that is no anchor.
+/// The file cannot be read, or it is not a valid anchor.
 pub fn anchor_of(folder: &Path) -> Result<Option<Anchor>, JournalError> {
     read_anchor(folder)
 }
 
-/// Reads the anchor beside a journal.
+/// Reads the anchor in a run folder, or returns `None` if there is none.
 pub(super) fn read_anchor(folder: &Path) -> Result<Option<Anchor>, JournalError> {
     let path = folder.join(ANCHOR);
     match read_few(&path) {
@@ -134,10 +136,11 @@ pub(super) fn read_anchor(folder: &Path) -> Result<Option<Anchor>, JournalError>
     }
 }
 
-/// Most bytes of an anchor.
+/// Maximum length of an anchor file, in bytes.
 const MOST_OF_ANCHOR: u64 = 4096;
 
-/// Reads a small file, and nothing that is none or has no end.
+/// Reads at most [`MOST_OF_ANCHOR`] bytes of a file. Rejects a path that is not a regular file, which could have no
+/// end.
 fn read_few(path: &Path) -> io::Result<Vec<u8>> {
     if !fs::metadata(path)?.is_file() {
         return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no file"));
@@ -151,20 +154,20 @@ fn broken(folder: &Path, seq: u64, what: impl Into<String>) -> JournalError {
     JournalError::Broken { path: folder.to_owned(), seq, what: what.into() }
 }
 
-/// What has been seen of a journal so far.
+/// State of the verification after the records read so far.
 #[derive(Clone)]
 struct Seen<'a> {
     folder: &'a Path,
-    /// Who may have signed; with nobody, whoever the journal names.
+    /// Keys that are trusted to sign. If empty, every key that the journal names is accepted.
     trusted: &'a [PublicKey],
     records: u64,
     head: String,
-    /// The number of the end.
+    /// Number of the end record.
     ended: Option<u64>,
     run: String,
-    /// The key that the newest beginning or reopening names.
+    /// Key that the newest begin or reopen record names.
     key: Option<PublicKey>,
-    /// Why none of the trusted keys proves it, from the first record that says so.
+    /// Reason why the trusted keys do not prove the author, from the first record where this is so.
     no_author: Option<String>,
     keys: Vec<PublicKey>,
     seals: u64,
@@ -178,7 +181,7 @@ struct Seen<'a> {
 
 fn examine(folder: &Path, anchors: &[&Anchor], trusted: &[PublicKey]) -> Result<Verified, JournalError> {
     let reader = Reader::open(folder)?;
-    // Asked before anything is read: what nobody drives does not change any more.
+    // Checked before anything is read: a run that no process drives does not change any more.
     let under_way = is_driven(folder);
     let mut seen = Seen::nothing(folder, trusted);
     let mut anchored = 0;
@@ -219,7 +222,7 @@ fn examine(folder: &Path, anchors: &[&Anchor], trusted: &[PublicKey]) -> Result<
     })
 }
 
-/// Whether somebody holds the lock of a run folder: its program is there, whether it is at its beginning, at work or at its end.
+/// Returns true if a process holds the lock of a run folder. The process holds it from the start of the run to its end.
 pub fn is_driven(folder: &Path) -> bool {
     let path = folder.join(LOCK);
     if !fs::metadata(&path).is_ok_and(|found| found.is_file()) {
@@ -229,7 +232,7 @@ pub fn is_driven(folder: &Path) -> bool {
     lock.is_ok_and(|lock| matches!(lock.try_lock_shared(), Err(fs::TryLockError::WouldBlock)))
 }
 
-/// Returns the files of a run folder that stand in no record.
+/// Returns the files of a run folder that are in no record, sorted.
 fn unrecorded(folder: &Path, recorded: &BTreeSet<String>) -> Result<Vec<String>, JournalError> {
     let mut names = Vec::new();
     files_below(folder, "", &mut names)?;
@@ -238,7 +241,8 @@ fn unrecorded(folder: &Path, recorded: &BTreeSet<String>) -> Result<Vec<String>,
     Ok(names)
 }
 
-/// Finds the files in a run folder, by their paths from it; those of the journal itself are left out, and what is no file.
+/// Collects the files in a run folder, by their paths relative to it. Omits the journal's own files, and everything
+/// that is not a regular file.
 fn files_below(folder: &Path, below: &str, found: &mut Vec<String>) -> Result<(), JournalError> {
     let at = folder.join(below);
     for entry in fs::read_dir(&at).map_err(JournalError::file(&at, "looking into it"))? {
@@ -253,7 +257,7 @@ fn files_below(folder: &Path, below: &str, found: &mut Vec<String>) -> Result<()
     Ok(())
 }
 
-/// Whether a file of a run folder is the journal's own, or what a crash has left of one.
+/// Returns true if a file of a run folder is the journal's own, or was left from one by a crash.
 fn is_own(name: &str) -> bool {
     name.starts_with(DATABASE) || [ANCHOR, LOCK, &temporary_name(ANCHOR)].contains(&name)
 }
@@ -289,7 +293,7 @@ impl<'a> Seen<'a> {
         if (record.kind == Kind::Begin) != (due == 1) {
             return wrong("a run begins with its first record, and only there");
         }
-        // The end is sealed, once.
+        // Only one seal can follow the end.
         if self.ended.is_some_and(|end| record.kind != Kind::Seal || end < self.records) {
             return wrong("it stands behind the end of the run");
         }
@@ -353,7 +357,7 @@ impl<'a> Seen<'a> {
         Ok(())
     }
 
-    /// Holds what has been seen against an anchor of as many records.
+    /// Checks the state so far against an anchor with the same number of records.
     fn take_anchor(&self, anchor: &Anchor) -> Result<(), JournalError> {
         let wrong = |what: &str| Err(broken(self.folder, self.records, what));
         if anchor.run.as_ref().is_some_and(|run| *run != self.run) {
@@ -404,7 +408,7 @@ impl<'a> Seen<'a> {
         if !path.is_file() {
             return wrong(format!("the file {} is missing", known.name));
         }
-        // What has another length is not read: it may have no end.
+        // A file of another length is not read: it could have no end.
         let length = fs::metadata(&path).map(|found| found.len()).unwrap_or_default();
         if length != known.bytes || describe(&path, &known.name)? != known {
             return wrong(format!("the file {} is not what was written", known.name));
@@ -427,7 +431,7 @@ mod tests {
     use super::super::write::{Header, Journal};
     use super::*;
 
-    /// A signed run of a hundred records.
+    /// Writes a signed run of a hundred records.
     fn run_of_a_hundred(folder: &Path) {
         let header = Header {
             run: "run-1".into(),
@@ -450,7 +454,7 @@ mod tests {
         journal.close(99, 1, json!("accepted")).unwrap();
     }
 
-    /// All values that differ from one in a single bit.
+    /// Returns all values that differ from `value` in a single bit.
     fn flipped(value: &Field) -> Vec<Field> {
         match value {
             Field::Integer(number) => (0..64).map(|bit| Field::Integer(number ^ 1_i64 << bit)).collect(),
@@ -465,7 +469,7 @@ mod tests {
         }
     }
 
-    /// The number of the record at which a journal breaks, gone on with from what was seen before.
+    /// Returns the number of the record at which the verification fails, continued from an earlier state.
     fn breaks_at(connection: &Connection, seen: &Seen<'_>, records: u64) -> Option<u64> {
         let mut seen = seen.clone();
         for record in Records::new(connection, seen.folder, seen.records + 1) {
@@ -473,7 +477,7 @@ mod tests {
                 return Some(seq);
             }
         }
-        // The anchor tells that the end is missing.
+        // The anchor shows that the end is missing.
         (seen.records < records).then_some(seen.records + 1)
     }
 
@@ -484,7 +488,7 @@ mod tests {
         run_of_a_hundred(&folder);
         let records = verify(&folder).unwrap().records;
         assert_eq!(records, 100);
-        // Changed and put right again in memory, by SQL.
+        // Records are changed and restored in memory, by SQL.
         let database = Connection::open_in_memory().unwrap();
         let schema = SCHEMA.split("CREATE INDEX").next().unwrap();
         database.execute_batch(schema).unwrap();
@@ -502,7 +506,7 @@ mod tests {
                 let change = format!("UPDATE main.record SET {column} = {text} WHERE seq = ?2");
                 let mut change = database.prepare(&change).unwrap();
                 for other in flipped(&value) {
-                    // Two records cannot have one number.
+                    // Two records cannot have the same number.
                     let Ok(1) = change.execute(params![other, seq as i64]) else {
                         impossible += 1;
                         continue;

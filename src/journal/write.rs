@@ -1,4 +1,4 @@
-//! The one writer of a journal.
+//! The only writer of a journal.
 
 use std::collections::BTreeMap;
 use std::fs::{OpenOptions, TryLockError};
@@ -19,26 +19,26 @@ use super::seal::{SEALED_EVERY, Seal};
 use super::verify::{Anchor, read_anchor};
 use super::{ANCHOR, DATABASE, LOCK, open, system};
 
-/// What the first record tells.
+/// Content of the first record.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Header {
-    /// The name of the run.
+    /// Name of the run.
     pub run: String,
-    /// The serial number of the part; every record carries it.
+    /// Serial number of the part; every record carries it.
     pub part: String,
-    /// Who began the run.
+    /// Person or program that began the run.
     pub actor: String,
-    /// Where.
+    /// Place of the actor.
     pub station: String,
-    /// Whether any machine of the cell is simulated.
+    /// True if any machine of the cell is simulated.
     pub simulation: bool,
-    /// The number of the first command.
+    /// Number of the first command.
     pub first_command_id: u32,
-    /// Anything else: versions, hashes of recipe and cell.
+    /// Other content: versions, hashes of recipe and cell.
     pub content: Value,
 }
 
-/// The journal of a run, open for writing. While it lives no other process can open it so.
+/// Journal of a run, open for writing. While it lives, no other process can open it for writing.
 #[derive(Debug)]
 pub struct Journal {
     connection: Connection,
@@ -49,21 +49,21 @@ pub struct Journal {
     run: String,
     part: String,
     first_command_id: u32,
-    /// Signs the head; without one nothing is signed.
+    /// Key that signs the head; without a key nothing is signed.
     key: Option<AuditKey>,
     tail: Tail,
-    /// The newest seal of this opening of the journal.
+    /// Newest seal of this opening of the journal.
     seal: Option<Seal>,
-    /// The number of records when the anchor was last written.
+    /// Number of records when the anchor was last written.
     anchored: u64,
-    /// A record whose write failed: only the database knows whether it stands.
+    /// Record whose write failed: only the database knows whether it was stored.
     doubtful: Option<Record>,
     artefacts: BTreeMap<String, String>,
-    /// The files that are written, as they were when they were seen first.
+    /// Identity of each file that is written, as found at the first check.
     files: BTreeMap<PathBuf, system::FileIdentity>,
 }
 
-/// The end of the chain.
+/// End of the chain.
 #[derive(Clone, Debug)]
 struct Tail {
     seq: u64,
@@ -71,7 +71,7 @@ struct Tail {
     cycle: u32,
     hash: String,
     last_command_id: Option<u32>,
-    /// Whether the run has its end. Only a seal may follow it.
+    /// True if the run has its end record. Only a seal can follow it.
     closed: bool,
 }
 
@@ -82,18 +82,19 @@ impl Tail {
 }
 
 impl Journal {
-    /// Makes the folder of a new run, with its parents, and its journal with the first record.
+    /// Creates the folder of a new run, with its parents, and its journal with the first record.
     ///
     /// # Errors
-    /// A folder that is in use or cannot be written; a full disk.
+    /// The folder is in use or cannot be written, or the disk is full.
     pub fn create(folder: impl AsRef<Path>, header: Header) -> Result<Self, JournalError> {
         Self::create_with(folder, header, None)
     }
 
-    /// As [`Journal::create`], and the head is signed with a key, if there is one: now, every [`SEALED_EVERY`] records, and at the end.
+    /// Creates a run as [`Journal::create`] does. If there is a key, signs the head with it: now, every
+    /// [`SEALED_EVERY`] records, and at the end.
     ///
     /// # Errors
-    /// As [`Journal::create`].
+    /// Those of [`Journal::create`].
     pub fn create_with(folder: impl AsRef<Path>, header: Header, key: Option<AuditKey>) -> Result<Self, JournalError> {
         let folder = folder.as_ref().to_owned();
         if !open::is_free(&folder)? {
@@ -130,27 +131,28 @@ impl Journal {
         Ok(journal)
     }
 
-    /// Opens the journal of a run to go on with it, and records that. The chain is not verified here; see [`super::verify`].
+    /// Opens the journal of a run to continue it, and records the opening. Checks the chain only after the anchor, or
+    /// all of it if there is no anchor; [`super::verify`] always checks all of it.
     ///
     /// # Errors
-    /// No journal there, one of another program, one that is in use, or closed.
+    /// The folder has no journal, or the journal belongs to another program, is in use, is closed, or is broken.
     pub fn open(folder: impl AsRef<Path>) -> Result<Self, JournalError> {
         Self::open_with(folder, None)
     }
 
-    /// As [`Journal::open`], and the head is signed from here on with a key, if there is one: that of the beginning or another, and
-    /// what is recorded says which.
+    /// Opens a journal as [`Journal::open`] does. If there is a key, signs the head with it from here on. It can be
+    /// another key than the one at the beginning: the reopen record names it.
     ///
     /// # Errors
-    /// As [`Journal::open`].
+    /// Those of [`Journal::open`].
     pub fn open_with(folder: impl AsRef<Path>, key: Option<AuditKey>) -> Result<Self, JournalError> {
         Self::open_locked(RunLock::take(folder)?, key)
     }
 
-    /// As [`Journal::open_with`], for who has looked through the run under its lock before.
+    /// Opens a journal as [`Journal::open_with`] does, for a caller that already holds the lock of the run.
     ///
     /// # Errors
-    /// Those of [`Journal::open_with`] but those of the lock.
+    /// Those of [`Journal::open_with`], except those of the lock.
     pub fn open_locked(lock: RunLock, key: Option<AuditKey>) -> Result<Self, JournalError> {
         let RunLock { file: lock, folder } = lock;
         let connection = open::read_write(&folder)?;
@@ -189,17 +191,18 @@ impl Journal {
         &self.part
     }
 
-    /// Sees that the files of the record lie where they are written. A file that has lost its name takes everything and keeps nothing.
+    /// Checks that the files of the record are at the paths where they are written. A file that has lost its name
+    /// accepts every write, and all of it is lost.
     ///
     /// # Errors
-    /// [`JournalError::Gone`] with the file that is not there any more, or is another one.
+    /// [`JournalError::Gone`] with the path of a file that is missing or was replaced.
     pub fn is_in_place(&mut self) -> Result<(), JournalError> {
         for name in [DATABASE.to_owned(), format!("{DATABASE}-wal"), LOCK.to_owned()] {
             let path = self.folder.join(name);
             match (system::identity(&path), self.files.get(&path)) {
                 (Ok(found), Some(known)) if found == *known => {}
                 (Ok(found), None) => drop(self.files.insert(path, found)),
-                // The log is made with the first record.
+                // The log is created with the first record.
                 (Err(error), None) if error.kind() == std::io::ErrorKind::NotFound => {}
                 (Err(error), _) if error.kind() != std::io::ErrorKind::NotFound => {
                     return Err(JournalError::file(&path, "looking for it")(error));
@@ -215,16 +218,17 @@ impl Journal {
         self.tail.seq
     }
 
-    /// Returns the records from a number on, in order.
+    /// Returns the records from number `from` on, in order.
     pub fn records(&self, from: u64) -> Records<'_> {
         Records::new(&self.connection, &self.folder, from)
     }
 
-    /// Records something and returns its number. On return it is on the disk. After an error the same entry may be given again: it
-    /// is written once, whatever became of the first try.
+    /// Appends a record and returns its number. On return the record is on the disk. Idempotent: after an error the
+    /// same entry can be given again, and it is written once, whether or not the first attempt succeeded.
     ///
     /// # Errors
-    /// A full or unwritable disk: then nothing may be done that needed this record. A closed journal.
+    /// The disk is full or not writable: then no action that needs this record may be performed. The journal is closed,
+    /// or the entry is not allowed.
     pub fn append(&mut self, entry: Entry) -> Result<u64, JournalError> {
         let wrong = |what| Err(JournalError::Entry { kind: entry.kind.as_str(), what });
         match (entry.kind, entry.command_id) {
@@ -236,10 +240,10 @@ impl Journal {
         }
     }
 
-    /// Records a command before it is carried out, under the next command number, which is returned. No number is used twice.
+    /// Records a command before it is executed, and returns its command number. Each number is used once.
     ///
     /// # Errors
-    /// As [`Journal::append`]: then the command must not be carried out.
+    /// Those of [`Journal::append`]: then the command must not be executed.
     pub fn intend(&mut self, entry: Entry) -> Result<u32, JournalError> {
         let entry = Entry { kind: Kind::Intent, ..entry };
         let stands = self.ask_where_it_ends()?.filter(|record| record.is_of(&entry));
@@ -254,19 +258,21 @@ impl Journal {
         Ok(id)
     }
 
-    /// Returns the commands that are on record without an outcome, in order. After a crash they are reconciled before anything
-    /// else is done.
+    /// Returns the recorded commands without an outcome, in order. After a crash they must be reconciled before any
+    /// other action.
     ///
     /// # Errors
-    /// A journal that cannot be read.
+    /// The journal cannot be read.
     pub fn open_intents(&self) -> Result<Vec<Record>, JournalError> {
         open_intents(&self.connection, &self.folder)
     }
 
-    /// Brings a file to the disk, then on record. The same content again is no error and no second record.
+    /// Writes a file to the disk, then records it. Idempotent: the same content again is no error and adds no second
+    /// record.
     ///
     /// # Errors
-    /// A name that is no plain relative path, another content under a name that is on record, a full or unwritable disk.
+    /// The name is not a plain relative path, the name is on record with another content, or the disk is full or not
+    /// writable.
     pub fn store(&mut self, name: &str, bytes: &[u8], mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
         let path = artefact::path_within(&self.folder, name)?;
         let sha256 = super::sha256_hex(bytes);
@@ -277,18 +283,18 @@ impl Journal {
         self.register(Artefact { name: name.to_owned(), bytes: bytes.len() as u64, sha256 }, mono_ns, cycle)
     }
 
-    /// Brings a file that was written into the run folder by another room on record, after bringing it to the disk.
+    /// Records a file that another part of the program wrote into the run folder, after syncing it to the disk.
     ///
     /// # Errors
-    /// As [`Journal::store`].
+    /// Those of [`Journal::store`].
     pub fn adopt(&mut self, name: &str, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
         self.adopt_known(Artefact::of(&self.folder, name)?, mono_ns, cycle)
     }
 
-    /// Brings a file on record that was brought to the disk and read already, by [`Artefact::of`].
+    /// Records a file that [`Artefact::of`] has already synced to the disk and read.
     ///
     /// # Errors
-    /// As [`Journal::store`].
+    /// Those of [`Journal::store`].
     pub fn adopt_known(&mut self, found: Artefact, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
         let path = artefact::path_within(&self.folder, &found.name)?;
         if self.artefacts.get(&found.name).is_some_and(|known| *known != found.sha256) {
@@ -297,29 +303,29 @@ impl Journal {
         self.register(found, mono_ns, cycle)
     }
 
-    /// Seals the journal if it has a key, writes the number of records and the hash of the last beside it, with the signature, and
-    /// returns them to be kept elsewhere too.
+    /// Seals the journal if it has a key. Writes the anchor file: the number of records and the hash of the last one,
+    /// with the signature. Returns the anchor, so that a copy can be kept elsewhere.
     ///
     /// # Errors
-    /// A full or unwritable disk.
+    /// The disk is full or not writable.
     pub fn anchor(&mut self) -> Result<Anchor, JournalError> {
         self.ask_where_it_ends()?;
         self.seal()?;
         self.write_anchor()
     }
 
-    /// Writes the last record of the run and the anchor. Nothing can be recorded after it.
+    /// Writes the end record of the run and the anchor. No record can follow, except the seal.
     ///
     /// # Errors
-    /// As [`Journal::append`].
+    /// Those of [`Journal::append`].
     pub fn close(mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError> {
         self.end(mono_ns, cycle, ending)
     }
 
-    /// As [`Journal::close`], for who may have to try again.
+    /// Ends the run as [`Journal::close`] does, for a caller that may need to retry.
     ///
     /// # Errors
-    /// As [`Journal::append`].
+    /// Those of [`Journal::append`].
     pub fn end(&mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError> {
         self.ask_where_it_ends()?;
         if !self.tail.closed {
@@ -327,7 +333,7 @@ impl Journal {
             self.append(Entry::new(Kind::End, mono_ns, cycle, payload))?;
         }
         let anchor = self.anchor()?;
-        // Everything is in the database then.
+        // The run is complete: from now on, closing the database writes the log into it.
         open::keep_the_log(&self.connection, false).map_err(JournalError::database(&self.folder))?;
         Ok(anchor)
     }
@@ -341,7 +347,7 @@ impl Journal {
         Ok(artefact)
     }
 
-    /// Records the head and its signature, unless nothing was recorded since.
+    /// Records the head and its signature, unless nothing was recorded since the last seal.
     fn seal(&mut self) -> Result<(), JournalError> {
         let Some(key) = self.key.as_ref().filter(|_| self.tail.seq > self.sealed()) else { return Ok(()) };
         let seal = Seal::new(key, &self.run, self.tail.seq, &self.tail.hash);
@@ -350,12 +356,12 @@ impl Journal {
         Ok(())
     }
 
-    /// The number of the newest seal; 0 if this opening of the journal has none.
+    /// Returns the record number of the newest seal; 0 if this opening of the journal has none.
     fn sealed(&self) -> u64 {
         self.seal.as_ref().map_or(0, |seal| seal.records + 1)
     }
 
-    /// Writes what the newest seal says beside the journal, or where nothing is signed what the last record does.
+    /// Writes the anchor file from the newest seal, or from the last record if nothing is signed.
     fn write_anchor(&mut self) -> Result<Anchor, JournalError> {
         let anchor = match &self.seal {
             Some(seal) => Anchor::sealed(&self.run, seal),
@@ -368,8 +374,8 @@ impl Journal {
         Ok(anchor)
     }
 
-    /// Seals and anchors what has become long. The record that made it so stands, whatever becomes of this: where it cannot be
-    /// done, it is done behind one of the next, and at the end at the latest.
+    /// Seals and anchors the journal if [`SEALED_EVERY`] records were added since the last time. A failure here does
+    /// not affect the record just written: sealing is tried again after the next record, and at the latest at the end.
     fn move_along(&mut self) {
         if self.tail.closed {
             return;
@@ -416,7 +422,7 @@ impl Journal {
             seq: self.tail.seq + 1,
             utc: utc(SystemTime::now()),
             boot_id: self.boot_id.clone(),
-            // What does not fit the database would not be what was hashed.
+            // Clamped, so that the stored value is the hashed value.
             mono_ns: entry.mono_ns.min(i64::MAX as u64),
             actor: entry.actor,
             station: entry.station,
@@ -433,12 +439,13 @@ impl Journal {
         record
     }
 
-    /// One statement is one transaction: when it returns, it is committed and synced.
+    /// Writes a record. One statement is one transaction: on return it is committed and synced.
     fn write(&self, r: &Record) -> Result<(), JournalError> {
         r.put_into(&self.connection).map_err(JournalError::database(&self.folder))
     }
 
-    /// After a failed write the record may stand or not; the database is asked. Returns it if it does.
+    /// Reads the end of the chain again after a failed write, because the record may or may not be stored. Returns that
+    /// record if it is stored.
     fn ask_where_it_ends(&mut self) -> Result<Option<Record>, JournalError> {
         let Some(record) = &self.doubtful else { return Ok(None) };
         self.tail = read_tail(&self.connection, &self.folder)?;
@@ -450,7 +457,8 @@ impl Journal {
         Ok(stands)
     }
 
-    /// A journal that was cut, or is not what was written since its anchor, is not gone on with: that would sign it.
+    /// Checks that no record was cut off or changed since the anchor. A journal that fails is not continued: that would
+    /// sign the changes.
     fn is_whole(&self) -> Result<(), JournalError> {
         let broken = |seq, what| Err(JournalError::Broken { path: self.folder.clone(), seq, what });
         let (mut records, mut head) = (0, Tail::of_nothing().hash);
@@ -479,7 +487,7 @@ impl Journal {
     }
 }
 
-/// The lock of a run: while it lives no other process can go on with it.
+/// Lock of a run. While it lives, no other process can continue the run.
 #[derive(Debug)]
 pub struct RunLock {
     file: HeldFile,
@@ -487,10 +495,10 @@ pub struct RunLock {
 }
 
 impl RunLock {
-    /// Takes the lock of a run that has a journal.
+    /// Locks a run that has a journal.
     ///
     /// # Errors
-    /// No journal there, or one that is in use.
+    /// The folder has no journal, or another process drives the run.
     pub fn take(folder: impl AsRef<Path>) -> Result<Self, JournalError> {
         let folder = folder.as_ref().to_owned();
         if !folder.join(DATABASE).is_file() {
@@ -551,13 +559,14 @@ fn read_tail(connection: &Connection, folder: &Path) -> Result<Tail, JournalErro
     let ask = |sql| connection.prepare_cached(sql).map_err(&failed);
     let last_command_id =
         ask("SELECT max(command_id) FROM record NOT INDEXED")?.query_row([], |row| row.get(0)).map_err(&failed)?;
-    // The end is the last record, or the one before its seal.
+    // The end record is the last record, or the one before its seal.
     let ended = "SELECT count(*) FROM record WHERE seq >= ?1 AND kind = 'end'";
     let ends = ask(ended)?.query_row([signed(tail.seq) - 1], |row| row.get::<_, u32>(0)).map_err(&failed)?;
     Ok(Tail { last_command_id, closed: ends > 0, ..tail })
 }
 
-/// Returns the intents without an outcome, in order. The records themselves are read, and no index, which nobody proves.
+/// Returns the intents without an outcome, in order. Reads the records themselves and not the index, because the hash
+/// chain does not protect the index.
 pub(super) fn open_intents(connection: &Connection, folder: &Path) -> Result<Vec<Record>, JournalError> {
     let failed = JournalError::database(folder);
     let sql = "SELECT seq, command_id, kind = 'intent' FROM record NOT INDEXED

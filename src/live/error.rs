@@ -1,4 +1,4 @@
-//! Why live values cannot be told as the plant file says, with the remedy.
+//! Errors of publishing live values as the plant file configures it, with the remedy.
 
 use std::io;
 use std::net::SocketAddr;
@@ -8,7 +8,7 @@ use regrind_formats::FormatError;
 use regrind_trust::TrustError;
 use thiserror::Error;
 
-/// Why live values cannot be told as the plant file says.
+/// Reason why live values cannot be published as the plant file configures it.
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the messages tell them")]
 #[non_exhaustive]

@@ -1,27 +1,27 @@
-//! What there is to tell of a cell, one by one: what it is called, of what kind it is, and in which unit. All who tell it tell the same.
+//! Figures of a cell that are published: name, kind and unit of each. All publishers use the same list.
 //!
-//! What nobody knows has no value: neither 0 nor an empty text stands for it.
+//! An unknown figure has no value: neither 0 nor an empty text.
 
 use regrind_control::{CycleRow, JobProgress};
 
 use crate::packml::{PRODUCTION, SIMULATION, state_number};
 use crate::told::{Now, Told};
 
-/// Something that is told of a cell.
+/// Figure that is published.
 #[derive(Clone, Copy, Debug)]
 pub struct Figure {
-    /// What it is called: a path of words, by `/`. Where PackML has a tag for it, it is that.
+    /// Name: a path of words separated by `/`. If PackML has a tag for the figure, the name is that tag.
     pub name: &'static str,
-    /// Of what kind its values are.
+    /// Kind of the values.
     pub kind: FigureKind,
-    /// Their unit.
+    /// Unit of the values.
     pub unit: Option<&'static str>,
-    /// What it is, for people.
+    /// Description, for people.
     pub about: &'static str,
     of: fn(&Told) -> Option<FigureValue>,
 }
 
-/// Of what kind the values of a figure are.
+/// Kind of the values of a figure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[expect(missing_docs, reason = "named for what they are")]
 pub enum FigureKind {
@@ -31,7 +31,7 @@ pub enum FigureKind {
     Text,
 }
 
-/// What is known of a figure.
+/// Value of a figure.
 #[derive(Clone, Debug, PartialEq)]
 #[expect(missing_docs, reason = "named for what they are")]
 pub enum FigureValue {
@@ -42,7 +42,7 @@ pub enum FigureValue {
 }
 
 impl Figure {
-    /// Returns what is known of it; none where nobody knows.
+    /// Returns the value of the figure; `None` if it is unknown.
     pub fn of(&self, told: &Told) -> Option<FigureValue> {
         (self.of)(told).filter(|value| !matches!(value, FigureValue::Number(number) if !number.is_finite()))
     }
@@ -69,7 +69,7 @@ const fn text(name: &'static str, about: &'static str, of: fn(&Told) -> Option<F
     Figure { name, kind: FigureKind::Text, unit: None, about, of }
 }
 
-/// All there is to tell of a cell.
+/// All published figures of a cell.
 pub const FIGURES: &[Figure] = &[
     whole("Status/StateCurrent", "Number of the state by PackML; 4 (Idle) where no run is on", |told| {
         match &told.now {

@@ -1,4 +1,5 @@
-//! The live values of a cell, for whoever speaks Sparkplug B or OPC UA. Both look and never order: a command is refused, and said so.
+//! Live values of a cell for clients of Sparkplug B or OPC UA. Both interfaces are read-only: a command is refused and
+//! reported.
 //!
 //! ```text
 //!  Snapshot --> Told --> FIGURES --> Sparkplug B: births, values that change, deaths --> broker

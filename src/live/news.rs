@@ -1,4 +1,4 @@
-//! What those who tell live values have to say to who began them: who was refused what, and whether anybody is there.
+//! Events from the publishers to the program that started them: refused requests, and whether the peer is connected.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -6,33 +6,33 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use regrind_document::visible;
 use tokio::sync::mpsc;
 
-/// Most news that wait to be heard.
+/// Maximum number of queued events.
 const WAITING: usize = 256;
-/// Longest text of somebody outside that is told.
+/// Maximum length of a reported text from outside, in characters.
 const LONGEST: usize = 200;
 
-/// What happened to those who tell.
+/// Event of a publisher.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[expect(missing_docs, reason = "named for what they are")]
 pub enum News {
-    /// Somebody is told from now on.
+    /// The publisher is connected from now on.
     Tells { place: String },
-    /// Nobody is told for now; it is tried again.
+    /// The publisher is not connected; it retries.
     Waits { place: String, why: String },
-    /// Somebody wanted something that is not theirs to do here.
+    /// A client requested something that it may not do here.
     Refused { by: String, what: String },
-    /// So much more was refused than could be heard.
+    /// This many more refusals did not fit in the queue.
     RefusedMore { times: u32 },
 }
 
-/// Where news go. They never wait: what nobody hears is counted.
+/// Sender of events. It never blocks: events that do not fit in the queue are counted.
 #[derive(Clone, Debug)]
 pub struct Notes {
     to: mpsc::Sender<News>,
     missed: Arc<AtomicU32>,
 }
 
-/// Returns where news go, and where they come out.
+/// Creates the queue of events; returns its sender and its receiver.
 pub fn notes() -> (Notes, mpsc::Receiver<News>) {
     let (to, heard) = mpsc::channel(WAITING);
     (Notes { to, missed: Arc::default() }, heard)
@@ -40,7 +40,7 @@ pub fn notes() -> (Notes, mpsc::Receiver<News>) {
 
 impl Notes {
     pub(crate) fn tells(&self, place: &str) {
-        // Nobody who listens misses it: the values themselves say so.
+        // A lost event does no harm here: the published values show the same.
         let _ = self.to.try_send(News::Tells { place: place.to_owned() });
     }
 
@@ -59,7 +59,7 @@ impl Notes {
     }
 }
 
-/// The beginning of a text of somebody outside, with nothing in it that is not seen.
+/// Returns the beginning of a text from outside as one line, without invisible characters.
 fn in_a_line(text: &str) -> String {
     let mut line: String = text.chars().take(LONGEST).collect();
     if line.len() < text.len() {

@@ -2,9 +2,9 @@
 
 use regrind_cell::StateName;
 
-/// The mode in which parts are made.
+/// Mode of production.
 pub(crate) const PRODUCTION: u32 = 1;
-/// The mode of a cell with a simulated machine: the first that PackML leaves to whoever builds a machine.
+/// Mode of a cell with a simulated machine: the first number that PackML leaves to the builder of a machine.
 pub(crate) const SIMULATION: u32 = 16;
 
 /// Returns the number of a state.

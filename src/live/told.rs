@@ -1,50 +1,50 @@
-//! What is told of a cell: how it is, and how the last of its runs ended.
+//! Published state of a cell: its present state, and the result of its last run.
 
 use regrind_control::Snapshot;
 
-/// What is told of a cell.
+/// Published state of a cell.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Told {
-    /// How it is.
+    /// Present state.
     pub now: Now,
-    /// The last run that came to its end.
+    /// Last run that ended.
     pub last: Option<Ended>,
 }
 
-/// How a cell is.
+/// Present state of a cell.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub enum Now {
-    /// No run is on.
+    /// There is no active run.
     #[default]
     NoRun,
-    /// A run's program is there and does not answer: what the machines do is not known.
+    /// The program of the run exists but does not answer: the state of the machines is unknown.
     #[expect(missing_docs, reason = "named for what it is")]
     Silent { run: String },
-    /// A run has no end on record, and its program has gone: what the machines do is not known.
+    /// The run has no end on record, and its program is gone: the state of the machines is unknown.
     Gone {
-        /// Its name.
+        /// Name of the run.
         run: String,
-        /// Whether its machines were simulated by that program, and have gone with it.
+        /// True if that program simulated its machines, so that they are gone too.
         machines_within: bool,
     },
-    /// A run is on.
+    /// A run is active.
     #[expect(missing_docs, reason = "named for what they are")]
     On { run: String, snapshot: Box<Snapshot> },
 }
 
-/// A run that came to its end.
+/// Run that ended.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Ended {
-    /// What it is called.
+    /// Name of the run.
     pub run: String,
-    /// How it ended, for people.
+    /// Result, in words for people.
     pub verdict: String,
-    /// Whether the part is accepted.
+    /// True if the part is accepted.
     pub accepted: bool,
 }
 
 impl Told {
-    /// Returns the run that is on, does not answer, or whose program has gone.
+    /// Returns the name of the run that is active, does not answer, or whose program is gone.
     pub(crate) fn run(&self) -> Option<&str> {
         match &self.now {
             Now::NoRun => None,
@@ -52,7 +52,7 @@ impl Told {
         }
     }
 
-    /// Returns how the run is that is on.
+    /// Returns the snapshot of the active run.
     pub(crate) fn snapshot(&self) -> Option<&Snapshot> {
         match &self.now {
             Now::On { snapshot, .. } => Some(snapshot),

@@ -1,4 +1,4 @@
-//! Whose turn it is to tell a cell: two that tell the same one would push each other off the broker.
+//! Lock of the publisher of a cell: two publishers of the same cell would disconnect each other from the broker.
 
 use std::path::{Path, PathBuf};
 
@@ -6,7 +6,7 @@ use regrind_formats::{KeptNumber, ResultFolder};
 
 use crate::error::LiveError;
 
-/// The turn of one program to tell a cell, until this is dropped. Another one waits for it.
+/// Lock of one publisher, held until this is dropped. Another publisher waits for it.
 #[derive(Debug)]
 pub struct Turn {
     folder: PathBuf,
@@ -14,23 +14,24 @@ pub struct Turn {
 }
 
 impl Turn {
-    /// Takes the turn in a folder, which is made where it is not there; none where another program has it.
+    /// Takes the lock in a folder, which is created if it does not exist. Returns `None` if another program has the
+    /// lock.
     ///
     /// # Errors
-    /// A folder that cannot be made or written.
+    /// The folder cannot be created or written.
     pub fn take(folder: &Path) -> Result<Option<Self>, LiveError> {
         ResultFolder::prepare(folder)?.keep();
         let held = KeptNumber::take(&folder.join("turn")).map_err(unwritable(folder))?;
         Ok(held.map(|held| Self { folder: folder.to_owned(), _held: held }))
     }
 
-    /// Returns the folder in which those who tell keep what outlives them.
+    /// Returns the folder for the persistent state of publishers.
     pub(crate) fn folder(&self) -> &Path {
         &self.folder
     }
 }
 
-/// The number of each connection to a broker (bdSeq), by which a host tells which birth a death belongs to.
+/// Counter of the connections to a broker (bdSeq). A host uses it to match a death to its birth.
 #[derive(Debug)]
 pub(crate) struct Births {
     kept: KeptNumber,
@@ -40,12 +41,12 @@ pub(crate) struct Births {
 impl Births {
     pub(crate) fn of(turn: &Turn) -> Result<Self, LiveError> {
         let kept = KeptNumber::take(&turn.folder.join("births")).map_err(unwritable(&turn.folder))?;
-        // Whoever has the turn has them too.
+        // Only the holder of the lock uses the counter, so it must be free.
         let kept = kept.ok_or_else(|| unwritable(&turn.folder)(std::io::ErrorKind::WouldBlock.into()))?;
         Ok(Self { kept, folder: turn.folder.clone() })
     }
 
-    /// Takes the next number, which is on disk before it is used; 0 follows 255.
+    /// Returns the next number, after it is on disk; 0 follows 255.
     pub(crate) fn next(&mut self) -> Result<u8, LiveError> {
         let unwritable = unwritable(&self.folder);
         let before = self.kept.get().map_err(&unwritable)?;

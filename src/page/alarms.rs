@@ -1,4 +1,4 @@
-//! The alarms of a cell in the languages of the page. The values of a case stay in the words of the cell.
+//! Alarms of a cell in the languages of the page. The values of an alarm stay in the wording of the cell.
 
 use std::borrow::Cow;
 
@@ -6,17 +6,17 @@ use regrind_cell::{Alarm, AlarmId};
 
 use super::texts::Language;
 
-/// What an alarm says in one language.
+/// Texts of an alarm in one language.
 pub(crate) struct Said<'a> {
-    /// What happened, with the values of this case.
+    /// Cause of the alarm, with its values.
     pub(crate) what: Cow<'a, str>,
-    /// What follows from it.
+    /// Consequence of the alarm.
     pub(crate) consequence: &'a str,
-    /// What to do, in this order.
+    /// Remedy, as steps in this order.
     pub(crate) remedy: Vec<&'a str>,
 }
 
-/// Says an alarm in a language.
+/// Returns the texts of an alarm in a language.
 pub(crate) fn said(alarm: &Alarm, language: Language) -> Said<'_> {
     let Some((head, consequence, remedy)) = translated(alarm.id, language) else {
         let remedy = alarm.remedy.iter().map(String::as_str).collect();
@@ -28,7 +28,7 @@ pub(crate) fn said(alarm: &Alarm, language: Language) -> Said<'_> {
 
 type Entry = (&'static str, &'static str, &'static [&'static str]);
 
-/// What happened in general, what follows and what to do; none in the language of the catalogue itself.
+/// Returns the general cause, the consequence and the remedy; `None` in the language of the catalogue itself.
 fn translated(id: AlarmId, language: Language) -> Option<Entry> {
     match language {
         Language::En => None,

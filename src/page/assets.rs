@@ -1,4 +1,4 @@
-//! What a browser needs besides the pages, out of the program itself.
+//! Assets that a browser needs in addition to the pages. They are part of the program.
 
 use axum::extract::Path;
 use axum::http::StatusCode;
@@ -17,7 +17,7 @@ const ASSETS: [(&str, &str, &str); 7] = [
 
 pub(crate) async fn asset(Path(name): Path<String>) -> Response {
     match ASSETS.iter().find(|(known, ..)| *known == name) {
-        // Another version of the program has other assets at the same address.
+        // Another version of the program has different assets at the same address, so a browser must revalidate them.
         Some((_, kind, text)) => ([(CONTENT_TYPE, *kind), (CACHE_CONTROL, "no-cache")], *text).into_response(),
         None => StatusCode::NOT_FOUND.into_response(),
     }

@@ -1,4 +1,5 @@
-//! How PV and RMS come down from cycle to cycle, with their limits, their uncertainty, and where the next one would come.
+//! Convergence of PV and RMS from cycle to cycle, with their limits, their uncertainty and the forecast for the next
+//! cycle.
 
 use maud::{Markup, html};
 use regrind_cell::Tolerance;
@@ -19,7 +20,7 @@ struct Line {
     class: &'static str,
     points: Vec<(u32, f64, f64)>,
     limit_um: f64,
-    /// What the next cycle is expected to come to.
+    /// Forecast for the next cycle: its number and the expected value.
     forecast: Option<(u32, f64)>,
 }
 
@@ -41,7 +42,7 @@ impl Line {
     }
 }
 
-/// Draws it; nothing where nothing is measured.
+/// Draws the chart; empty if nothing was measured.
 pub(crate) fn chart(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, ahead: bool, language: Language) -> Markup {
     let lines = [
         Line::of(["PV", "pv"], 0, cycles, tolerance.map(|tolerance| tolerance.pv_mm), ahead),
@@ -99,7 +100,7 @@ fn drawn(line: &Line, scale: &Scale, language: Language) -> Markup {
     }
 }
 
-/// What somebody hears who does not see it.
+/// Returns the text of the chart for a screen reader.
 fn words(lines: &[Line], language: Language) -> String {
     let of = |line: &Line| {
         let points =
@@ -109,7 +110,7 @@ fn words(lines: &[Line], language: Language) -> String {
     lines.iter().map(of).collect::<Vec<_>>().join("; ")
 }
 
-/// Cycles along, micrometres upwards by their logarithm.
+/// Scale of the chart: cycles to the right, micrometres upwards on a logarithmic axis.
 struct Scale {
     first: u32,
     last: u32,
@@ -118,7 +119,7 @@ struct Scale {
 }
 
 impl Scale {
-    /// The scale on which all of some lines can be seen; none where there is nothing to see.
+    /// Returns the scale on which all lines are visible; `None` if there is nothing to show.
     fn of(lines: &[Line]) -> Option<Self> {
         let all = || lines.iter().flat_map(|line| &line.points);
         let first = all().map(|(cycle, ..)| *cycle).min()?;
@@ -143,7 +144,7 @@ impl Scale {
         HEIGHT - BOTTOM - share.clamp(0.0, 1.0) * (HEIGHT - TOP - BOTTOM)
     }
 
-    /// 1, 2 and 5 of every decade, or the decades alone where those would crowd.
+    /// Returns ticks at 1, 2 and 5 of each decade, or only at the decades if the others would be too dense.
     fn ticks(&self) -> Vec<f64> {
         let (from, to) = (self.low.log10().floor() as i32, self.high.log10().ceil() as i32);
         let steps: &[f64] = if to - from > 3 { &[1.0] } else { &[1.0, 2.0, 5.0] };

@@ -1,4 +1,4 @@
-//! The door of a page: what stands behind it is for who is let in, over TLS or on this computer, one connection at a time.
+//! Access to a page: serves its routes to authorised clients, over TLS or on this computer, with limits on connections.
 
 use std::io;
 use std::net::IpAddr;
@@ -26,51 +26,52 @@ use super::sign_in::place;
 use super::view::{self, PageOf};
 use super::{assets, sign_in};
 
-/// Most connections at a time of those who are let in, of those who are not yet, and of the latter from one address.
+/// Maximum number of simultaneous connections: of authorised clients, of clients that are not yet authorised, and of
+/// the latter from one address.
 const KNOWN: usize = 512;
 const STRANGERS: usize = 384;
 const STRANGERS_OF_ADDRESS: usize = 64;
-/// The longest a client may take to say what it wants, and the longest until the answer to an order begins, for its body and for a cell that does
-/// not answer at once.
+/// Timeout for a client to send its request, and timeout until the answer to an order begins. The second one covers the
+/// body of the order and a cell that does not answer at once.
 const PATIENCE: Duration = Duration::from_secs(10);
 const ANSWERS_WITHIN: Duration = Duration::from_secs(25);
-/// Longest body of an order.
+/// Maximum length of the body of an order, in bytes.
 const LONGEST_BODY: usize = 4096;
 
-/// The door of a page that gives no orders to a cell.
+/// Access to a page that gives no orders to a cell.
 pub struct Door {
     guard: Arc<Guard>,
 }
 
 impl Door {
-    /// Makes ready to let people in to a page. `log` takes what was refused, and who signed in.
+    /// Prepares access to a page. `log` gets the refusals and the sign-ins.
     ///
     /// # Errors
-    /// No random numbers for the key.
+    /// Fails if no random numbers are available for the key.
     pub fn new(entrance: Entrance, of: PageOf, log: Box<dyn Fn(&str) + Send + Sync>) -> io::Result<Self> {
-        // It belongs to no run: what is refused is told, and stands nowhere else.
+        // The page belongs to no run, so refusals go to the log only.
         Ok(Self { guard: Arc::new(Guard::new(entrance, of, log, Box::new(drop))?) })
     }
 
-    /// Returns the address that opens the page, with its key where there are no users.
+    /// Returns the address that opens the page. It contains the key if there are no users.
     pub fn url(&self) -> String {
         self.guard.url()
     }
 
-    /// Shows what the routes show to whoever is let in, for as long as it is polled.
+    /// Serves the routes to authorised clients as long as the future is polled.
     pub async fn serve(self, listener: TcpListener, routes: Router) {
         serve(listener, self.guard, routes).await;
     }
 }
 
-/// Shows what stands behind a guard to whoever comes, for as long as it is polled.
+/// Serves the routes with the guard in front of them, as long as the future is polled.
 pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Router) {
     let tls = guard.entrance.tls.clone();
     let service = TowerToHyperService::new(guarded(guard, routes));
     let connections = Arc::new(Connections::default());
     for number in 0.. {
         let Ok((stream, peer)) = listener.accept().await else {
-            // No descriptor is left, or the client has gone: that passes.
+            // No file descriptor is free, or the client has gone. Both are temporary.
             tokio::time::sleep(Duration::from_millis(50)).await;
             continue;
         };
@@ -81,11 +82,11 @@ pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Rout
         let (is_listed, listed) = oneshot::channel::<()>();
         let serving = tokio::spawn(async move {
             let _place = place;
-            // A connection that ends, or is let in, is on the list by then.
+            // Wait until the connection is on the list, so that it can be found there when it ends or is authorised.
             if listed.await.is_err() {
                 return;
             }
-            // A client that goes away or misbehaves is no concern of anybody else.
+            // An error of one client must not affect the others.
             match tls {
                 None => answer(stream, Peer(peer.ip(), is_known), service).await,
                 Some(tls) => {
@@ -96,19 +97,22 @@ pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Rout
             }
         });
         connections.open().add(number, of, serving.abort_handle());
-        // It may have ended with the program.
+        // The receiver may have ended with the program.
         let _ = is_listed.send(());
     }
 }
 
-/// The connections of a page. One more than there is room for of those who are not let in ends the oldest of them, of the same address or network, or of
-/// that which has most: whoever opens many and says nothing keeps out nobody elsewhere, and nobody who has come in.
+/// Connections of a page.
+///
+/// If the limit for clients that are not yet authorised is reached, a new connection ends the oldest of
+/// them: of the same address or network, or of the address that has most. A client that opens many idle connections
+/// therefore locks out no client elsewhere and no authorised client.
 #[derive(Default)]
 struct Connections(Mutex<Open>);
 
 #[derive(Default)]
 struct Open {
-    /// In the order in which they came, those of strangers.
+    /// Connections of clients that are not yet authorised, in the order in which they came.
     strangers: Vec<(u64, IpAddr, AbortHandle)>,
     known: Vec<(u64, AbortHandle)>,
 }
@@ -118,7 +122,7 @@ impl Connections {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whoever is at the other end has been let in.
+    /// Marks the client of a connection as authorised.
     fn know(&self, number: u64) {
         let mut open = self.open();
         if let Some(at) = open.strangers.iter().position(|(of, ..)| *of == number) {
@@ -155,7 +159,7 @@ impl Open {
     }
 }
 
-/// A connection, until it ends.
+/// Connection in the list, until it ends.
 struct Place {
     connections: Arc<Connections>,
     number: u64,
@@ -167,7 +171,7 @@ impl Drop for Place {
     }
 }
 
-/// Answers what comes over one connection.
+/// Answers the requests of one connection.
 async fn answer(
     stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
     peer: Peer,
@@ -182,7 +186,7 @@ async fn answer(
     drop(http.serve_connection(TokioIo::new(stream), service).await);
 }
 
-/// Puts the guard before some routes, and beside them what is for everybody.
+/// Puts the guard in front of the routes, and adds the routes that are open to everybody.
 fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
     let own = Router::new()
         .route("/token", get(guard::token))
@@ -198,15 +202,15 @@ fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
         .layer(from_fn(in_time))
 }
 
-/// Gives up an order whose answer does not begin in time, be it that its body does not come.
+/// Ends an order whose answer does not begin before the timeout, for example because its body does not arrive.
 async fn in_time(request: Request, next: Next) -> Response {
-    // A request that only looks has no body that could stay away, and a proof of a large record takes its time.
+    // A request that only reads has no body to wait for, and the verification of a large record takes time.
     if request.method().is_safe() {
         return next.run(request).await;
     }
     match tokio::time::timeout(ANSWERS_WITHIN, next.run(request)).await {
         Ok(response) => response,
-        // The connection has half a request on it, and is of no more use.
+        // The connection contains half a request, so it cannot be used again.
         Err(_) => (StatusCode::REQUEST_TIMEOUT, [(CONNECTION, "close")]).into_response(),
     }
 }

@@ -1,9 +1,10 @@
-//! Who is let in: whoever has the key, or has signed in where there are users; under a name of this page; and with orders only from
-//! the page itself.
+//! Access control: a client needs the key, or must sign in if there are users. It must use a name of this page, and
+//! orders must come from the page itself.
 //!
-//! A page on the loopback address is open to every program of the computer, and to every page in every browser on it. So the address
-//! that opens it carries a key, which becomes a cookie; a request must name this page as its host (a foreign name that leads here is
-//! refused); and an order must come from this page by its `Origin` and carry a token that was fetched for it and is good once.
+//! Every program on the computer, and every page in every browser on it, can reach a page on the loopback address. The
+//! address that opens the page therefore contains a key, which becomes a cookie. A request must name this page as its
+//! host, so a foreign name that leads here is refused. An order must come from this page by its `Origin`, and it must
+//! carry a token that was fetched for it and that is valid once.
 
 use std::collections::VecDeque;
 use std::io;
@@ -27,35 +28,35 @@ use super::tls::Tls;
 use super::users::{Person, UsersFile};
 use super::view::{self, PageOf};
 
-/// The cookies of a page, by its port: a browser keeps one set for all pages of a computer.
+/// Cookies of a page; the port is part of their names, because a browser keeps one set for all pages of a computer.
 const KEY_COOKIE: &str = "regrind_key";
 const SESSION_COOKIE: &str = "regrind_session";
-/// The header in which an order carries its token.
+/// Header that carries the token of an order.
 const TOKEN: &str = "x-regrind-token";
-/// How long a token waits for its order, and how many wait at most.
+/// Lifetime of a token, and maximum number of tokens without an order.
 const TOKEN_LASTS: Duration = Duration::from_secs(30);
 const TOKENS: usize = 1024;
 
-/// Wrong keys within a minute that are answered as such; to more it is said that there are too many.
+/// Maximum number of wrong keys within a minute. For further ones, the answer is that there are too many.
 const WRONG_KEYS: u32 = 20;
-/// Refusals that are told within a minute; more are counted.
+/// Maximum number of refusals that are logged within a minute. Further ones are only counted.
 const TOLD: u32 = 10;
 const MINUTE: Duration = Duration::from_secs(60);
 
-/// The names of this computer for itself.
+/// Names of the loopback address.
 const IS_LOOPBACK: [&str; 3] = ["localhost", "127.0.0.1", "[::1]"];
 
-/// What a page of this program may do in a browser: nothing from elsewhere, nothing within others.
+/// Content security policy of a page: nothing from elsewhere, and no framing by other pages.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; \
                       form-action 'self'; frame-ancestors 'none'; base-uri 'none'";
 
-/// Where a page is open, and to whom.
+/// Address of a page and its access rules.
 pub struct Entrance {
-    /// Where it listens.
+    /// Address that the page listens on.
     pub address: SocketAddr,
-    /// Its certificate; none on the loopback address alone.
+    /// Certificate; `None` only on the loopback address.
     pub tls: Option<Tls>,
-    /// Who may sign in; without users, who has the key.
+    /// Users who can sign in. Without users, access needs the key.
     pub users: Option<UsersFile>,
 }
 
@@ -64,15 +65,15 @@ impl Entrance {
         if self.tls.is_some() { "https" } else { "http" }
     }
 
-    /// Whether a request names this page as its host.
+    /// Returns true if a request names this page as its host.
     fn is_host(&self, named: &str) -> bool {
         let port = self.address.port();
         let (host, at) = match named.rsplit_once(':') {
-            // A sign before it would be read as a number too.
+            // The number parser would accept a sign, so only digits are allowed.
             Some((host, at)) if !at.ends_with(']') => {
                 (host, at.parse().ok().filter(|_| at.bytes().all(|byte| byte.is_ascii_digit())))
             }
-            // What browsers leave out.
+            // Browsers omit the default port.
             _ => (named, Some(if self.tls.is_some() { 443 } else { 80 })),
         };
         let is_loopback = IS_LOOPBACK.iter().any(|name| name.eq_ignore_ascii_case(host));
@@ -83,7 +84,7 @@ impl Entrance {
         is_here && at == Some(port)
     }
 
-    /// The address by which a browser opens the page.
+    /// Returns the address with which a browser opens the page.
     fn base(&self) -> String {
         let name = self.tls.as_ref().and_then(Tls::name);
         let at = name.map_or(self.address.to_string(), |name| format!("{name}:{}", self.address.port()));
@@ -98,19 +99,19 @@ pub(crate) struct Guard {
     key: String,
     wrong: Mutex<Rate>,
     refusals: Mutex<Rate>,
-    /// Tokens that no order came with yet: for which browser, and since when.
+    /// Tokens without an order: the browser, the token and its time.
     tokens: Mutex<VecDeque<(String, String, Instant)>>,
-    /// The browser that has control.
+    /// Browser that has control.
     holder: Mutex<Option<String>>,
     log: Box<Told>,
-    /// Has something on record wherever it belongs.
+    /// Function that writes a message to the record of the runs concerned.
     on_record: Box<dyn Fn(String) + Send + Sync>,
 }
 
-/// Takes what nobody else would keep.
+/// Function that logs messages that are recorded nowhere else.
 pub(crate) type Told = dyn Fn(&str) + Send + Sync;
 
-/// How often something happened within a minute.
+/// Number of occurrences of an event within a minute.
 pub(crate) struct Rate {
     began: Instant,
     count: u32,
@@ -125,12 +126,12 @@ impl Rate {
         self.began.elapsed() > MINUTE
     }
 
-    /// How long ago the minute began.
+    /// Returns the time since the minute began.
     pub(crate) fn age(&self) -> Duration {
         self.began.elapsed()
     }
 
-    /// How often it has happened since the minute began.
+    /// Returns the number of occurrences since the minute began.
     pub(crate) fn so_far(&self) -> u32 {
         self.count
     }
@@ -170,7 +171,7 @@ impl Guard {
         if self.entrance.users.is_some() { base } else { format!("{base}?key={}", self.key) }
     }
 
-    /// The cookie of that name that is this page's.
+    /// Returns the cookie of this page with that name.
     fn cookie<'h>(&self, headers: &'h HeaderMap, name: &str) -> Option<&'h str> {
         let name = self.cookie_name(name);
         let pairs = text(headers, COOKIE)?.split(';').filter_map(|pair| pair.trim().split_once('='));
@@ -181,7 +182,7 @@ impl Guard {
         format!("{name}_{}", self.entrance.address.port())
     }
 
-    /// Has a browser keep a cookie, for this page alone.
+    /// Sets a cookie for this page only.
     fn set_cookie(&self, headers: &mut HeaderMap, name: &str, value: &str) {
         let secure = if self.entrance.tls.is_some() { "; Secure" } else { "" };
         let ends = if value.is_empty() { "; Max-Age=0" } else { "" };
@@ -191,13 +192,13 @@ impl Guard {
         }
     }
 
-    /// Has a browser keep the session in which somebody signed in; an empty one ends it.
+    /// Sets the session cookie of a signed-in user. An empty session deletes it.
     pub(crate) fn set_session(&self, response: &mut Response, session: &str) {
         self.set_cookie(response.headers_mut(), SESSION_COOKIE, session);
     }
 
-    /// Whether a key is right; none where it is one wrong one of many. The right one is let in however many wrong ones come: nobody
-    /// finds it by trying, and nobody shall keep an operator out.
+    /// Returns true if a key is correct, and `None` if it is one of too many wrong keys. A correct key is always
+    /// accepted: it cannot be found by guessing, and wrong guesses of others must not lock out an operator.
     fn is_key(&self, key: &str) -> Option<bool> {
         if same(key, &self.key) {
             return Some(true);
@@ -206,7 +207,7 @@ impl Guard {
         (wrong <= WRONG_KEYS).then_some(false)
     }
 
-    /// Makes the token of the next order of a browser.
+    /// Creates the token for the next order of a browser.
     fn give_token(&self, session: &Session) -> io::Result<String> {
         let token = random_word()?;
         let mut tokens = self.tokens.lock().unwrap_or_else(PoisonError::into_inner);
@@ -217,8 +218,8 @@ impl Guard {
         Ok(token)
     }
 
-    /// Whether a token was given to this browser, not long ago, and no order came with it yet. It is good once: an order that
-    /// somebody else has seen and sends again has none.
+    /// Returns true if the token was given to this browser, has not expired and was not used. A token is valid once, so
+    /// an order that an attacker recorded and sends again is refused.
     fn takes_token(&self, session: &Session, token: &str) -> bool {
         let mut tokens = self.tokens.lock().unwrap_or_else(PoisonError::into_inner);
         let found = tokens
@@ -227,14 +228,14 @@ impl Guard {
         found.and_then(|at| tokens.remove(at)).is_some()
     }
 
-    /// Whether who sits at a browser is still let in.
+    /// Returns true if the person at a browser still has access.
     pub(crate) fn lets(&self, session: &Session) -> bool {
         let person = |users| self.signed_in.person(&session.id, users);
         self.entrance.users.as_ref().is_none_or(|users| person(users) == session.person)
     }
 
-    /// Tells that something was refused, to who keeps it; returns whether it should be on record too. Of many within a minute the first are told, and
-    /// all are counted.
+    /// Logs a refusal. Returns true if it should also be on record. Within a minute only the first refusals are
+    /// logged one by one; all are counted.
     pub(crate) fn refused(&self, what: &str) -> bool {
         let (told, untold) = {
             let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
@@ -252,24 +253,25 @@ impl Guard {
         told <= TOLD
     }
 
-    /// Tells who keeps it that somebody came in.
+    /// Logs a successful sign-in.
     pub(crate) fn tell(&self, what: &str) {
         (self.log)(what);
     }
 
-    /// Has it told and on record that something was refused.
+    /// Logs a refusal and puts it on record.
     pub(crate) fn record_refusal(&self, what: &str) {
         if self.refused(what) {
             self.record(format!("the page refused {what}"));
         }
     }
 
-    /// Has something on record.
+    /// Puts a message on record.
     pub(crate) fn record(&self, what: String) {
         (self.on_record)(what);
     }
 
-    /// Whether a browser has control; one that nobody else has is taken by who asks.
+    /// Returns true if a browser has control, or if no browser has it. In the second case, the browser gets control if
+    /// `asks` is true.
     pub(crate) fn has_control(&self, session: &Session, asks: bool) -> bool {
         let mut holder = self.holder.lock().unwrap_or_else(PoisonError::into_inner);
         match &*holder {
@@ -287,18 +289,18 @@ impl Guard {
         *self.holder.lock().unwrap_or_else(PoisonError::into_inner) = Some(session.id.clone());
     }
 
-    /// Takes control from a browser that has signed out: the next one that asks has it.
+    /// Releases the control of a browser that has signed out. The next browser that asks gets it.
     pub(crate) fn leave_control(&self, session: &Session) {
         let mut holder = self.holder.lock().unwrap_or_else(PoisonError::into_inner);
         holder.take_if(|holder| *holder == session.id);
     }
 }
 
-/// Where a request came from, and what is to be told of its connection once it is let in.
+/// Address of the client of a request, and function to call when the client is authorised.
 #[derive(Clone)]
 pub(crate) struct Peer(pub(crate) IpAddr, pub(crate) Arc<dyn Fn() + Send + Sync>);
 
-/// The browser that a request comes from, and who sits at it where people sign in. Whatever is let in has one.
+/// Browser that a request comes from, and the person at it if users sign in. Each authorised request has a session.
 #[derive(Clone, Debug)]
 pub struct Session {
     pub(crate) id: String,
@@ -307,18 +309,19 @@ pub struct Session {
 }
 
 impl Session {
-    /// Whether an order of that name is for who sits at it. Who has the key of the page is the user of the operating system that
-    /// serves it.
+    /// Returns true if the person at the browser can give the order with that name. A client with the key of the page
+    /// acts for the operating-system user that serves the page, and can give all orders.
     pub(crate) fn may(&self, order: &str) -> bool {
         self.person.as_ref().is_none_or(|person| person.role.may(order))
     }
 }
 
-/// Refuses a request that names another page than this one, and puts on every answer what a browser may make of it.
+/// Refuses a request for another host, and adds the security headers to each response.
 pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
     let mut hosts = request.headers().get_all(HOST).iter();
     let host = hosts.next().and_then(|host| host.to_str().ok()).unwrap_or_default();
-    // Such a header holds for all ports of a name: other pages of this computer go without.
+    // Strict-Transport-Security applies to all ports of a name. It is omitted on loopback, for other pages of this
+    // computer.
     let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
     let is_loopback = IS_LOOPBACK.iter().any(|known| known.eq_ignore_ascii_case(name));
     let mut response = if hosts.next().is_none() && guard.entrance.is_host(host) {
@@ -331,9 +334,9 @@ pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Re
     let policy = HeaderName::from_static("content-security-policy");
     headers.entry(policy).or_insert(HeaderValue::from_static(POLICY));
     headers.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-    // Without any, a form would be sent as from nowhere.
+    // Without a referrer a form would have the origin `null`.
     headers.insert(REFERRER_POLICY, HeaderValue::from_static("same-origin"));
-    // What stands there now is of no use later, and who uses the computer next has no business with it.
+    // The content is soon out of date, and the next user of the computer must not see it.
     headers.entry(CACHE_CONTROL).or_insert(HeaderValue::from_static("no-store"));
     if guard.entrance.tls.is_some() && !is_loopback {
         headers.insert(STRICT_TRANSPORT_SECURITY, HeaderValue::from_static("max-age=31536000"));
@@ -341,7 +344,7 @@ pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Re
     response
 }
 
-/// Lets in who has the key or has signed in, and turns a key in the address into a cookie.
+/// Lets in a client that has the key or has signed in, and converts a key in the address to a cookie.
 pub(crate) async fn let_in(
     State(guard): State<Arc<Guard>>,
     Extension(Peer(from, is_known)): Extension<Peer>,
@@ -370,7 +373,7 @@ pub(crate) async fn let_in(
     next.run(request).await
 }
 
-/// Gives the page the token of its next order.
+/// Returns the token for the next order of the page.
 pub(crate) async fn token(State(guard): State<Arc<Guard>>, Extension(session): Extension<Session>) -> Response {
     match guard.give_token(&session) {
         Ok(token) => ([(CACHE_CONTROL, "no-store")], token).into_response(),
@@ -378,7 +381,7 @@ pub(crate) async fn token(State(guard): State<Arc<Guard>>, Extension(session): E
     }
 }
 
-/// Why a request that changes something is refused before anybody looks at it; none where it comes from this page.
+/// Returns the reason to refuse a request that changes something; `None` if it comes from this page.
 pub(crate) fn foreign_origin(guard: &Guard, headers: &HeaderMap) -> Option<String> {
     let origin = text(headers, ORIGIN).unwrap_or_default();
     let host = origin.strip_prefix(guard.entrance.scheme()).and_then(|rest| rest.strip_prefix("://"));
@@ -386,7 +389,7 @@ pub(crate) fn foreign_origin(guard: &Guard, headers: &HeaderMap) -> Option<Strin
         .then(|| format!("an order from the origin {}", printable(origin)))
 }
 
-/// Why an order is refused before anybody looks at it; none where it comes from this page, for the first time.
+/// Returns the reason to refuse an order; `None` if it comes from this page and its token is used for the first time.
 pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> Option<String> {
     foreign_origin(guard, headers).or_else(|| {
         let token = text(headers, HeaderName::from_static(TOKEN)).unwrap_or_default();
@@ -395,7 +398,7 @@ pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> 
     })
 }
 
-/// Gives a browser the key to keep, and a name; one that has a name goes by it in all its tabs.
+/// Sends the key cookie and a session name to a browser. A browser with a session keeps it in all its tabs.
 fn welcome(guard: &Guard, request: &Request) -> Response {
     let headers = request.headers();
     let is_known = guard.cookie(headers, KEY_COOKIE).is_some_and(|key| same(key, &guard.key));
@@ -439,12 +442,12 @@ pub(crate) fn text(headers: &HeaderMap, name: HeaderName) -> Option<&str> {
     headers.get(name)?.to_str().ok()
 }
 
-/// What a stranger sent, for a line of a log.
+/// Returns text from an unknown client in a form that is safe for a line of a log.
 pub(crate) fn printable(text: &str) -> String {
     text.chars().take(80).map(|c| if c.is_ascii_graphic() { c } else { '?' }).collect()
 }
 
-/// Compares two secrets without telling by the time it takes how much of them is alike.
+/// Compares two secrets, so that the time does not reveal how much of them is equal.
 fn same(one: &str, other: &str) -> bool {
     Sha256::digest(one) == Sha256::digest(other)
 }

@@ -1,4 +1,4 @@
-//! The runs in a folder, as a list shows them. What was read of a run is kept until its record changes.
+//! List of the runs in a folder. The summary of a run is cached until its record changes.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -8,7 +8,7 @@ use std::time::SystemTime;
 use regrind_control::is_live;
 use regrind_report::{RunSummary, run_summary};
 
-/// The files that change with a record, and when they did last, with their lengths.
+/// Time of the last change and length of each file that changes with a record.
 type Stamp = [Option<(SystemTime, u64)>; 2];
 
 pub(crate) struct History {
@@ -16,10 +16,10 @@ pub(crate) struct History {
     read: Mutex<HashMap<PathBuf, (Stamp, Arc<RunSummary>)>>,
 }
 
-/// A run in the list.
+/// Run in the list.
 #[derive(Clone)]
 pub(crate) struct Listed {
-    /// The name of its folder.
+    /// Name of the run folder.
     pub(crate) id: String,
     pub(crate) is_live: bool,
     pub(crate) summary: Arc<RunSummary>,
@@ -30,14 +30,14 @@ impl History {
         Self { runs, read: Mutex::default() }
     }
 
-    /// Returns the folder of a run by its name; none for what is no name of a folder here.
+    /// Returns the folder of a run from its name; `None` if the name is not the name of a folder here.
     pub(crate) fn folder(&self, id: &str) -> Option<PathBuf> {
         let plain = !id.is_empty() && !id.starts_with('.') && !id.contains(['/', '\\', '\0', ':']);
         let folder = self.runs.join(id);
         (plain && folder.join("journal.sqlite").is_file()).then_some(folder)
     }
 
-    /// The folders of the runs that are on. Blocks for the disk.
+    /// Returns the folders of the active runs. Blocks while it reads the disk.
     pub(crate) fn live(&self) -> Vec<PathBuf> {
         self.ids().filter_map(|id| self.folder(&id)).filter(|folder| is_live(folder)).collect()
     }
@@ -47,7 +47,7 @@ impl History {
         folders.filter_map(|entry| entry.file_name().into_string().ok())
     }
 
-    /// Lists the runs, those that are on first, then the newest first. Blocks for the disk.
+    /// Lists the runs: active runs first, then from the newest to the oldest. Blocks while it reads the disk.
     pub(crate) fn list(&self) -> Vec<Listed> {
         let listed = |id: String| {
             let folder = self.folder(&id)?;
@@ -58,7 +58,7 @@ impl History {
         all
     }
 
-    /// Reads what the record of a run tells; none where it cannot be read. Blocks for the disk.
+    /// Reads the summary of a run from its record; `None` if the record cannot be read. Blocks while it reads the disk.
     pub(crate) fn summary(&self, folder: &Path) -> Option<Arc<RunSummary>> {
         let stamp = stamp(folder);
         let kept = |read: &HashMap<PathBuf, (Stamp, Arc<RunSummary>)>| {

@@ -1,14 +1,14 @@
-//! The live page of a cell: one screen for who stands before it, the history of its runs, and orders through the same door as those
-//! of the terminal.
+//! Live page of a cell: one screen for the person at the cell, the history of its runs, and orders through the same
+//! socket as those of the terminal.
 //!
 //! ```text
-//!  run folder: control.sock ==watch==> live ---> Seen --> view (HTML in a person's language) --> stream --> every browser
+//!  run folder: control.sock ==watch==> live ---> Seen --> view (HTML in user's language) --> stream --> every browser
 //!              journal.sqlite --------> history --^        shape (maps and points in bytes) ------------> the canvas
 //!  browser ==POST==> guard (key or user, Host, Origin, token, control) --> orders ==control.sock==> the drive
 //! ```
 //!
-//! The page stands beside the run and never within it: it reads what the run tells and what is on record, and it can die without the
-//! run noticing. Everything that a browser needs is in the program; nothing is fetched from elsewhere.
+//! The page runs independently of the run. It reads the status that the run publishes and the record, and it can crash
+//! without effect on the run. The program contains everything that a browser needs; nothing is fetched from elsewhere.
 
 mod alarms;
 mod assets;
@@ -44,10 +44,10 @@ use guard::Guard;
 use history::History;
 use live::Live;
 
-/// Where the probe is to touch in a run, in the order in which it does: x and y in millimetres, model frame.
+/// Function that returns the planned points of a run in touching order: x and y in millimetres, model frame.
 pub type PlannedPoints = dyn Fn(&Path) -> Option<Vec<[f64; 2]>> + Send + Sync;
 
-/// What the page is made of.
+/// Page of a cell with its state.
 pub struct Page {
     guard: Arc<Guard>,
     live: Live,
@@ -55,14 +55,15 @@ pub struct Page {
     planned: Box<PlannedPoints>,
 }
 
-/// Shared by everything that answers.
+/// State that all request handlers share.
 type Shared = Arc<Page>;
 
 impl Page {
-    /// Makes ready to show the runs in a folder. `planned` tells where the probe is to touch; `log` takes what nobody else would keep.
+    /// Creates the page for the runs in a folder. `planned` returns the planned points. `log` gets messages that are
+    /// recorded nowhere else.
     ///
     /// # Errors
-    /// No random numbers for the key.
+    /// Fails if no random numbers are available for the key.
     pub fn new(
         runs: PathBuf,
         entrance: Entrance,
@@ -77,19 +78,19 @@ impl Page {
         Ok(Self { guard, live, history, planned })
     }
 
-    /// Returns the address that opens the page, with its key where there are no users.
+    /// Returns the address that opens the page. It contains the key if there are no users.
     pub fn url(&self) -> String {
         self.guard.url()
     }
 
-    /// Shows the page to whoever comes, for as long as it is polled.
+    /// Serves the page as long as the future is polled.
     pub async fn serve(self, listener: TcpListener) {
         let guard = Arc::clone(&self.guard);
         door::serve(listener, guard, routes(Arc::new(self))).await;
     }
 }
 
-/// What is there for who is let in.
+/// Returns the routes for clients that are let in.
 fn routes(page: Shared) -> Router {
     Router::new()
         .route("/", get(view::home))

@@ -1,4 +1,4 @@
-//! What is known of each run that somebody looks at: one watcher a run, however many look.
+//! Status of each run that a browser shows: one watcher for each run, independent of the number of browsers.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -12,21 +12,22 @@ use tokio::task::spawn_blocking;
 
 use super::history::History;
 
-/// Between two tries to find the program of a run that does not answer.
+/// Interval between two attempts to connect to the program of a run that does not answer.
 const BETWEEN_TRIES: Duration = Duration::from_secs(1);
 
-/// What is known of a run.
+/// Current knowledge about a run.
 #[derive(Clone, Default)]
 pub(crate) struct Seen {
-    /// What its program told last; none where none was heard.
+    /// Last snapshot from the program of the run; `None` if there was none.
     pub(crate) snapshot: Option<Arc<Snapshot>>,
-    /// Whether that program is there.
+    /// True if the program answers.
     pub(crate) answers: bool,
     pub(crate) summary: Arc<RunSummary>,
 }
 
 impl Seen {
-    /// Whether the run has neither an end on record nor a program that answers: what its machines do is not known.
+    /// Returns true if the run has no end on record and no program that answers. The state of its machines is then
+    /// unknown.
     pub(crate) fn is_lost(&self) -> bool {
         !self.answers && self.summary.ended.is_none()
     }
@@ -42,7 +43,7 @@ impl Live {
         Self { history, watched: Mutex::default() }
     }
 
-    /// Returns what is known of a run, and what becomes known of it.
+    /// Returns a receiver of the current status of a run and of its changes.
     pub(crate) fn look(self: &Live, folder: &Path) -> Receiver<Seen> {
         let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
         watched.retain(|_, seen| seen.receiver_count() > 0);
@@ -56,11 +57,11 @@ impl Live {
     }
 }
 
-/// Watches a run until nobody looks any more.
+/// Watches a run until no browser shows it.
 async fn keep_watching(folder: PathBuf, history: Arc<History>, seen: Sender<Seen>) {
     let watching = async {
         loop {
-            // Whatever ends it, the program may come again: a run is gone on with by another.
+            // After any end of the connection the program can return, because another program can continue the run.
             let _ = follow(&folder, &history, &seen).await;
             let summary = read(&folder, &history).await;
             seen.send_if_modified(|now| {
@@ -77,12 +78,12 @@ async fn keep_watching(folder: PathBuf, history: Arc<History>, seen: Sender<Seen
     }
 }
 
-/// Follows the program of a run for as long as it answers.
+/// Follows the program of a run as long as it answers.
 async fn follow(folder: &Path, history: &Arc<History>, seen: &Sender<Seen>) -> std::io::Result<()> {
     let mut watch = watch(folder).await?;
     let mut read_at = None;
     while let Some(snapshot) = watch.next().await? {
-        // Measurements, judgements and alarms come with a new state.
+        // Measurements, judgements and alarms always come with a new state.
         let at = (snapshot.number, snapshot.cycles.len());
         let summary = match read_at {
             Some(before) if before == at => Arc::clone(&seen.borrow().summary),
@@ -104,7 +105,7 @@ async fn read(folder: &Path, history: &Arc<History>) -> Arc<RunSummary> {
     spawn_blocking(move || history.summary(&folder)).await.ok().flatten().unwrap_or_default()
 }
 
-/// Returns whether a part was accepted, was not, or is not told.
+/// Returns true if the part was accepted, false if it was not, and `None` if the result is unknown.
 pub(crate) fn verdict(seen: &Seen) -> Option<bool> {
     match seen.summary.result {
         RunResult::Accepted => Some(true),

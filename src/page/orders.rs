@@ -1,8 +1,8 @@
-//! Orders from the page, through the same door as those from the terminal.
+//! Orders from the page, through the same socket as those from the terminal.
 //!
-//! One browser has control. What makes safe (hold, stop, abort) is taken from every one whose person may give it; what lets machines
-//! move, or says what a person has seen, from the one that has control only. Who takes control is on record in the run, and so is
-//! what was refused.
+//! One browser has control. Orders that make the cell safe (hold, stop, abort) are accepted from every browser whose
+//! person can give them. Orders that let machines move, or that confirm what a person has seen, are accepted only from
+//! the browser that has control. Each change of control is on record in the run, and so is each refusal.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -23,7 +23,7 @@ use super::guard::{Session, foreign};
 use super::history::History;
 use super::users::PageRole;
 
-/// What the page answers to an order.
+/// Answer of the page to an order.
 #[derive(Serialize)]
 struct Answer {
     accepted: bool,
@@ -43,7 +43,7 @@ pub(crate) async fn order(
     }
     let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
     let request = serde_json::from_slice::<Request>(&body).ok();
-    // What else the cell understands is for programs and the terminal.
+    // Other requests that the cell understands are for programs and the terminal only.
     let Some((request, name)) = request.and_then(|request| name_of(&request).map(|name| (request, name))) else {
         return refuse(&page, &run, "what is no order of the page".into(), StatusCode::BAD_REQUEST).await;
     };
@@ -62,16 +62,16 @@ pub(crate) async fn order(
     answered(give(folder, request, &session).await)
 }
 
-/// What every screen may order, whoever has control.
+/// Orders that every screen can give, without control.
 const MAKES_SAFE: [&str; 3] = ["hold", "stop", "abort"];
 
-/// The name of an order that the page gives; none for what is for programs and the terminal.
+/// Returns the name of an order of the page; `None` for requests that are for programs and the terminal only.
 fn name_of(request: &Request) -> Option<&'static str> {
     match request {
         Request::Hold { .. } => Some("hold"),
         Request::Stop { .. } => Some("stop"),
         Request::Abort { .. } => Some("abort"),
-        // One that is meant for the state that the person saw.
+        // Only a resume for the state that the person saw is accepted.
         Request::Resume { seen: Some(_), .. } => Some("resume"),
         Request::Loaded => Some("loaded"),
         Request::Clear { .. } => Some("clear"),
@@ -80,13 +80,14 @@ fn name_of(request: &Request) -> Option<&'static str> {
     }
 }
 
-/// Why an order is not for who sits at a browser.
+/// Returns the reason why the person at a browser cannot give an order.
 fn not_for(session: &Session, order: &str) -> Option<String> {
     let person = session.person.as_ref().filter(|_| !session.may(order))?;
     Some(format!("the order {order} of {person}: it is not for that role"))
 }
 
-/// Why somebody does not go on: an alarm that stands is cleared by a process engineer, and they are none.
+/// Returns the reason why a person cannot continue: only a process engineer clears the active alarm, and the person is
+/// not one.
 async fn clears_alarm_of_another(folder: &std::path::Path, session: &Session) -> Option<String> {
     let person = session.person.as_ref().filter(|person| person.role != PageRole::Engineer)?;
     let Reply { status, .. } = give(folder.to_owned(), Request::Status, session).await.ok()?;
@@ -124,7 +125,7 @@ fn answered(reply: std::io::Result<Reply>) -> Response {
     }
 }
 
-/// Refuses, and answers when it is on record.
+/// Refuses a request, and answers after the refusal is on record.
 async fn refuse(page: &Shared, run: &str, what: String, status: StatusCode) -> Response {
     if page.guard.refused(&what) {
         drop(write_down(&page.history, Some(run.to_owned()), format!("the page refused {what}")).await);
@@ -132,7 +133,8 @@ async fn refuse(page: &Shared, run: &str, what: String, status: StatusCode) -> R
     (status, Json(Answer { accepted: false, message: what })).into_response()
 }
 
-/// Has something on record: in a run, or in every run that is on. The record takes it in its turn; a run that is over takes no remark.
+/// Puts a message on record in one run, or in every active run. The record is written in its turn. A run that has ended
+/// accepts no remark.
 pub(crate) fn write_down(history: &Arc<History>, run: Option<String>, what: String) -> JoinHandle<()> {
     let history = Arc::clone(history);
     spawn_blocking(move || {
@@ -144,7 +146,7 @@ pub(crate) fn write_down(history: &Arc<History>, run: Option<String>, what: Stri
     })
 }
 
-/// Asks the cell on a thread that may wait.
+/// Sends a request to the cell on a blocking thread.
 async fn give(folder: PathBuf, request: Request, session: &Session) -> std::io::Result<Reply> {
     let screen = session.id.get(..6).map_or("page".to_owned(), |short| format!("page, screen {short}"));
     let station = if session.from.is_loopback() { screen } else { format!("{screen}, at {}", session.from) };

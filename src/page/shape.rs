@@ -1,9 +1,10 @@
-//! Maps and points in the bytes that the canvas draws from: little endian, lengths in millimetres, deviations in micrometres.
+//! Binary maps and points for the canvas: little endian, lengths in millimetres, deviations in micrometres.
 //!
 //! ```text
-//!  map      u32 columns, u32 rows, f64 first x, first y, f64 spacing x, y, then f32 a node, x fastest; NaN where nothing was measured;
+//!  map      u32 columns, u32 rows, f64 first x, first y, f64 spacing x, y, then f32 a node, x fastest;
+//!           NaN where nothing was measured;
 //!           the errors of all nodes first, then the standard uncertainties of all
-//!  points   f32 x, y, deviation a point, in the order measured; the deviation is NaN where the point took no part in the fit
+//!  points   f32 x, y, deviation a point, in the order measured; the deviation is NaN if the fit did not use the point
 //!  planned  f32 x, y a point, in the order in which it is to be touched
 //! ```
 
@@ -19,7 +20,7 @@ use tokio::task::spawn_blocking;
 
 use super::Shared;
 
-/// Most nodes of a map that are drawn.
+/// Maximum number of nodes of a map that is drawn.
 const MOST_NODES: usize = 4 << 20;
 
 pub(crate) async fn map(State(page): State<Shared>, Path((run, cycle)): Path<(String, u32)>) -> Response {
@@ -46,7 +47,7 @@ pub(crate) async fn planned(State(page): State<Shared>, Path(run): Path<String>)
     .await
 }
 
-/// The file of a cycle that its record names.
+/// Returns the path of a file of a cycle that is named in the record.
 fn file(page: &Shared, run: &str, cycle: u32, named: fn(&CycleSummary) -> Option<&String>) -> Option<PathBuf> {
     let folder = page.history.folder(run)?;
     let summary = page.history.summary(&folder)?;
@@ -54,7 +55,7 @@ fn file(page: &Shared, run: &str, cycle: u32, named: fn(&CycleSummary) -> Option
     Some(folder.join(named(of)?))
 }
 
-/// Answers with bytes that are made where waiting hurts nobody.
+/// Answers with bytes. They are made on a blocking thread, so that no other request waits.
 async fn respond(make: impl FnOnce() -> Option<Result<Option<Vec<u8>>, FormatError>> + Send + 'static) -> Response {
     match spawn_blocking(make).await {
         Ok(Some(Ok(Some(bytes)))) => {
@@ -67,7 +68,7 @@ async fn respond(make: impl FnOnce() -> Option<Result<Option<Vec<u8>>, FormatErr
     }
 }
 
-/// Lays nodes on the grid that they came from; none where they lie on no grid.
+/// Returns the bytes of the nodes on their grid; `None` if they do not lie on a grid.
 fn grid_bytes(nodes: &[MapNode]) -> Option<Vec<u8>> {
     let [x, y] = [0, 1].map(|k| axis(nodes.iter().map(|node| node.at_mm[k]).collect()));
     let ([first_x, step_x, columns], [first_y, step_y, rows]) = (x?, y?);
@@ -89,18 +90,18 @@ fn grid_bytes(nodes: &[MapNode]) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Which step of an axis a place is; none where it lies between two.
+/// Returns the index of a position on an axis; `None` if it lies between two grid positions.
 fn place(value: f64, first: f64, step: f64) -> Option<usize> {
     const ROUNDING: f64 = 0.01;
     let steps = (value - first) / step;
     ((steps - steps.round()).abs() < ROUNDING).then_some(steps.round() as usize)
 }
 
-/// The first of some places along an axis, their distance, and how many there are; none where there is no distance.
+/// Returns the first position along an axis, the spacing and the number of positions; `None` if there is no spacing.
 fn axis(mut places: Vec<f64>) -> Option<[f64; 3]> {
     places.sort_by(f64::total_cmp);
     let (first, last) = (*places.first()?, *places.last()?);
-    // Places of one column are written alike; what is closer than this is rounding.
+    // Positions of one column are written identically. A smaller distance than this is a rounding error.
     let least = 1e-6 * (last - first);
     let steps = places.windows(2).map(|pair| pair[1] - pair[0]).filter(|step| *step > least);
     let step = steps.fold(f64::INFINITY, f64::min);
@@ -121,7 +122,7 @@ mod tests {
 
     #[test]
     fn nodes_come_on_the_grid_that_they_were_written_from() {
-        // Three columns and two rows, one node of which was not measured; in any order.
+        // Three columns and two rows, in any order. One node was not measured.
         let nodes = [[2.0, 5.5, 4e-3], [1.0, 5.0, 1e-3], [1.5, 5.0, 2e-3], [1.0, 5.5, 3e-3], [2.0, 5.0, -1e-3]];
         let bytes = grid_bytes(&nodes.map(node)).unwrap();
         let count = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());

@@ -1,4 +1,5 @@
-//! Signing in and out, where there are users: one password at a time, and of a stranger's guesses only the first few.
+//! Sign-in and sign-out, if there are users. Passwords are checked one at a time, and the attempts of each place are
+//! limited.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
@@ -20,29 +21,32 @@ use super::texts::Text;
 use super::users::{Person, Proven, UsersFile};
 use super::view;
 
-/// How long somebody stays signed in: a shift and its handover.
+/// Duration of a session: a shift and its handover.
 const LASTS: Duration = Duration::from_secs(12 * 3600);
-/// Most browsers that are signed in at a time; the one that signed in first goes.
+/// Maximum number of browsers that are signed in at a time. Beyond it, the oldest session ends.
 const MOST: usize = 256;
-/// Tries within a minute under one name from one place; more are not looked at. Others at that place sign in all the same.
+/// Maximum number of attempts within a minute under one name from one place. Further attempts are not checked. Other
+/// users at that place can still sign in.
 const TRIES: u32 = 10;
-/// Names and places of which the tries are counted; of one place only so many, those with the fewest tries forgotten first.
+/// Maximum number of pairs of name and place whose attempts are counted, and maximum number of names for one place. The
+/// pair with the fewest attempts is forgotten first.
 const COUNTED: usize = 4096;
 const NAMES_OF_PLACE: usize = 64;
-/// Proofs that one place may have waiting: whoever else signs in is not kept behind its guesses.
+/// Maximum number of password checks that one place can have waiting, so that its guesses do not delay the sign-in of
+/// others.
 const WAITING_OF_PLACE: usize = 2;
-/// Longest time that somebody waits for the guesses of others.
+/// Maximum time that a user waits for the guesses of others, and interval at which a waiting sign-in asks again.
 const WAITS: Duration = Duration::from_secs(5);
 const ASKED_EVERY: Duration = Duration::from_millis(20);
 
-/// Who has signed in, and who tries to.
+/// Sessions of signed-in users, and attempts to sign in.
 pub(crate) struct SignedIn {
-    /// By the session of the browser, in the order in which they came.
+    /// Sessions of the browsers, in the order in which they began.
     sessions: Mutex<Vec<(String, Proven, Instant)>>,
     tries: Mutex<HashMap<(IpAddr, String), Rate>>,
-    /// How many proofs each place has waiting.
+    /// Number of waiting password checks for each place.
     waiting: Mutex<HashMap<IpAddr, usize>>,
-    /// A proof costs time and memory by design: one at a time, so that guesses cost the computer no more than that.
+    /// A password check costs time and memory by design. Only one runs at a time, so guesses cost the computer no more.
     proving: Arc<Semaphore>,
 }
 
@@ -58,7 +62,8 @@ impl Default for SignedIn {
 }
 
 impl SignedIn {
-    /// Who has signed in with a browser; nobody any more whose line on the list has changed since.
+    /// Returns the person who has signed in with a browser; `None` if that person's line in the list has changed since
+    /// then.
     pub(crate) fn person(&self, session: &str, users: &UsersFile) -> Option<Person> {
         let mut sessions = self.sessions.lock().unwrap_or_else(PoisonError::into_inner);
         sessions.retain(|(.., since)| since.elapsed() < LASTS);
@@ -78,13 +83,14 @@ impl SignedIn {
         self.sessions.lock().unwrap_or_else(PoisonError::into_inner).retain(|(id, ..)| id != session);
     }
 
-    /// Counts a try under a name from a place; returns whether it is looked at.
+    /// Counts an attempt under a name from a place. Returns true if the attempt can be checked.
     fn may_try(&self, from: IpAddr, name: &str) -> bool {
         let mut tries = self.tries.lock().unwrap_or_else(PoisonError::into_inner);
         tries.retain(|_, rate| !rate.is_over());
         let this = (place(from), name.to_owned());
         if !tries.contains_key(&this) {
-            // The one that was tried least goes: a name that somebody guesses at stays however many others are tried beside it.
+            // The pair with the fewest attempts is removed. A name under attack therefore stays, however many other
+            // names are tried.
             let least = |of: &mut dyn Iterator<Item = (&(IpAddr, String), &Rate)>| {
                 of.min_by_key(|(_, rate)| (rate.so_far(), Reverse(rate.age()))).map(|(tried, _)| tried.clone())
             };
@@ -101,12 +107,13 @@ impl SignedIn {
         tries.entry(this).or_insert_with(Rate::new).count() <= TRIES
     }
 
-    /// Who knows their password has all tries again.
+    /// Resets the attempts of a user who gave the correct password.
     fn forget_tries(&self, from: IpAddr, name: &str) {
         self.tries.lock().unwrap_or_else(PoisonError::into_inner).remove(&(place(from), name.to_owned()));
     }
 
-    /// Takes a place in the line of those whose passwords are looked at, until it is dropped; none where that place has its share for some seconds.
+    /// Reserves a waiting place for a password check, until the place is dropped; `None` if the place of the
+    /// client has no free share before the timeout.
     async fn wait_a_while(&self, from: IpAddr) -> Option<Waiting<'_>> {
         let began = Instant::now();
         loop {
@@ -117,7 +124,7 @@ impl SignedIn {
         }
     }
 
-    /// The same, at once.
+    /// Reserves a waiting place at once; `None` if the place of the client has used its share.
     fn wait(&self, from: IpAddr) -> Option<Waiting<'_>> {
         let place = place(from);
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
@@ -130,7 +137,7 @@ impl SignedIn {
     }
 }
 
-/// A place in the line of those whose passwords are looked at.
+/// Waiting place for a password check. It is released on drop.
 struct Waiting<'s> {
     of: &'s SignedIn,
     place: IpAddr,
@@ -148,7 +155,8 @@ impl Drop for Waiting<'_> {
     }
 }
 
-/// The place from which somebody tries: one who has an IPv6 network has all its addresses.
+/// Returns the place that an address belongs to: the address itself for IPv4, the /64 network for IPv6, because one
+/// client of an IPv6 network has all its addresses.
 pub(crate) fn place(from: IpAddr) -> IpAddr {
     match from.to_canonical() {
         IpAddr::V6(address) => IpAddr::V6(Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX))),
@@ -156,7 +164,7 @@ pub(crate) fn place(from: IpAddr) -> IpAddr {
     }
 }
 
-/// What somebody signs in with.
+/// Name and password from the sign-in form.
 #[derive(Deserialize)]
 pub(crate) struct Credentials {
     name: String,
@@ -201,7 +209,7 @@ pub(crate) async fn sign_in(
     let signed_in = format!("{} signed in at the page, from {from}", proven.person());
     guard.tell(&signed_in);
     guard.record(signed_in);
-    // A name of this sign-in alone: nobody can have known it before.
+    // The session gets a new random name, which nobody can have known before.
     let Ok(session) = random_word() else { return StatusCode::INTERNAL_SERVER_ERROR.into_response() };
     guard.signed_in.add(&session, proven);
     let mut response = (StatusCode::SEE_OTHER, [(LOCATION, "/")]).into_response();
@@ -209,13 +217,13 @@ pub(crate) async fn sign_in(
     response
 }
 
-/// Waits for the turn of a proof; none where it does not come in time.
+/// Waits for the turn of a password check; `None` after the timeout.
 async fn turn(guard: &Arc<Guard>) -> Option<OwnedSemaphorePermit> {
     let turn = Arc::clone(&guard.signed_in.proving).acquire_owned();
     tokio::time::timeout(WAITS, turn).await.ok()?.ok()
 }
 
-/// Sees whether a name and a password belong together, in its turn.
+/// Checks a name and a password, while holding the permit `turn`.
 async fn prove(guard: &Arc<Guard>, turn: OwnedSemaphorePermit, given: Credentials) -> Option<Proven> {
     let guard = Arc::clone(guard);
     let proven = spawn_blocking(move || {

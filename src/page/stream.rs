@@ -1,4 +1,4 @@
-//! What changes on a page while somebody looks at it: pieces of HTML, sent when they are other than those sent last.
+//! Updates of an open page: pieces of HTML, sent only if they differ from the last ones sent.
 
 use std::convert::Infallible;
 use std::time::Duration;
@@ -18,16 +18,16 @@ use super::live::Seen;
 use super::texts::Language;
 use super::view::{self, Piece};
 
-/// Longest silence of the stream: a browser that hears nothing for longer shows that its figures are old.
+/// Maximum silence of the stream. A browser that gets nothing for longer shows that its figures are old.
 const MOST_BETWEEN: Duration = Duration::from_secs(1);
 
-/// A browser that looks at a run.
+/// Browser that shows a run.
 struct Looking {
     page: Shared,
     session: Session,
     language: Language,
     seen: Receiver<Seen>,
-    /// What it was sent last of each piece.
+    /// Last version of each piece that was sent.
     sent: Vec<(Piece, String)>,
     is_first: bool,
 }
@@ -50,14 +50,14 @@ pub(crate) async fn events(
 }
 
 impl Looking {
-    /// Waits for what the browser has to know next; none where there will be no more.
+    /// Waits for the next update for the browser; `None` if there will be no more.
     async fn next(&mut self) -> Option<Event> {
         if !self.is_first {
             if let Ok(Err(_)) = tokio::time::timeout(MOST_BETWEEN, self.seen.changed()).await {
                 return None;
             }
         } else if self.seen.borrow().summary.run.is_empty() {
-            // Nothing is known yet; the watcher has just begun to look.
+            // Nothing is known yet, because the watcher has just started.
             let _ = tokio::time::timeout(MOST_BETWEEN, self.seen.changed()).await;
         }
         self.is_first = false;

@@ -1,5 +1,5 @@
-//! What the page says by itself, in every language that it speaks. Alarms have a file of their own; what a cell
-//! tells of its machines comes in the words of the cell.
+//! Texts of the page in all its languages. The texts of alarms are in a separate file. Messages of a cell about its
+//! machines stay in the wording of the cell.
 
 use regrind_cell::{Device, JobStep, Phase, StateName};
 use regrind_control::Next;
@@ -7,7 +7,7 @@ use regrind_report::RunResult;
 
 use super::users::PageRole;
 
-/// A language of the page.
+/// Language of the page.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub(crate) enum Language {
     #[default]
@@ -19,17 +19,18 @@ pub(crate) enum Language {
 impl Language {
     pub(crate) const ALL: [Self; 3] = [Self::En, Self::De, Self::Zh];
 
-    /// The tag by which HTML and browsers name it.
+    /// Returns the language tag for HTML and browsers.
     pub(crate) fn tag(self) -> &'static str {
         ["en", "de", "zh"][self as usize]
     }
 
-    /// What its speakers call it.
+    /// Returns the name of the language in the language itself.
     pub(crate) fn name(self) -> &'static str {
         ["English", "Deutsch", "中文"][self as usize]
     }
 
-    /// Returns the first that a list of tags names, such as that of `Accept-Language`; the order of the list decides, not its weights.
+    /// Returns the first supported language in a list of tags, for example that of `Accept-Language`. The order of the
+    /// list decides; its weights are ignored.
     pub(crate) fn first_of(tags: &str) -> Option<Self> {
         tags.split(',').find_map(|tag| {
             let primary = tag.trim().split(['-', ';', '_']).next()?.to_ascii_lowercase();
@@ -89,7 +90,7 @@ texts! {
         "Diese Seite hat ihren Server verloren. Was die Zelle tut, ist hier nicht bekannt: bitte nachsehen.",
         "页面与服务器断开。此处无法得知单元状态：请到现场查看。"
     }
-    // What stands about the part.
+    // Texts about the part.
     Part { "Part", "Teil", "零件" }
     Recipe { "Recipe", "Rezept", "配方" }
     Cycle { "Cycle", "Zyklus", "循环" }
@@ -102,7 +103,7 @@ texts! {
     Until { "Until", "Bis", "至" }
     Result { "Result", "Ergebnis", "结果" }
     Alarms { "Alarms", "Alarme", "报警" }
-    // The column of the work.
+    // Column with the current work.
     NextAction { "Your next action", "Ihr nächster Schritt", "您的下一步" }
     TimeLeft { "left", "verbleiben", "剩余" }
     Preliminary { "preliminary", "vorläufig", "初步" }
@@ -241,7 +242,7 @@ texts! {
     AtRegister { "registering", "Einpassen", "配准" }
     AtJudge { "judging", "Beurteilen", "判定" }
     AtCompensate { "computing the correction", "Korrektur berechnen", "计算补偿" }
-    // What a resume does first.
+    // First action of a resume.
     GoesOn {
         "the machine goes on with its job from where it stands",
         "die Maschine setzt ihren Auftrag dort fort, wo sie steht",
@@ -274,7 +275,7 @@ texts! {
         "确认磨床已离开零件；然后开始测量"
     }
     ComputesAnew { "it is computed again; nothing moves", "es wird neu berechnet; nichts bewegt sich", "重新计算；无动作" }
-    // How runs ended.
+    // Results of runs.
     Open { "no end on record", "kein Ende im Protokoll", "无结束记录" }
     Live { "on now", "im Gang", "进行中" }
     Accepted { "ACCEPTED", "ANGENOMMEN", "合格" }
@@ -321,7 +322,7 @@ texts! {
     NotHere { "There is nothing at this address.", "Unter dieser Adresse ist nichts.", "此地址没有内容。" }
 }
 
-/// The word for a state.
+/// Returns the text for a state.
 pub(crate) fn state(name: StateName) -> Text {
     match name {
         StateName::Idle => Text::Idle,
@@ -342,7 +343,7 @@ pub(crate) fn state(name: StateName) -> Text {
     }
 }
 
-/// The word for a phase.
+/// Returns the text for a phase.
 pub(crate) fn phase(phase: Phase) -> Text {
     match phase {
         Phase::Load => Text::AtLoad,
@@ -355,7 +356,7 @@ pub(crate) fn phase(phase: Phase) -> Text {
     }
 }
 
-/// The word for how a run ended.
+/// Returns the text for the result of a run.
 pub(crate) fn result(result: RunResult) -> Text {
     match result {
         RunResult::Open => Text::Open,
@@ -367,7 +368,7 @@ pub(crate) fn result(result: RunResult) -> Text {
     }
 }
 
-/// The word for what a person may do.
+/// Returns the text for a role.
 pub(crate) fn role(role: PageRole) -> Text {
     match role {
         PageRole::Viewer => Text::Viewer,
@@ -377,7 +378,7 @@ pub(crate) fn role(role: PageRole) -> Text {
     }
 }
 
-/// What a person does next, and the machine that it is about.
+/// Returns the next action of a person, and the machine that it concerns.
 pub(crate) fn next(next: &Next, language: Language) -> (String, Option<Device>) {
     let (text, device) = match next {
         Next::Load => (Text::Load, None),
@@ -395,7 +396,7 @@ pub(crate) fn next(next: &Next, language: Language) -> (String, Option<Device>) 
     (text.to(language).to_owned(), device)
 }
 
-/// What a resume does first where the cell is held in a phase, and the machine that it is about.
+/// Returns the first action of a resume if the cell is held in a phase, and the machine that it concerns.
 pub(crate) fn on_resume(phase: Phase) -> (Text, Option<Device>) {
     let Some((device, step)) = phase.job() else {
         let text = match phase {

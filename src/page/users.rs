@@ -1,4 +1,5 @@
-//! Who may sign in to the page, and as what: a file with a line a person, which keeps of a password only what proves it (Argon2id).
+//! Users who can sign in to the page, and their roles: a file with an entry for each person. It stores only an Argon2id
+//! hash of each password.
 
 use std::fmt::{self, Display, Formatter};
 use std::io;
@@ -15,43 +16,43 @@ use regrind_formats::{OpenToOthers, readable_by_others};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Said in the first lines of the file, for who finds it.
+/// First lines of the file, which explain it to a reader.
 const FIRST_LINES: &str = "\
 # Who may sign in to the page of this cell. `regrind users` keeps it. Of a password it has only what proves it, which is still for
 # nobody else: who has it may try passwords as fast as a computer can.
 ";
-/// Longest name of a person, in characters.
+/// Maximum length of the name of a person, in characters.
 const LONGEST_NAME: usize = 64;
-/// Lengths of a password, in bytes: a shorter one is guessed, a longer one is no password.
+/// Minimum and maximum length of a password, in bytes. A shorter one is easy to guess; a longer one is rejected.
 const SHORTEST_PASSWORD: usize = 10;
 const LONGEST_PASSWORD: usize = 256;
-/// More is no list of the users of a cell.
+/// Maximum size of the file in bytes. A longer file cannot be a list of the users of a cell.
 const MOST_BYTES: u64 = 1 << 20;
 
-/// What a person may do at the page.
+/// Role of a person at the page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PageRole {
-    /// Looks.
+    /// Can only look.
     Viewer,
-    /// Looks, and holds a cell whose figures are not right.
+    /// Can look, and can hold a cell whose figures are wrong.
     Quality,
-    /// Gives every order, but goes on from no alarm that a process engineer clears.
+    /// Can give all orders, but cannot continue after an alarm that only a process engineer clears.
     Operator,
-    /// Gives every order.
+    /// Can give all orders.
     Engineer,
 }
 
 impl PageRole {
-    /// All of them, from who may least.
+    /// All roles, in ascending order of permissions.
     pub const ALL: [Self; 4] = [Self::Viewer, Self::Quality, Self::Operator, Self::Engineer];
 
-    /// The word for it in the file and on the command line.
+    /// Returns the name of the role in the file and on the command line.
     pub fn name(self) -> &'static str {
         ["viewer", "quality", "operator", "engineer"][self as usize]
     }
 
-    /// Whether an order of that name is for this role.
+    /// Returns true if this role can give the order with that name.
     pub(crate) fn may(self, order: &str) -> bool {
         match self {
             Self::Viewer => false,
@@ -76,12 +77,12 @@ impl FromStr for PageRole {
     }
 }
 
-/// Somebody who has signed in.
+/// Person who has signed in.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Person {
-    /// The name by which they sign in, and which is on record with their orders.
+    /// Name that the person signs in with. It is on record with the person's orders.
     pub name: String,
-    /// What they may do.
+    /// Role of the person.
     pub role: PageRole,
 }
 
@@ -91,7 +92,7 @@ impl Display for Person {
     }
 }
 
-/// What is wrong with the file of the users, or with what was to become of it.
+/// Errors of the file of the users, or of a change to it.
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the messages tell them")]
 pub enum UsersError {
@@ -111,7 +112,7 @@ pub enum UsersError {
     Hash(String),
 }
 
-/// The file as it is written.
+/// Content of the file.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Written {
@@ -124,11 +125,11 @@ struct Written {
 struct User {
     name: String,
     role: PageRole,
-    /// What proves the password, as a PHC string.
+    /// Argon2id hash of the password, as a PHC string.
     proof: String,
 }
 
-/// The people who may sign in.
+/// List of the people who can sign in.
 #[derive(Clone, Debug, Default)]
 pub struct Users {
     users: Vec<User>,
@@ -138,7 +139,7 @@ impl Users {
     /// Reads a list of users.
     ///
     /// # Errors
-    /// A file that is not there, that others may read, or that is no such list.
+    /// Fails if the file is missing, if others can read it, or if it is not a valid list.
     pub fn read(path: &Path) -> Result<Self, UsersError> {
         let failed = |source| UsersError::Unreadable { path: path.to_owned(), source };
         let found = std::fs::metadata(path).map_err(failed)?;
@@ -169,17 +170,17 @@ impl Users {
         Ok(Self { users })
     }
 
-    /// The file that says it.
+    /// Returns the content of the file for this list.
     pub fn to_text(&self) -> String {
         let written = Written { user: self.users.clone() };
-        // Strings alone: that is always TOML.
+        // The list contains only strings, so the conversion to TOML cannot fail.
         format!("{FIRST_LINES}\n{}", toml::to_string(&written).unwrap_or_default())
     }
 
-    /// Adds a person, or gives one who is there another password and role.
+    /// Adds a person, or changes the password and the role of an existing person.
     ///
     /// # Errors
-    /// What is no name, and a password that is too short or too long.
+    /// Fails if the name is not valid, or if the password is too short or too long.
     pub fn add(&mut self, name: &str, role: PageRole, password: &str) -> Result<(), UsersError> {
         let name = named(name)?;
         if !(SHORTEST_PASSWORD..=LONGEST_PASSWORD).contains(&password.len()) {
@@ -193,20 +194,20 @@ impl Users {
         Ok(())
     }
 
-    /// Takes a person off the list; returns whether they were on it.
+    /// Removes a person from the list. Returns true if the person was on it.
     pub fn remove(&mut self, name: &str) -> bool {
         let before = self.users.len();
         self.users.retain(|user| user.name != name);
         self.users.len() < before
     }
 
-    /// Everybody on the list, by name.
+    /// Returns all people on the list, by name.
     pub fn people(&self) -> impl Iterator<Item = Person> + '_ {
         self.users.iter().map(|User { name, role, .. }| Person { name: name.clone(), role: *role })
     }
 
-    /// Who signs in with a name and a password; none where they do not belong together. Takes some hundredths of a second, for a name
-    /// that is not there as well: who guesses learns nothing of either.
+    /// Returns the user with this name and password; `None` if they do not match. Takes some hundredths of a second,
+    /// also for an unknown name, so that the time reveals nothing about either to an attacker.
     fn signs_in(&self, name: &str, password: &str) -> Option<Proven> {
         let user = self.users.iter().find(|user| user.name == name);
         let proof = user.or(self.users.first()).and_then(|user| PasswordHash::new(&user.proof).ok())?;
@@ -215,7 +216,7 @@ impl Users {
     }
 }
 
-/// A line of the list, whose person gave the password that goes with it.
+/// Entry of the list whose person gave the correct password.
 #[derive(Clone, Debug)]
 pub(crate) struct Proven(User);
 
@@ -231,10 +232,11 @@ fn named(name: &str) -> Result<String, UsersError> {
     if fits && misleading(name).is_none() { Ok(name.to_owned()) } else { Err(UsersError::Name) }
 }
 
-/// When a file changed last, and how long it is; none where it is not there.
+/// Time of the last change and length of a file; `None` if the file does not exist.
 type Stamp = Option<(SystemTime, u64)>;
 
-/// A list of users that is read again when it changes: who is taken off it, or has another role or password, is out at once.
+/// List of users that is read again when its file changes. A person who is removed, or who gets another role or
+/// password, is signed out at once.
 pub struct UsersFile {
     path: PathBuf,
     read: Mutex<(Stamp, Users)>,
@@ -244,13 +246,13 @@ impl UsersFile {
     /// Opens a list.
     ///
     /// # Errors
-    /// Those of [`Users::read`].
+    /// Fails as [`Users::read`] does.
     pub fn open(path: &Path) -> Result<Self, UsersError> {
         let read = (changed(path), Users::read(path)?);
         Ok(Self { path: path.to_owned(), read: Mutex::new(read) })
     }
 
-    /// The list as it stands. One that cannot be read has nobody on it.
+    /// Returns the current list. If the file cannot be read, the list is empty.
     fn now(&self) -> Users {
         let at = changed(&self.path);
         let mut read = self.read.lock().unwrap_or_else(PoisonError::into_inner);
@@ -260,12 +262,12 @@ impl UsersFile {
         read.1.clone()
     }
 
-    /// Who signs in with a name and a password. Blocks for some hundredths of a second.
+    /// Returns the user with this name and password. Blocks for some hundredths of a second.
     pub(crate) fn signs_in(&self, name: &str, password: &str) -> Option<Proven> {
         self.now().signs_in(name, password)
     }
 
-    /// Whether a line is still on the list as it was.
+    /// Returns true if an entry is still on the list without changes.
     pub(crate) fn has(&self, Proven(was): &Proven) -> bool {
         self.now().users.contains(was)
     }

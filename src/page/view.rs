@@ -1,5 +1,5 @@
-//! The pages as HTML, in the language of who looks. The pieces of a run's page are made here alone, for the first look and for every
-//! change after it.
+//! Pages as HTML, in the language of the reader. Only this module makes the pieces of a run's page, both for the first
+//! response and for each later change.
 
 use axum::Extension;
 use axum::extract::{Path, Query, State};
@@ -23,7 +23,7 @@ use super::live::{Seen, verdict};
 use super::texts::{self, Language, Text};
 use super::users::Person;
 
-/// A piece of the page of a run, which changes by itself.
+/// Piece of the page of a run, which is updated on its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Piece {
     Banner,
@@ -37,7 +37,7 @@ pub(crate) enum Piece {
 }
 
 impl Piece {
-    /// The element of the page that holds it.
+    /// Returns the id of the HTML element that contains the piece.
     pub(crate) fn id(self) -> &'static str {
         match self {
             Self::Banner => "banner",
@@ -52,7 +52,7 @@ impl Piece {
     }
 }
 
-/// Makes every piece of the page of a run.
+/// Returns all pieces of the page of a run.
 pub(crate) fn pieces(seen: &Seen, has_control: bool, language: Language) -> [(Piece, String); 8] {
     let Seen { snapshot, summary, .. } = seen;
     let snapshot = snapshot.as_deref();
@@ -71,7 +71,7 @@ pub(crate) fn pieces(seen: &Seen, has_control: bool, language: Language) -> [(Pi
     .map(|(piece, markup)| (piece, markup.into_string()))
 }
 
-/// What the scripts of the page have to know of a run.
+/// Returns the state of a run for the scripts of the page.
 pub(crate) fn state(seen: &Seen, session: &Session, has_control: bool) -> Value {
     let live = seen.snapshot.as_deref().filter(|_| seen.answers);
     let cycles: Vec<_> = seen
@@ -102,7 +102,7 @@ pub(crate) fn state(seen: &Seen, session: &Session, has_control: bool) -> Value 
     })
 }
 
-/// The orders that make sense now, and are for who sits there.
+/// Returns the orders that make sense now and that the person can give.
 fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static str> {
     let mut can = vec!["hold", "stop", "abort"];
     if is_over(live.state) {
@@ -125,7 +125,7 @@ fn is_over(state: StateName) -> bool {
     matches!(state, StateName::Stopped | StateName::Aborted | StateName::Complete)
 }
 
-/// The state in one word, a shape and a colour: for who stands two metres away.
+/// Returns the state in one word, with a shape and a colour, readable from a distance of two metres.
 fn banner(seen: &Seen, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let mark = |class: &str, shape: &str, word: &str, more: &str| {
@@ -161,7 +161,7 @@ fn banner(seen: &Seen, language: Language) -> Markup {
         RunResult::Open | RunResult::Recovery => ("still", SQUARE),
         _ => ("bad", CROSS),
     };
-    // The words of the record begin with the same word.
+    // The text of the record begins with the same word.
     let verdict = &seen.summary.verdict;
     let reason = verdict.split_once(": ").filter(|(word, _)| word.chars().all(|c| !c.is_lowercase()));
     mark(class, shape, say(texts::result(result)), reason.map_or(verdict, |(_, reason)| reason))
@@ -176,7 +176,7 @@ const CROSS: &str = "M4 7 L7 4 L12 9 L17 4 L20 7 L15 12 L20 17 L17 20 L12 15 L7 
 const TRIANGLE: &str = "M12 2 L23 21 H1 Z";
 const UNKNOWN: &str = "M12 2 L22 12 L12 22 L2 12 Z";
 
-/// Colour and shape of a state.
+/// Returns the colour and the shape of a state.
 fn look(live: &Snapshot) -> (&'static str, &'static str) {
     use StateName as S;
     match live.state {
@@ -206,17 +206,17 @@ fn about(seen: &Seen, language: Language) -> Markup {
     }
 }
 
-/// A time of the record to the second.
+/// Formats a time of the record to the second.
 fn when(utc: &str) -> String {
     let second: String = utc.chars().take(19).collect();
     if second.is_empty() { second } else { format!("{} UTC", second.replacen('T', " ", 1)) }
 }
 
-/// What a person does next, with the buttons for it.
+/// Returns the next action of a person, with its buttons.
 fn next(seen: &Seen, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let Some(live) = seen.snapshot.as_deref().filter(|_| seen.answers) else {
-        // Of a run that is lost the banner has said what to do.
+        // For a lost run the banner already says what to do.
         return html! { @if !seen.is_lost() { p .sentence { (say(Text::ReadReport)) } } };
     };
     let (sentence, device) = texts::next(&live.next_step, language);
@@ -242,7 +242,7 @@ fn next(seen: &Seen, language: Language) -> Markup {
     }
 }
 
-/// How far the job under way is.
+/// Returns the progress of the current job.
 fn job(live: &Snapshot, language: Language) -> Markup {
     let Some(JobProgress { device, done, total, left_s }) = live.progress else { return Markup::default() };
     let percent = 100.0 * f64::from(done.min(total)) / f64::from(total.max(1));
@@ -263,7 +263,7 @@ fn job(live: &Snapshot, language: Language) -> Markup {
     }
 }
 
-/// A range of seconds, as nobody reads more of it.
+/// Formats a range of seconds, rounded to a useful precision.
 fn range([least, most]: [f64; 2]) -> String {
     let (unit, per) = match most {
         most if most < 90.0 => ("s", 1.0),
@@ -275,7 +275,7 @@ fn range([least, most]: [f64; 2]) -> String {
     if least == most { format!("{most} {unit}") } else { format!("{least} – {most} {unit}") }
 }
 
-/// The alarms that stand; of a run that is over, or whose program is gone, all that its record tells.
+/// Returns the active alarms. For a run that has ended, or whose program is gone, returns all alarms on record.
 fn alarms(seen: &Seen, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     if let Some(live) = seen.snapshot.as_deref().filter(|live| seen.answers && !is_over(live.state)) {
@@ -306,7 +306,7 @@ fn alarms(seen: &Seen, language: Language) -> Markup {
     }
 }
 
-/// An alarm that somebody has to see to.
+/// Returns an alarm that needs action.
 fn standing(alarm: &Alarm, language: Language) -> Markup {
     let (say, said) = (|text: Text| text.to(language), said(alarm, language));
     html! {
@@ -324,7 +324,7 @@ fn standing(alarm: &Alarm, language: Language) -> Markup {
     }
 }
 
-/// A row a cycle: what was judged, beside its limit.
+/// Returns a row for each cycle with its judged figures and their limits.
 fn figures(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let limit = |mm: f64| if mm.is_finite() { format!("{:.2}", 1e3 * mm) } else { "–".to_owned() };
@@ -370,13 +370,13 @@ fn control(is_elsewhere: bool, language: Language) -> Markup {
     }
 }
 
-/// The name of a run as a part of an address: a folder may be called anything.
+/// Percent-encodes the name of a run for an address, because a folder can have any name.
 fn in_path(run: &str) -> String {
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-._~".contains(&byte);
     run.bytes().map(|byte| if is_plain(byte) { char::from(byte).to_string() } else { format!("%{byte:02X}") }).collect()
 }
 
-/// The page of the run that is on; of the last one where none is.
+/// Serves the page of the active run, or of the last run if none is active.
 pub(crate) async fn home(State(page): State<Shared>) -> Response {
     let history = std::sync::Arc::clone(&page.history);
     let listed = spawn_blocking(move || history.list()).await.unwrap_or_default();
@@ -398,7 +398,7 @@ pub(crate) async fn run(
     let mut looked = page.live.look(&folder);
     let known = looked.borrow().summary.run.is_empty();
     if known {
-        // A run that is on tells itself at once; of one that is over the record tells.
+        // An active run reports its status at once. For a run that has ended, the record contains it.
         drop(tokio::time::timeout(std::time::Duration::from_secs(2), looked.changed()).await);
     }
     let seen = looked.borrow().clone();
@@ -408,7 +408,7 @@ pub(crate) async fn run(
     document(&title, &Frame { language, person: session.person.as_ref(), kind: Kind::WithMaps }, main)
 }
 
-/// The page of a run: the cell while it is on, and what it came to afterwards.
+/// Returns the page of a run: the cell while the run is active, and its result afterwards.
 fn cell(seen: &Seen, id: &str, session: &Session, has_control: bool, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let made = pieces(seen, has_control || !session.may("control"), language);
@@ -449,7 +449,7 @@ fn cell(seen: &Seen, id: &str, session: &Session, has_control: bool, language: L
     }
 }
 
-/// JSON that ends no script element before its time.
+/// Returns JSON that cannot end a script element early.
 fn harmless(data: &Value) -> String {
     data.to_string().replace('<', "\\u003c")
 }
@@ -472,7 +472,7 @@ fn map(language: Language) -> Markup {
     }
 }
 
-/// What the scripts say by themselves.
+/// Returns the texts that the scripts show.
 fn script_texts(language: Language) -> Value {
     let say = |text: Text| text.to(language);
     json!({
@@ -482,20 +482,20 @@ fn script_texts(language: Language) -> Value {
     })
 }
 
-/// The colours of the maps, from below to above, as they are in every picture: three bytes each in hexadecimal digits.
+/// Returns the colours of the maps, from low to high, the same as in all pictures: three bytes each in hexadecimal.
 fn colours(of: ColourMap) -> String {
     let colour = |k: u32| of.at(f64::from(k) / 254.0);
     (0..255).flat_map(colour).map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// What a list of runs is narrowed to; empty is all.
+/// Filter for a list of runs. An empty field matches all runs.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub(crate) struct Wanted {
     part: String,
     recipe: String,
     result: String,
-    /// The first and the last day on which it began, `2026-07-04`, in UTC.
+    /// First and last day of the start of the run, `2026-07-04`, in UTC.
     since: String,
     until: String,
 }
@@ -513,7 +513,7 @@ impl Wanted {
     }
 }
 
-/// The list of runs.
+/// Serves the list of runs.
 pub(crate) async fn runs(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -582,7 +582,7 @@ fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> M
     }
 }
 
-/// Two runs side by side.
+/// Serves two runs side by side.
 pub(crate) async fn compare(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -627,7 +627,7 @@ pub(crate) async fn compare(
     document(say(Text::Compare), &Frame { language, person: session.person.as_ref(), kind: Kind::WithMaps }, main)
 }
 
-/// The report of a run, as it stands in its folder.
+/// Serves the report of a run from its folder.
 pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, headers: HeaderMap) -> Response {
     let Some(folder) = page.history.folder(&id) else { return not_here(PageOf::Cell, &headers) };
     let read = spawn_blocking(move || {
@@ -635,7 +635,7 @@ pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, h
     });
     match read.await {
         Ok(Ok(html)) => {
-            // Its style stands in it; nothing in it may run, and nothing may be fetched.
+            // The report contains its style. It must not run scripts and must not fetch anything.
             let policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'";
             let headers = [
                 (CONTENT_TYPE, "text/html; charset=utf-8"),
@@ -648,7 +648,7 @@ pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, h
     }
 }
 
-/// What is said where nothing is.
+/// Returns the page for an address that does not exist.
 pub(crate) fn not_here(of: PageOf, headers: &HeaderMap) -> Response {
     let language = language(headers);
     let main = html! { main .list { h1 { "404" } p { (Text::NotHere.to(language)) } } };
@@ -656,7 +656,7 @@ pub(crate) fn not_here(of: PageOf, headers: &HeaderMap) -> Response {
         .into_response()
 }
 
-/// What who has no key is told.
+/// Returns the page for a client without a key.
 pub(crate) fn key_needed(status: StatusCode, of: PageOf, headers: &HeaderMap) -> Response {
     let language = language(headers);
     let main = html! {
@@ -669,7 +669,7 @@ pub(crate) fn key_needed(status: StatusCode, of: PageOf, headers: &HeaderMap) ->
     (status, document("Regrind", &Frame { language, person: None, kind: Kind::Of(of) }, main)).into_response()
 }
 
-/// The page at which somebody signs in, and what is said to who could not.
+/// Returns the sign-in page, with a message for a user whose sign-in failed.
 pub(crate) fn sign_in(status: StatusCode, of: PageOf, headers: &HeaderMap, told: Option<Text>) -> Response {
     let language = language(headers);
     let say = |text: Text| text.to(language);
@@ -688,30 +688,30 @@ pub(crate) fn sign_in(status: StatusCode, of: PageOf, headers: &HeaderMap, told:
     (status, document(say(Text::SignIn), &Frame { language, person: None, kind: Kind::Of(of) }, main)).into_response()
 }
 
-/// What stands around every page.
+/// Frame around every page.
 struct Frame<'a> {
     language: Language,
-    /// Who has signed in.
+    /// Person who has signed in.
     person: Option<&'a Person>,
     kind: Kind<'a>,
 }
 
-/// What a page is of, which decides what stands at its head.
+/// Subject of a page. It decides the content of the page's head.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PageOf {
     /// One cell and its runs.
     Cell,
-    /// All cells of a plant. It speaks English.
+    /// All cells of a plant. This page is in English.
     Plant,
 }
 
-/// What a page needs besides its words.
+/// Kind of a page: which scripts and styles it needs.
 #[derive(Clone, Copy)]
 enum Kind<'a> {
     Of(PageOf),
-    /// A page of the cell on which maps are drawn.
+    /// Page of the cell with maps.
     WithMaps,
-    /// A page of the plant, which is asked for again after some seconds where it changes.
+    /// Page of the plant, which is reloaded after some seconds if it changes.
     Plant {
         again_s: Option<u32>,
         style: &'a str,
@@ -728,8 +728,8 @@ impl Kind<'_> {
     }
 }
 
-/// A page of the plant within the frame of every page. It is asked for again after `again_s` seconds; `style` is the address of what is its
-/// look beside that of the cell's page.
+/// Returns a page of the plant within the common frame. The browser reloads it after `again_s` seconds. `style` is the
+/// address of a style sheet that is used in addition to that of the cell's page.
 pub fn plant_document(title: &str, session: &Session, again_s: Option<u32>, style: &str, main: Markup) -> Response {
     let kind = Kind::Plant { again_s, style };
     document(title, &Frame { language: Language::En, person: session.person.as_ref(), kind }, main)
@@ -798,7 +798,8 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
     ([(CONTENT_TYPE, "text/html; charset=utf-8")], markup.into_string()).into_response()
 }
 
-/// The language that a browser chose here, or else the first that its owner wants.
+/// Returns the language that was chosen in this browser, otherwise the first language in the preferences of the
+/// browser.
 pub(crate) fn language(headers: &HeaderMap) -> Language {
     let chosen = text(headers, COOKIE).and_then(|cookies| {
         let pair = cookies.split(';').find_map(|pair| pair.trim().strip_prefix("regrind_language="))?;

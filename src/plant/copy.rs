@@ -1,4 +1,5 @@
-//! The plant's copy of a run as evidence: brought back as a run folder, and proven by the same means as that of the cell.
+//! The plant's copy of a run as evidence: fetched into a run folder, and verified with the same code as the cell's own
+//! record.
 
 use std::fs;
 use std::path::Path;
@@ -13,28 +14,28 @@ use super::hex::digits;
 use super::link::Link;
 use super::settings::ArtefactSettings;
 
-/// A run of the plant.
+/// Run in the plant.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PlantRun {
-    /// Its number in the database.
+    /// Id of the run in the database.
     pub id: i32,
-    /// The cell that made it.
+    /// Cell that made the run.
     pub cell: String,
-    /// What it is called there.
+    /// Name of the run at the cell.
     pub name: String,
-    /// How many of its records the plant has.
+    /// Number of records that the plant has.
     pub records: u64,
-    /// The hash of the last.
+    /// Hash of the last of these records.
     pub head: String,
-    /// The keys that may have signed the cell's records, as the plant knows them.
+    /// Keys that may have signed the cell's records, as the plant has them.
     pub keys: Vec<PublicKey>,
 }
 
 impl PlantRun {
-    /// Finds a run by its name, and by its cell where several have one of that name.
+    /// Finds a run by its name, and by its cell if several cells have a run of that name.
     ///
     /// # Errors
-    /// No such run, a plant that cannot be reached.
+    /// There is no such run, or the plant cannot be reached.
     pub async fn find(link: &Link, cell: Option<&str>, name: &str) -> Result<Self, PlantError> {
         let failed = refused("to find a run");
         let text = "SELECT r.id, c.name, r.name, r.records, r.head,
@@ -53,10 +54,11 @@ impl PlantRun {
         })
     }
 
-    /// Holds the journal at the cell against what had arrived: that many records must stand in it, of which the last has this hash.
+    /// Checks the journal at the cell against the plant's copy: the journal must contain at least that many records,
+    /// and the last of them must have this hash.
     ///
     /// # Errors
-    /// A journal that was cut or rewritten after it was shipped; one that cannot be read.
+    /// The journal was cut or rewritten after it was replicated, or cannot be read.
     pub fn stands_in(&self, folder: &Path) -> Result<(), PlantError> {
         if self.records == 0 {
             return Ok(());
@@ -76,10 +78,10 @@ impl PlantRun {
         Err(PlantError::Differs { run: self.name.clone(), what })
     }
 
-    /// Brings the run back into a folder, which is made: its records and its files. It is proven by [`regrind_journal::verify`].
+    /// Fetches the records and files of the run into a new folder. [`regrind_journal::verify`] then verifies it.
     ///
     /// # Errors
-    /// A folder that is in use; a record that no journal writes; a plant that cannot be reached.
+    /// The folder is in use, a record is not one that a journal writes, or the plant cannot be reached.
     pub async fn fetch(
         &self,
         link: &Link,
@@ -100,7 +102,7 @@ impl PlantRun {
         Ok(())
     }
 
-    /// The records of the run, in order.
+    /// Returns the records of the run, in order.
     async fn records(&self, link: &Link, folder: &Path) -> Result<Vec<Record>, PlantError> {
         const PAGE: i32 = 5000;
         let mut records: Vec<Record> = Vec::new();
@@ -128,7 +130,8 @@ impl PlantRun {
         }
     }
 
-    /// Proves the plant's copy: records, order, files and signatures. With no keys given those count that the plant knows of the cell.
+    /// Verifies the plant's copy: records, order, files and signatures. If no keys are given, the keys that the plant
+    /// has for the cell count.
     ///
     /// # Errors
     /// [`JournalError::Broken`] with the first record that cannot be believed.
@@ -146,7 +149,8 @@ impl PlantRun {
     }
 }
 
-/// The newest seal among records, as the anchor that stood beside the journal then; where nothing is sealed, their end.
+/// Returns the newest seal among the records, as the anchor next to the journal had it at that time; without a seal,
+/// the end of the records.
 fn last_sealed(records: &[Record]) -> Option<Anchor> {
     let Some(seal) = records.iter().rev().find(|record| record.kind == Kind::Seal).map(Record::value) else {
         return records.last().map(|last| Anchor::new(last.seq, last.hash.clone()));
@@ -161,10 +165,10 @@ fn last_sealed(records: &[Record]) -> Option<Anchor> {
     })
 }
 
-/// Reads a content by its hash; none where the plant does not have it.
+/// Reads a content by its hash; `None` if the plant does not have it.
 ///
 /// # Errors
-/// A plant that cannot be reached, a folder of large files that is not there.
+/// The plant cannot be reached, or the folder of large files does not exist.
 pub async fn content(
     link: &Link,
     artefacts: Option<&ArtefactSettings>,
@@ -176,10 +180,10 @@ pub async fn content(
     match (row.get::<_, Option<Vec<u8>>>(0), row.get::<_, Option<String>>(1), artefacts) {
         (Some(content), ..) => Ok(Some(content)),
         (None, Some(_), Some(kept)) => {
-            // The place is made from the hash here too: what stands in a table leads nowhere else.
+            // The path is built from the hash here too, so a text in a table cannot lead to another file.
             let name = digits(sha256);
             let path = kept.folder.join(&name[..2]).join(&name);
-            // A share that is gone may hang: whoever asks goes on with others meanwhile.
+            // A network share that is gone can hang, so the read runs in a blocking thread and other work continues.
             let at = path.clone();
             let read = tokio::task::spawn_blocking(move || fs::read(at));
             match read.await.unwrap_or_else(|error| Err(std::io::Error::other(error))) {

@@ -1,4 +1,4 @@
-//! Why the plant could not be reached, or said no, with the remedy.
+//! Errors of the plant: why it cannot be reached or why it refuses, with the remedy.
 
 use std::io;
 use std::path::PathBuf;
@@ -9,14 +9,14 @@ use regrind_report::ReportError;
 use regrind_trust::TrustError;
 use thiserror::Error;
 
-/// Why the plant could not be reached, or said no.
+/// Reason why the plant cannot be reached or refuses.
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the messages tell them")]
 #[non_exhaustive]
 pub enum PlantError {
     #[error(transparent)]
     Trust(#[from] TrustError),
-    /// It may be there again later.
+    /// The database cannot be reached now; a retry can succeed.
     #[error("the database at {place} cannot be reached: {what}; check that it runs and that the network is up")]
     Unreachable { place: String, what: String },
     #[error("the database refused {what}: {why}{hint}")]
@@ -27,7 +27,7 @@ pub enum PlantError {
         "the layout of the database is not what was put there: migration {version} has another text; bring the database back from its backup"
     )]
     ForeignLayout { version: i32 },
-    /// What the plant holds and what the cell holds are two stories.
+    /// The records in the plant and those at the cell disagree.
     #[error("{run}: {what}; keep both as they are, and compare: regrind audit verify --plant")]
     Differs { run: String, what: String },
     #[error("the plant has no run {name:?} of {cell:?}; `regrind plant runs` lists them")]
@@ -47,19 +47,20 @@ pub enum PlantError {
 }
 
 impl PlantError {
-    /// Whether it may pass by itself: a network that is down, a database that is being started.
+    /// Returns true if the error can pass by itself: the network is down, or the database is starting.
     pub fn may_pass(&self) -> bool {
         matches!(self, Self::Unreachable { .. })
     }
 }
 
-/// What the database was asked for when it failed.
+/// Converts an error of the database to a [`PlantError`]; `what` names the request that failed.
 pub(crate) fn refused(what: &'static str) -> impl Fn(tokio_postgres::Error) -> PlantError {
     move |error| {
         let Some(said) = error.as_db_error() else {
             return PlantError::Unreachable { place: "the other end".into(), what: in_words(&error) };
         };
-        // Classes 57 (it is being shut down or started) and 53 (no room, too many), and a lost race, pass.
+        // Errors that can pass: classes 57 (the server shuts down or starts), 53 (no space, too many connections), 08,
+        // and 40 (a lost race).
         let passes = ["57", "53", "40", "08"].iter().any(|class| said.code().code().starts_with(class));
         if passes {
             return PlantError::Unreachable { place: "the other end".into(), what: said.message().to_owned() };
@@ -69,7 +70,7 @@ pub(crate) fn refused(what: &'static str) -> impl Fn(tokio_postgres::Error) -> P
     }
 }
 
-/// An error of the client with what is behind it.
+/// Returns the message of an error of the client, with its causes.
 pub(crate) fn in_words(error: &tokio_postgres::Error) -> String {
     let mut words = error.to_string();
     let mut behind = std::error::Error::source(error);

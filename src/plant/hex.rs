@@ -1,11 +1,11 @@
-//! Hashes as the database has them, bytes, and as people and journals have them, small hexadecimal digits.
+//! Conversion of hashes between bytes (database) and lower-case hexadecimal digits (people and journals).
 
-/// Returns the digits of bytes.
+/// Returns the hexadecimal digits of bytes.
 pub(crate) fn digits(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// Returns the bytes of digits; none for what are not pairs of small digits.
+/// Returns the bytes of hexadecimal digits; `None` if the text is not pairs of lower-case digits.
 pub(crate) fn unhex(digits: &str) -> Option<Vec<u8>> {
     let nibble = |digit: u8| match digit {
         b'0'..=b'9' => Some(digit - b'0'),

@@ -1,4 +1,5 @@
-//! What other cells have learned, for a first part: asked for by what the parts have in common, and proven here before it is used.
+//! Results of other cells as prior knowledge for a first part: selected by what the parts have in common, and verified
+//! here before use.
 
 use std::fs;
 use std::io::{self, Read};
@@ -15,21 +16,21 @@ use super::hex::digits;
 use super::link::Link;
 use super::settings::ArtefactSettings;
 
-/// The largest file that teaches: as in the database's own layout.
+/// Maximum size of a file of learned results, the same as in the layout of the database.
 const MOST_BYTES: u64 = 4 << 20;
 
-/// What the plant knows that a first part of a kind can begin with.
+/// Prior knowledge of the plant for a first part of a kind.
 #[derive(Default)]
 pub struct Knowledge {
-    /// What other cells found of parts of this kind.
+    /// Results of other cells for parts of this kind.
     pub lessons: Vec<(CellRun, Learned)>,
-    /// What two cells found of the same kind, whichever; whether this cell is one of them.
+    /// Results of pairs of cells for the same kind, whichever kind it is; true if this cell is one of the pair.
     pub pairs: Vec<([Learned; 2], bool)>,
-    /// What was given and cannot be believed.
+    /// Reasons for each result that was rejected.
     pub left_alone: Vec<String>,
 }
 
-/// A lesson as it was given.
+/// Result as the plant delivered it.
 struct Given {
     kind: String,
     is_own: bool,
@@ -44,10 +45,12 @@ struct Head {
 }
 
 impl Knowledge {
-    /// Asks for what other cells found of parts of a kind, and for what tells how alike machines are.
+    /// Asks the plant for the results of other cells for a kind of parts, and for the pairs of results that show how
+    /// similar machines are.
     ///
     /// # Errors
-    /// A plant that cannot be reached, a role that is no cell's. What is wrong with one lesson is told in the answer and to the plant.
+    /// The plant cannot be reached, or the role is not a cell's. A fault of one result is in the answer and is reported
+    /// to the plant.
     pub async fn ask(
         link: &Link,
         artefacts: Option<&ArtefactSettings>,
@@ -74,7 +77,7 @@ impl Knowledge {
         Ok(knowledge)
     }
 
-    /// Proves what was given, and tells the plant what cannot be believed.
+    /// Verifies the delivered results, and reports to the plant those that cannot be believed.
     async fn believed(
         &mut self,
         link: &Link,
@@ -99,7 +102,7 @@ impl Knowledge {
     }
 }
 
-/// Takes a lesson from a row, where it is what it is said to be.
+/// Reads a result from a row, if its content is what the row says.
 fn given(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> Result<Given, String> {
     let (kind, is_own): (String, bool) = (row.get(0), row.get(1));
     let from = CellRun { cell: row.get(2), run: row.get(3) };
@@ -120,7 +123,7 @@ fn given(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> R
     Ok(Given { kind, is_own, from, learned })
 }
 
-/// A file that is no larger than a lesson is, whatever the database says of it.
+/// Reads a file up to the maximum size of a result, whatever size the database gives.
 fn bounded(path: &Path) -> io::Result<Vec<u8>> {
     let mut content = Vec::new();
     fs::File::open(path)?.take(MOST_BYTES + 1).read_to_end(&mut content)?;
@@ -130,18 +133,19 @@ fn bounded(path: &Path) -> io::Result<Vec<u8>> {
     }
 }
 
-/// Has the plant know what a finished run of this cell has learned, all of whose files have arrived. Returns why it is refused.
+/// Registers in the plant what a finished run of this cell has learned; all files of the run have arrived. Returns the
+/// reason if the plant refuses.
 pub(crate) async fn teach(link: &Link, folder: &Path, id: i32) -> Result<Option<String>, PlantError> {
     let failed = refused("what a run has learned");
     let text = "SELECT a.sha256 FROM run_artefact a WHERE a.run = $1 AND a.name = $2 AND NOT EXISTS (SELECT FROM lesson l WHERE l.run = $1)";
     let Some(row) = link.client().query_opt(text, &[&id, &LEARNED]).await.map_err(&failed)? else { return Ok(None) };
     let sha256: &[u8] = row.get(0);
-    // A file that is not what was written has been told of, and teaches nobody.
+    // A file that differs from its record was reported elsewhere, and is not used for learning.
     let Ok(content) = fs::read(folder.join(LEARNED)) else { return Ok(None) };
     if sha256_hex(&content) != digits(sha256) {
         return Ok(None);
     }
-    // Nor does one of an earlier version, which does not say for which parts it is.
+    // A file of an earlier version does not name its kind of parts, so it is not used either.
     let Ok(Head { kind: Some(kind) }) = serde_json::from_slice(&content) else { return Ok(None) };
     let row = link.client().query_one("SELECT teach($1, $2, $3)", &[&id, &kind, &sha256]).await;
     Ok(row.map_err(&failed)?.get(0))

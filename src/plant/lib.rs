@@ -1,7 +1,7 @@
-//! Many cells: their records and their work in one PostgreSQL, and a page that shows them.
+//! Plant of several cells: their records and their queue in one PostgreSQL database, and a page that shows them.
 //!
-//! A cell never needs the plant to run, hold or accept, and the plant never commands a motion. What leaves the cell is its record; what
-//! comes in is work, and is asked for.
+//! A cell never needs the plant to run, hold or accept, and the plant never commands a motion. A cell sends its record
+//! to the plant, and fetches work from it.
 #![cfg(feature = "plant")]
 
 mod copy;

@@ -1,4 +1,4 @@
-//! The way to the database: who signs in, by what both ends prove themselves, and how long anything may take.
+//! Connection to the database: role, authentication of both ends, and timeouts.
 
 use std::time::Duration;
 
@@ -11,24 +11,25 @@ use tokio_postgres_rustls::MakeRustlsConnect;
 use super::error::{PlantError, in_words, refused};
 use super::settings::DatabaseSettings;
 
-/// How long the database may take to be reached, and to answer.
+/// Timeouts to connect to the database, and to get an answer.
 const PATIENCE: Duration = Duration::from_secs(10);
 const ANSWER: Duration = Duration::from_secs(120);
-/// How soon a connection is given up whose other end is gone.
+/// Time after which a connection to a dead peer is closed.
 const SILENCE: Duration = Duration::from_secs(30);
 
-/// A connection to the database of a plant. It ends with the last of those who hold it.
+/// Connection to the database of a plant. It closes when the last owner drops it.
 pub struct Link {
     client: Client,
-    /// Where it goes, for messages.
+    /// Address, for messages.
     place: String,
 }
 
 impl Link {
-    /// Signs in to the database as the settings say.
+    /// Signs in to the database with the settings.
     ///
     /// # Errors
-    /// A password or certificates that cannot be read, a database on another computer without certificates, one that cannot be reached.
+    /// A password or a certificate cannot be read, the database is on another computer and no certificates are given,
+    /// or it cannot be reached.
     pub async fn open(settings: &DatabaseSettings) -> Result<Self, PlantError> {
         let place = format!("{}:{}/{}", settings.host, settings.port, settings.name);
         let proof = regrind_trust::proof(&settings.host, settings.certificates.as_deref(), "[database]")?;
@@ -54,48 +55,49 @@ impl Link {
         Ok(Self { client, place })
     }
 
-    /// What is asked goes through here.
+    /// Returns the client, for queries.
     pub fn client(&self) -> &Client {
         &self.client
     }
 
-    /// The same, for what takes a transaction.
+    /// Returns the client, for transactions.
     pub fn client_mut(&mut self) -> &mut Client {
         &mut self.client
     }
 
-    /// Asks a question; returns its rows.
+    /// Runs a query; returns its rows.
     ///
     /// # Errors
-    /// A database that cannot be reached, or refuses it.
+    /// The database cannot be reached, or refuses the query.
     pub async fn ask(&self, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<Vec<Row>, PlantError> {
         self.client.query(text, values).await.map_err(refused("what it was asked"))
     }
 
-    /// Tells how the cell is, in the run of this name.
+    /// Reports the state of the cell, in the run of this name.
     ///
     /// # Errors
-    /// A database that cannot be reached, or refuses it.
+    /// The database cannot be reached, or refuses the report.
     pub async fn tell_state(&self, run: Option<&str>, snapshot: &Value) -> Result<(), PlantError> {
         let told = self.client.execute("SELECT tell_state($1, $2::text::jsonb)", &[&run, &snapshot.to_string()]).await;
         told.map(drop).map_err(refused("how the cell is"))
     }
 
-    /// Whether nothing can be asked any more.
+    /// Returns true if the connection is closed.
     pub fn is_closed(&self) -> bool {
         self.client.is_closed()
     }
 
-    /// Where it goes, for messages.
+    /// Returns the address, for messages.
     pub fn place(&self) -> &str {
         &self.place
     }
 }
 
-/// Who could not sign in is told so; everything else is a database that is not there.
+/// Converts an error of signing in: a refused login is reported as such; every other error means that the database
+/// cannot be reached.
 fn unopened(place: &str, error: &tokio_postgres::Error) -> PlantError {
     match error.as_db_error() {
-        // Invalid authorisation, and no such database or role.
+        // Classes 28 (invalid authorisation), 3D and 42 (no such database or role).
         Some(said) if ["28", "3D", "42"].iter().any(|class| said.code().code().starts_with(class)) => {
             PlantError::Refused {
                 what: "to let this computer in",

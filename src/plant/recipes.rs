@@ -1,7 +1,8 @@
-//! Recipes in the plant: brought in versions, signed by two people, and pulled by the hash that was signed.
+//! Recipes in the plant: stored in versions, signed by two people, and pulled by the hash that was signed.
 //!
-//! What is signed is the hash of name, version, text and files together, so that an old recipe under a new name is another one, which nobody
-//! has signed. The cell proves hash and signatures by the keys of its own plant file: a database that was changed gives it nothing to grind.
+//! The signed hash covers name, version, text and files together. An old recipe under a new name therefore has another
+//! hash, which nobody has signed. The cell verifies hash and signatures with the keys in its own plant file, so a
+//! changed database cannot make it grind another recipe.
 
 use std::collections::BTreeMap;
 
@@ -13,36 +14,36 @@ use super::hex::{digits, unhex};
 use super::link::Link;
 use super::settings::Approver;
 
-/// How many people sign a recipe.
+/// Number of people who must sign a recipe.
 pub const SIGNERS: usize = 2;
 
-/// A recipe as the plant has it: its text, and the files that it names.
+/// Recipe in the plant: its text, and the files that it names.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PlantRecipe {
-    /// What it is called.
+    /// Name of the recipe.
     pub name: String,
-    /// Its version, from 1.
+    /// Version, from 1.
     pub version: i32,
-    /// The text of the recipe.
+    /// Text of the recipe.
     pub text: String,
-    /// What it names beside itself, by the path in it.
+    /// Files that the recipe names, by their path in the recipe.
     pub files: BTreeMap<String, Vec<u8>>,
 }
 
-/// Who has signed a recipe.
+/// Signature of a person on a recipe.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Approval {
-    /// What the person is called.
+    /// Name of the person.
     pub person: String,
-    /// The public half of the person's key.
+    /// Public half of the person's key.
     pub key: String,
-    /// The signature, in hexadecimal digits.
+    /// Signature, in hexadecimal digits.
     pub signature: String,
 }
 
 impl PlantRecipe {
-    /// Returns the hash by which it is known and signed, in hexadecimal digits: SHA-256 of a first line that says what it is, then name, version,
-    /// hash of the text, and a line for each file.
+    /// Returns the hash that identifies the recipe and that people sign, in hexadecimal digits. It is the SHA-256 of a
+    /// first line with the format, then name, version, hash of the text, and a line for each file.
     pub fn sha256(&self) -> String {
         let mut lines =
             format!("regrind recipe 1\n{}\n{}\n{}\n", self.name, self.version, sha256_hex(self.text.as_bytes()));
@@ -52,10 +53,11 @@ impl PlantRecipe {
         sha256_hex(lines.as_bytes())
     }
 
-    /// Brings it as the next version of its name; returns its hash.
+    /// Stores the recipe as the next version of its name; returns its hash.
     ///
     /// # Errors
-    /// A recipe that is there under this or another name, a role that may not bring any, a plant that cannot be reached.
+    /// The recipe exists already under this or another name, the role may not store recipes, or the plant cannot be
+    /// reached.
     pub async fn propose(&mut self, link: &Link) -> Result<String, PlantError> {
         let failed = refused("the recipe");
         let newest = "SELECT coalesce(max(version), 0) FROM recipe WHERE name = $1";
@@ -72,10 +74,10 @@ impl PlantRecipe {
         Ok(digits(row.get(0)))
     }
 
-    /// Finds a version of a recipe, or the newest that nobody has withdrawn, as a planner or reader.
+    /// Finds a version of a recipe, or the newest version that is not withdrawn. For planners and readers.
     ///
     /// # Errors
-    /// No such recipe, a plant that cannot be reached.
+    /// There is no such recipe, or the plant cannot be reached.
     pub async fn find(link: &Link, name: &str, version: Option<i32>) -> Result<Self, PlantError> {
         let text = "SELECT name, version, text, array(SELECT f.name FROM recipe_file f WHERE f.recipe = r.sha256 ORDER BY 1),
                 array(SELECT f.content FROM recipe_file f WHERE f.recipe = r.sha256 ORDER BY f.name)
@@ -95,10 +97,10 @@ impl PlantRecipe {
         })
     }
 
-    /// Puts a person's signature beside it.
+    /// Adds a person's signature to the recipe.
     ///
     /// # Errors
-    /// A person or a key that has signed it already, a role that may not, a plant that cannot be reached.
+    /// The person or the key has signed the recipe already, the role may not sign, or the plant cannot be reached.
     pub async fn approve(&self, link: &Link, person: &str, key: &AuditKey) -> Result<(), PlantError> {
         let sha256 = self.sha256();
         let signature = key.sign(words(&sha256, person).as_bytes());
@@ -117,12 +119,12 @@ impl PlantRecipe {
         }
     }
 
-    /// Pulls the recipe of a hash to a cell, and proves it: that it is what has this hash, and that two different people have signed it whom the
-    /// plant file of the cell knows. Returns who they are.
+    /// Pulls the recipe with a hash to a cell, and verifies it: the recipe must have this hash, and at least two people
+    /// with different keys must have signed it who are in the plant file of the cell. Returns their names.
     ///
     /// # Errors
-    /// A recipe that is not what its hash says, that too few people have signed, that was withdrawn; the plant is told. A plant that cannot be
-    /// reached.
+    /// The recipe does not match its hash, too few people have signed it, or it was withdrawn; the plant receives a
+    /// report of this. Or the plant cannot be reached.
     pub async fn pull(link: &Link, sha256: &str, approvers: &[Approver]) -> Result<(Self, Vec<String>), PlantError> {
         let bytes = unhex(sha256).unwrap_or_default();
         let text = "SELECT name, version, text, names, contents, persons, keys, signatures FROM pull_recipe($1)";
@@ -156,12 +158,12 @@ impl PlantRecipe {
     }
 }
 
-/// What a person signs.
+/// Returns the text that a person signs.
 fn words(sha256: &str, person: &str) -> String {
     format!("regrind recipe approval 1\n{sha256}\n{person}\n")
 }
 
-/// Proves a recipe that came over the wire; returns who has signed it, or what is wrong.
+/// Verifies a recipe received from the plant. Returns the names of those who signed it; in words, the fault.
 fn proven(
     recipe: PlantRecipe,
     sha256: &str,
@@ -183,7 +185,7 @@ fn proven(
         })
     };
     let mut signed: Vec<&Approver> = approvers.iter().filter(has_signed).collect();
-    // Two names with one key are one person, and so is one name with two.
+    // Two names with one key count as one person; so does one name with two keys.
     signed.sort_by(|a, b| a.key.cmp(&b.key));
     signed.dedup_by(|a, b| a.key == b.key);
     signed.sort_by(|a, b| a.name.cmp(&b.name));
@@ -239,7 +241,7 @@ mod tests {
             proven(recipe.clone(), &good.sha256(), approvals, approvers).map(|(_, signed)| signed)
         };
         assert_eq!(of(&good, &both, &known), Ok(vec!["Ada".to_owned(), "Bob".to_owned()]));
-        // The old text under a new name, or with another file, is not what was signed.
+        // The old text under a new name, or with another file, has a hash that nobody signed.
         for other in [
             PlantRecipe { name: "panel".into(), ..good.clone() },
             PlantRecipe { version: 4, ..good.clone() },
@@ -247,19 +249,19 @@ mod tests {
             PlantRecipe { files: BTreeMap::new(), ..good.clone() },
         ] {
             assert!(of(&other, &both, &known).unwrap_err().contains("was changed"));
-            // With its own hash it is whole, and nobody has signed it.
+            // With its own hash it is consistent, but nobody has signed it.
             let own = proven(other.clone(), &other.sha256(), &both, &known).unwrap_err();
             assert!(own.contains("signed by nobody"), "{own}");
         }
         let too_few = [
             (signed(&good, &[("Ada", &ada)]), known.to_vec()),
             (signed(&good, &[("Ada", &ada), ("Eve", &eve)]), known.to_vec()),
-            // In another's name.
+            // Signed in another person's name.
             (signed(&good, &[("Ada", &ada), ("Bob", &eve)]), known.to_vec()),
             // One person with two keys, and two names with one.
             (signed(&good, &[("Ada", &ada), ("Ada", &bob)]), vec![approver("Ada", &ada), approver("Ada", &bob)]),
             (signed(&good, &[("Ada", &ada), ("Bob", &ada)]), vec![approver("Ada", &ada), approver("Bob", &ada)]),
-            // A signature of the one under the name of the other.
+            // The signature of one person under the name of the other.
             (
                 vec![both[0].clone(), Approval { signature: both[0].signature.clone(), ..both[1].clone() }],
                 known.to_vec(),

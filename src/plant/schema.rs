@@ -1,11 +1,11 @@
-//! The layout of the database, version by version, and who may do what in it.
+//! Layout of the database, version by version, and the roles with their rights.
 
 use tokio_postgres::Client;
 
 use super::error::{PlantError, refused};
 use super::link::Link;
 
-/// Every version of the layout: what is put on top of the one before. A text that was handed out is never changed.
+/// All versions of the layout, each as a migration from the one before. A published migration never changes.
 const MIGRATIONS: [(i32, &str); 6] = [
     (1, include_str!("migrations/0001_records.sql")),
     (2, include_str!("migrations/0002_work.sql")),
@@ -15,23 +15,24 @@ const MIGRATIONS: [(i32, &str); 6] = [
     (6, include_str!("migrations/0006_knowledge.sql")),
 ];
 
-/// The groups of roles: what signs in is a member of one.
+/// Groups of roles. Each role that signs in is a member of one group.
 const GROUPS: [&str; 4] = ["regrind_cell", "regrind_reader", "regrind_planner", "regrind_worker"];
 
-/// Keeps two programs from changing the layout at once: a number that nobody else uses.
+/// Key of the advisory lock that stops two programs from changing the layout at once.
 const LOCK: i64 = 0x5267_7264_506c_616e;
 
-/// Brings the layout of a database up to this program's, as its owner. Returns the version that was there, and the one that is.
+/// Migrates the layout of a database to the version of this program, as its owner. Returns the version before and the
+/// version after.
 ///
 /// # Errors
-/// A role that may not, a database that a later program has laid out, one whose layout was changed by hand.
+/// The role may not, a later program has laid out the database, or its layout was changed by hand.
 pub async fn migrate(link: &mut Link) -> Result<[i32; 2], PlantError> {
     let failed = refused("to be laid out");
     let client = link.client_mut();
     let step = client.transaction().await.map_err(&failed)?;
     step.execute("SELECT pg_advisory_xact_lock($1)", &[&LOCK]).await.map_err(&failed)?;
     for group in GROUPS {
-        // Groups are of all databases together: another plant may have made them.
+        // Roles are common to all databases of the server, so another plant may have made the groups already.
         let make =
             format!("DO $$ BEGIN CREATE ROLE {group} NOLOGIN; EXCEPTION WHEN duplicate_object THEN NULL; END $$");
         step.batch_execute(&make).await.map_err(&failed)?;
@@ -60,16 +61,16 @@ pub async fn migrate(link: &mut Link) -> Result<[i32; 2], PlantError> {
     Ok([before, known()])
 }
 
-/// Holds the layout of a database against the one that this program knows.
+/// Checks that the layout of a database is the one this program knows.
 ///
 /// # Errors
-/// A layout that is older, later or another one.
+/// The layout is older, later or different.
 pub async fn is_known(client: &Client) -> Result<(), PlantError> {
     let layout = |found, remedy| PlantError::Layout { found, known: known(), remedy };
     let older = "bring it up as its owner: regrind plant init";
     let rows = match client.query("SELECT version, sha256 FROM regrind.migration ORDER BY version", &[]).await {
         Ok(rows) => rows,
-        // There is no such table, or no such schema.
+        // The table or the schema does not exist.
         Err(error) if error.code().is_some_and(|code| ["42P01", "3F000"].contains(&code.code())) => {
             return Err(layout(0, older));
         }
@@ -86,7 +87,7 @@ fn known() -> i32 {
     MIGRATIONS.last().map_or(0, |(version, _)| *version)
 }
 
-/// Returns the newest version that was put there, where all of them are ours.
+/// Returns the newest applied version, if every applied migration is one of this program's.
 fn held_against_ours(applied: &[(i32, String)]) -> Result<i32, PlantError> {
     for (k, (version, sha256)) in applied.iter().enumerate() {
         match MIGRATIONS.get(k) {
@@ -101,12 +102,12 @@ fn held_against_ours(applied: &[(i32, String)]) -> Result<i32, PlantError> {
     Ok(applied.last().map_or(0, |(version, _)| *version))
 }
 
-/// What a role of a person or a program is for.
+/// Purpose of the role of a person or a program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PlantRole {
-    /// Looks at everything and changes nothing: the page of the plant, Grafana, who counts parts.
+    /// Reads everything and changes nothing: for the page of the plant, Grafana, and statistics.
     Reader,
-    /// Puts parts into the queue and brings recipes, besides looking.
+    /// Reads everything, puts parts into the queue, and stores recipes.
     Planner,
     /// Makes the simulated runs of studies.
     Worker,
@@ -122,11 +123,11 @@ impl PlantRole {
     }
 }
 
-/// Makes a cell known, with the role by which it signs in, and the keys that may have signed its records. Who is known gets the new password
-/// and the further keys.
+/// Registers a cell with its role and the keys that may sign its records. A cell that is registered already gets the
+/// new password and the additional keys.
 ///
 /// # Errors
-/// A role that may not make roles, a name that another cell's role has.
+/// The role may not make roles, or another cell's role has this name.
 pub async fn enrol_cell(
     link: &mut Link,
     name: &str,
@@ -154,10 +155,10 @@ pub async fn enrol_cell(
     step.commit().await.map_err(&failed)
 }
 
-/// Makes a role for a person or a program, or gives it a new password.
+/// Creates a role for a person or a program, or gives an existing role a new password.
 ///
 /// # Errors
-/// A role that may not make roles.
+/// The role may not make roles.
 pub async fn enrol(link: &mut Link, role: &str, password: &str, of: PlantRole) -> Result<(), PlantError> {
     let failed = refused("to enrol the role");
     let step = link.client_mut().transaction().await.map_err(&failed)?;
@@ -165,7 +166,7 @@ pub async fn enrol(link: &mut Link, role: &str, password: &str, of: PlantRole) -
     step.commit().await.map_err(&failed)
 }
 
-/// Names and passwords cannot be given apart from the text of a command: the server itself puts them into it.
+/// Creates the role. A role command takes no parameters, so the server itself formats name and password into its text.
 async fn make_role(
     step: &tokio_postgres::Transaction<'_>,
     role: &str,
@@ -185,10 +186,10 @@ async fn make_role(
     Ok(())
 }
 
-/// Takes a cell out of the plant: its role may not sign in any more, its records stay.
+/// Retires a cell: its role cannot sign in any more; its records stay.
 ///
 /// # Errors
-/// No such cell, a role that may not.
+/// There is no such cell, or the role may not retire it.
 pub async fn retire_cell(link: &mut Link, name: &str) -> Result<bool, PlantError> {
     let failed = refused("to retire the cell");
     let step = link.client_mut().transaction().await.map_err(&failed)?;

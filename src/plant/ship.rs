@@ -1,4 +1,4 @@
-//! Shipping: what stands in the journals of a cell goes to the plant, at least once on the wire and exactly once in the table.
+//! Replication of the journals of a cell to the plant. Records are sent at least once, and stored exactly once.
 //!
 //! ```text
 //!  runs/<id>/journal.sqlite --records--> ship() --+--> record      held against the chain as it arrives
@@ -6,8 +6,9 @@
 //!                  what a glance shows ---------> +--> run, cycle
 //! ```
 //!
-//! How far a run has come is asked of the plant, and nowhere else kept: whatever was lost on the way, a round begins from what stands
-//! there. A journal that is shorter than what the plant has of it, or another one, was cut or rewritten, and is told and left alone.
+//! The plant alone stores how far a run is replicated. After any loss, a round therefore continues from the plant's
+//! state. A journal that is shorter than the plant's copy, or differs from it, was cut or rewritten; it is reported and
+//! not replicated further.
 
 use std::collections::{HashMap, HashSet};
 use std::fs;
@@ -26,38 +27,39 @@ use super::knowledge::teach;
 use super::link::Link;
 use super::settings::ArtefactSettings;
 
-/// Records and bytes of text that go at once.
+/// Maximum number of records, and of bytes of text, in one batch.
 const MOST_RECORDS: usize = 1000;
 const MOST_BYTES: usize = 1 << 20;
-/// Largest content that the database takes.
+/// Maximum size of a content in the database.
 const LARGEST_BYTES: u64 = 256 << 20;
 
-/// Ships the runs of a folder.
+/// Replicates the runs of a folder.
 pub struct Shipper {
     runs: PathBuf,
     artefacts: Option<ArtefactSettings>,
-    /// The runs of which everything has arrived, as they were then.
+    /// Runs that are completely replicated, with the stamp of their files at that time.
     settled: HashMap<String, Stamp>,
-    /// The runs that cannot be shipped, and why.
+    /// Runs that cannot be replicated, with the reason.
     left_alone: HashMap<String, String>,
-    /// The files that cannot be, by run and name, once they were told.
+    /// Files, by run and name, that cannot be replicated and were reported.
     told: HashSet<(String, String)>,
 }
 
-/// What went in one round.
+/// Result of one round.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Shipped {
-    /// Records that the plant did not have.
+    /// Number of records that the plant did not have.
     pub records: u64,
-    /// Contents of files that it did not have.
+    /// Number of file contents that the plant did not have.
     pub files: u64,
-    /// Runs of which something went.
+    /// Number of runs of which something was sent.
     pub runs: u64,
-    /// Runs that were found to differ from what the plant has of them, or a file of which cannot go, and why. Each is told once.
+    /// Runs that differ from the plant's copy, or that have a file which cannot be sent, with the reason. Each is
+    /// reported once.
     pub differ: Vec<(String, String)>,
 }
 
-/// A run as the plant has it.
+/// State of a run in the plant.
 struct There {
     id: i32,
     records: i32,
@@ -65,20 +67,21 @@ struct There {
 }
 
 impl Shipper {
-    /// Ships from a folder of runs.
+    /// Creates a shipper for a folder of runs.
     pub fn new(runs: PathBuf, artefacts: Option<ArtefactSettings>) -> Self {
         Self { runs, artefacts, settled: HashMap::new(), left_alone: HashMap::new(), told: HashSet::new() }
     }
 
-    /// Runs that differ from what the plant has of them, and why.
+    /// Returns the runs that differ from the plant's copy, with the reason.
     pub fn left_alone(&self) -> impl Iterator<Item = (&str, &str)> {
         self.left_alone.iter().map(|(run, why)| (run.as_str(), why.as_str()))
     }
 
-    /// Ships what is there and has not arrived, the newest run first.
+    /// Sends everything that the plant does not have, the newest run first.
     ///
     /// # Errors
-    /// A plant that cannot be reached or refuses everything. What is wrong with one run is told in the answer, and the others go.
+    /// The plant cannot be reached, or refuses everything. A fault of one run is in the result, and the other runs
+    /// continue.
     pub async fn round(&mut self, link: &Link) -> Result<Shipped, PlantError> {
         let mut shipped = Shipped::default();
         for (name, stamp) in self.unsettled() {
@@ -89,7 +92,7 @@ impl Shipper {
                     self.left_alone.insert(run.clone(), what.clone());
                     shipped.differ.push((run, what));
                 }
-                // A journal that is being made, or that cannot be read now: another round will tell.
+                // The journal is being created, or cannot be read now: a later round retries.
                 Err(PlantError::Journal(_) | PlantError::Report(_)) => {}
                 Err(error) => return Err(error),
             }
@@ -97,7 +100,7 @@ impl Shipper {
         Ok(shipped)
     }
 
-    /// The runs that may have something new.
+    /// Returns the runs that can have new content.
     fn unsettled(&self) -> Vec<(String, Stamp)> {
         let entries = fs::read_dir(&self.runs).into_iter().flatten().filter_map(Result::ok);
         let named = entries.filter_map(|entry| entry.file_name().into_string().ok());
@@ -111,7 +114,7 @@ impl Shipper {
         open
     }
 
-    /// Ships one run; returns whether all of it has arrived.
+    /// Replicates one run; returns true if the plant then has all of it.
     async fn ship_run(&mut self, link: &Link, name: &str, shipped: &mut Shipped) -> Result<bool, PlantError> {
         let folder = self.runs.join(name);
         let Some(last) = Reader::open(&folder)?.last()? else { return Ok(false) };
@@ -139,7 +142,7 @@ impl Shipper {
         Ok(missing == 0 && i64::from(there.records) >= last.seq as i64)
     }
 
-    /// Has the plant know what a finished run has learned.
+    /// Registers in the plant what a finished run has learned.
     async fn teach(
         &mut self,
         link: &Link,
@@ -156,7 +159,8 @@ impl Shipper {
         Ok(())
     }
 
-    /// Gives the contents of the files on record that the plant does not have. Returns how many went and how many could not.
+    /// Sends the contents of the recorded files that the plant does not have. Returns how many were sent and how many
+    /// could not be sent.
     async fn give_files(
         &mut self,
         link: &Link,
@@ -184,7 +188,7 @@ impl Shipper {
         Ok(files)
     }
 
-    /// Gives the content of one file; returns why it cannot be.
+    /// Sends the content of one file; returns the reason if it cannot be sent.
     async fn give_file(
         &self,
         link: &Link,
@@ -225,7 +229,8 @@ impl Shipper {
     }
 }
 
-/// Puts a content into the folder of the plant, under its hash. What is there already should be the same, and is put right where it is not.
+/// Writes a content to the folder of the plant, under its hash. An existing file is checked, and repaired if it
+/// differs.
 fn put_aside(folder: &Path, sha256: &[u8], content: &[u8]) -> Result<(), PlantError> {
     let name = digits(sha256);
     let path = folder.join(&name[..2]).join(&name);
@@ -243,7 +248,7 @@ async fn open_run(link: &Link, name: &str) -> Result<There, PlantError> {
     Ok(There { id: row.get(0), records: row.get(1), head: row.get(2) })
 }
 
-/// Holds a journal against what the plant has of it, and tells the plant where they differ.
+/// Compares a journal with the plant's copy, and reports a difference to the plant.
 async fn held_against(link: &Link, folder: &Path, run: &str, there: &There) -> Result<(), PlantError> {
     let copy = PlantRun {
         id: there.id,
@@ -262,7 +267,7 @@ async fn held_against(link: &Link, folder: &Path, run: &str, there: &There) -> R
     }
 }
 
-/// Reads the next records that go at once.
+/// Reads the next batch of records.
 fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
     let mut batch = Vec::new();
     let mut bytes = 0;
@@ -278,7 +283,8 @@ fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
     Ok(batch)
 }
 
-/// Gives records; returns where the run stands then. An answer that was lost leaves it to the next round to ask.
+/// Sends records; returns the new state of the run in the plant. After a lost answer, the next round asks the plant for
+/// the state.
 async fn give(link: &Link, run: &str, there: There, batch: &[Record]) -> Result<There, PlantError> {
     let hashes: Vec<Vec<u8>> = batch.iter().map(|record| unhex(&record.hash).unwrap_or_default()).collect();
     let texts: Vec<String> = batch.iter().map(Record::text).collect();
@@ -292,7 +298,7 @@ async fn give(link: &Link, run: &str, there: There, batch: &[Record]) -> Result<
     }
 }
 
-/// Whether a run whose last record is this one has its end.
+/// Returns true if the run with this last record has its end on record.
 fn has_end(folder: &Path, last: &Record) -> Result<bool, PlantError> {
     if last.kind == Kind::End {
         return Ok(true);
@@ -312,13 +318,13 @@ async fn tell_run(link: &Link, id: i32, told: &Value) -> Result<(), PlantError> 
     asked.map(drop).map_err(refused("what a glance shows of a run"))
 }
 
-/// Returns what a glance shows of a run, as its record tells it: result, limits, machines, figures of each cycle in micrometres.
+/// Returns the summary of a run from its record: result, limits, machines, and the figures of each cycle in µm.
 ///
 /// # Errors
-/// A record that cannot be read.
+/// The record cannot be read.
 pub fn glance(folder: &Path) -> Result<Value, PlantError> {
     let RunSummary { result, verdict, tolerance, cycles, alarms, machines, wheel_radius_mm, .. } = run_summary(folder)?;
-    // A limit that is none is infinite, which no number in JSON is.
+    // A missing limit is infinite, which JSON cannot represent.
     let limit = |mm: f64| mm.is_finite().then_some(1e3 * mm);
     let cycles = cycles.iter().map(|of| {
         let [[pv, pv_u], [rms, rms_u]] = of.figures.map_or([[None; 2]; 2], |figures| figures.map(|of| of.map(Some)));
@@ -337,7 +343,7 @@ pub fn glance(folder: &Path) -> Result<Value, PlantError> {
     }))
 }
 
-/// The radius of the probe, as the recipe of the run has it.
+/// Returns the radius of the probe from the recipe of the run.
 fn probe_of(folder: &Path) -> Option<f64> {
     let recipe: toml::Table = fs::read_to_string(folder.join("recipe.toml")).ok()?.parse().ok()?;
     recipe.get("measure")?.get("probe_radius_mm")?.as_float()

@@ -1,4 +1,4 @@
-//! Studies: simulated runs of a recipe, spread over workers by leases as the parts of the queue are.
+//! Studies: simulated runs of a recipe, distributed to workers by leases as the parts of the queue are.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -9,41 +9,41 @@ use tokio_postgres::types::ToSql;
 use super::error::{PlantError, refused};
 use super::link::Link;
 
-/// How long a job is kept for a worker: a run takes seconds, of a large part minutes.
+/// Duration of the lease of a job. A run takes seconds; for a large part, minutes.
 const LEASE: Duration = Duration::from_secs(1800);
 
-/// A recipe, and the runs that are to be made of it.
+/// Recipe of a study.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Study {
-    /// What the study is called.
+    /// Name of the study.
     pub name: String,
-    /// What the recipe is called.
+    /// Name of the recipe.
     pub recipe: String,
-    /// The text of the recipe.
+    /// Text of the recipe.
     pub text: String,
-    /// What it names beside itself, by the path in it.
+    /// Files that the recipe names, by their path in the recipe.
     pub files: BTreeMap<String, Vec<u8>>,
 }
 
-/// A run that a worker has taken.
+/// Run that a worker has leased.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Job {
-    /// The study.
+    /// Id of the study.
     pub study: i32,
-    /// Its number in the study, from 1.
+    /// Number of the job in the study, from 1.
     pub number: i32,
-    /// Keys of the recipe and the values that they have here.
+    /// Keys of the recipe, with the values that they have in this job.
     pub varied: Value,
-    /// What the simulated part and run are drawn from.
+    /// Seed of the simulated part and run.
     pub seed: u64,
     lease: i32,
 }
 
 impl Study {
-    /// Begins it: each set of values with each seed. Returns how many jobs there are.
+    /// Stores the study with one job for each combination of values and seed. Returns the number of jobs.
     ///
     /// # Errors
-    /// A study of that name, a role that may not, a plant that cannot be reached.
+    /// A study of that name exists, the role may not, or the plant cannot be reached.
     pub async fn begin(&self, link: &Link, variations: &[Value], seeds: &[u64]) -> Result<usize, PlantError> {
         let seeds: Vec<i64> = seeds.iter().map(|seed| seed.cast_signed()).collect();
         let names: Vec<&str> = self.files.keys().map(String::as_str).collect();
@@ -64,7 +64,7 @@ impl Study {
     /// Reads the recipe of a job.
     ///
     /// # Errors
-    /// A role that is no worker's, a plant that cannot be reached.
+    /// The role is not a worker's, or the plant cannot be reached.
     pub async fn of(link: &Link, job: &Job) -> Result<Self, PlantError> {
         let text = "SELECT recipe, text, names, contents FROM study_recipe($1)";
         let row = link.client().query_one(text, &[&job.study]).await.map_err(refused("the recipe of a study"))?;
@@ -79,10 +79,10 @@ impl Study {
 }
 
 impl Job {
-    /// Takes the next job; none where there is none.
+    /// Leases the next job; `None` if there is none.
     ///
     /// # Errors
-    /// A role that is no worker's, a plant that cannot be reached.
+    /// The role is not a worker's, or the plant cannot be reached.
     pub async fn take(link: &Link) -> Result<Option<Self>, PlantError> {
         let seconds = i32::try_from(LEASE.as_secs()).unwrap_or(i32::MAX);
         let text = "SELECT study, job, lease, varied::text, seed FROM take_job($1)";
@@ -96,10 +96,11 @@ impl Job {
         }))
     }
 
-    /// Brings the result, or why there is none. Returns whether it was taken: another worker has the job where this one's time was over.
+    /// Stores the result, or the reason why there is none. Returns whether the plant accepted it: after the lease has
+    /// ended, another worker can have the job.
     ///
     /// # Errors
-    /// A plant that cannot be reached.
+    /// The plant cannot be reached.
     pub async fn finish(&self, link: &Link, result: &Result<Value, String>) -> Result<bool, PlantError> {
         let told = match result {
             Ok(told) => told.to_string(),

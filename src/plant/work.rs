@@ -1,11 +1,12 @@
-//! The queue of parts, as a cell takes from it: leased, confirmed, begun, and then its run's for good.
+//! The queue of parts, as a cell uses it: a cell leases a part, confirms the lease, and begins a run; from then on the
+//! part belongs to that run.
 //!
 //! ```text
 //!  open --take--> leased --begin--> begun --the run's end arrives--> ended
 //!    ^               |                 |
-//!    +--return, or --+                 |     a lease that ran out opens nothing: the next has another number
+//!    +--return, or --+                 |     an expired lease is void: the next has another number
 //!    |  its time is over               |
-//!    +--give back, where nothing came of its run           ended <--give up, where its run is not gone on with
+//!    +--give back, if its run did nothing                  ended <--give up, if its run does not continue
 //! ```
 
 use std::time::Duration;
@@ -16,38 +17,38 @@ use super::error::{PlantError, refused};
 use super::hex::digits;
 use super::link::Link;
 
-/// How long a part is kept for a cell that has taken it.
+/// Duration of a lease.
 pub const LEASE: Duration = Duration::from_secs(300);
 
-/// A part that a cell has taken.
+/// Part that a cell has leased.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Lease {
-    /// Its number in the queue.
+    /// Number of the part in the queue.
     pub work: i64,
-    /// The serial number of the part.
+    /// Serial number of the part.
     pub serial: String,
-    /// The hash of the recipe, in hexadecimal digits.
+    /// Hash of the recipe, in hexadecimal digits.
     pub recipe_sha256: String,
-    /// When it is due, if somebody said so.
+    /// Due date, if a planner gave one.
     pub due: Option<String>,
-    /// Which lease of the part this is.
+    /// Number of this lease of the part.
     pub number: i32,
 }
 
-/// A part that a cell has begun.
+/// Part that a cell has begun.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Begun {
-    /// The part, as it was taken.
+    /// Lease under which the part was begun.
     pub lease: Lease,
-    /// What its run is called.
+    /// Name of the run.
     pub run: String,
 }
 
 impl Lease {
-    /// Takes the part that is due first, for some minutes; none where there is none for this cell.
+    /// Leases the part that is due first, for the duration [`LEASE`]. Returns `None` if there is no part for this cell.
     ///
     /// # Errors
-    /// A role that is no cell's, a plant that cannot be reached.
+    /// The role is not a cell's, or the plant cannot be reached.
     pub async fn take(link: &Link) -> Result<Option<Self>, PlantError> {
         let text = "SELECT id, serial, recipe, due::text, lease FROM take_work($1)";
         let row = link.client().query_opt(text, &[&seconds()]).await.map_err(refused("a part"))?;
@@ -60,26 +61,26 @@ impl Lease {
         }))
     }
 
-    /// Keeps the part for some minutes more, from now.
+    /// Renews the lease: it then ends [`LEASE`] from now.
     ///
     /// # Errors
-    /// A lease that is over, a plant that cannot be reached.
+    /// The lease has ended, or the plant cannot be reached.
     pub async fn renew(&self, link: &Link) -> Result<(), PlantError> {
         self.ask(link, "SELECT renew_work($1, $2, $3)", &[&self.work, &self.number, &seconds()]).await
     }
 
-    /// Begins the part in a run of this name. The same again has the same answer, so that one that was lost can be asked for.
+    /// Begins the part in a run of this name. Idempotent: a retry after a lost answer returns the same answer.
     ///
     /// # Errors
-    /// A lease that is over, a part that another run has, a recipe that was withdrawn; a plant that cannot be reached.
+    /// The lease has ended, another run has the part, or the recipe was withdrawn; or the plant cannot be reached.
     pub async fn begin(&self, link: &Link, run: &str) -> Result<(), PlantError> {
         self.ask(link, "SELECT begin_work($1, $2, $3)", &[&self.work, &self.number, &run]).await
     }
 
-    /// Gives the part back, unbegun.
+    /// Returns the part to the queue; no run was begun.
     ///
     /// # Errors
-    /// A lease that is over, a plant that cannot be reached.
+    /// The lease has ended, or the plant cannot be reached.
     pub async fn hand_back(&self, link: &Link, why: &str) -> Result<(), PlantError> {
         self.ask(link, "SELECT return_work($1, $2, $3)", &[&self.work, &self.number, &why]).await
     }
@@ -90,10 +91,10 @@ impl Lease {
 }
 
 impl Begun {
-    /// Finds what this cell has begun and whose end has not arrived.
+    /// Finds the parts that this cell has begun and whose runs have no end in the plant yet.
     ///
     /// # Errors
-    /// A role that is no cell's, a plant that cannot be reached.
+    /// The role is not a cell's, or the plant cannot be reached.
     pub async fn all(link: &Link) -> Result<Vec<Self>, PlantError> {
         let text =
             "SELECT id, serial, recipe, due::text, lease, run FROM work WHERE state = 'begun' ORDER BY begun_at, id";
@@ -111,24 +112,24 @@ impl Begun {
         Ok(begun.collect())
     }
 
-    /// Gives the part back, of whose run nothing came: the cell has looked.
+    /// Returns the part to the queue after its run did nothing. The cell has checked this first.
     ///
     /// # Errors
-    /// A run in which something was asked of a machine, a plant that cannot be reached.
+    /// The run has commanded a machine, or the plant cannot be reached.
     pub async fn give_back(&self, link: &Link, why: &str) -> Result<(), PlantError> {
         answered(link, self.lease.work, "SELECT give_back_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
     }
 
-    /// Gives the part up: its run is not gone on with, and no other takes its place unless a planner says so.
+    /// Gives the part up: its run does not continue. The part goes to no other run unless a planner decides so.
     ///
     /// # Errors
-    /// A part that this cell has not begun in that run, a plant that cannot be reached.
+    /// This cell has not begun the part in that run, or the plant cannot be reached.
     pub async fn give_up(&self, link: &Link, why: &str) -> Result<(), PlantError> {
         answered(link, self.lease.work, "SELECT give_up_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
     }
 }
 
-/// Asks for a step of a part, which is refused in words.
+/// Runs a query for a step of a part. The database answers with the reason if it refuses.
 async fn answered(link: &Link, work: i64, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<(), PlantError> {
     let row = link.client().query_one(text, values).await.map_err(refused("a part"))?;
     match row.get::<_, Option<String>>(0) {

@@ -1,16 +1,16 @@
-//! Where the ticks of an axis stand and what is written at them.
+//! Positions and labels of the ticks of an axis.
 
-/// How a coordinate runs along an axis.
+/// Mapping of a coordinate to the position along an axis.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Scale {
-    /// Evenly.
+    /// Linear.
     #[default]
     Linear,
-    /// By its logarithm.
+    /// Logarithmic.
     Log,
 }
 
-/// A range of coordinates laid on a range of pixels.
+/// Mapping of a range of coordinates to a range of pixels.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Ruler {
     scale: Scale,
@@ -19,7 +19,7 @@ pub(super) struct Ruler {
     pixels: [f64; 2],
 }
 
-/// A tick: its pixel and its label; an exponent stands raised behind it.
+/// Tick with its pixel and its label. An exponent is drawn raised, after the label.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Tick {
     pub(super) pixel: f64,
@@ -28,7 +28,7 @@ pub(super) struct Tick {
 }
 
 impl Ruler {
-    /// Lays a range of coordinates, which must be above 0 on a logarithmic axis, on pixels.
+    /// Maps a range of coordinates to a range of pixels. On a logarithmic axis the coordinates must be above 0.
     pub(super) fn new(scale: Scale, range: [f64; 2], pixels: [f64; 2]) -> Self {
         let range = match scale {
             Scale::Linear => range,
@@ -37,7 +37,7 @@ impl Ruler {
         Self { scale, range, pixels }
     }
 
-    /// Widens the range to whole ticks.
+    /// Widens the range so that it begins and ends at a tick.
     pub(super) fn rounded(self, most: usize) -> Self {
         let [low, high] = self.range;
         let step = match self.scale {
@@ -58,7 +58,7 @@ impl Ruler {
         self.pixels[0] + t * (self.pixels[1] - self.pixels[0])
     }
 
-    /// Returns at most about `most` ticks at round numbers.
+    /// Returns approximately `most` ticks or fewer, at round numbers.
     pub(super) fn ticks(&self, most: usize) -> Vec<Tick> {
         let [low, high] = self.range;
         match self.scale {
@@ -82,7 +82,7 @@ impl Ruler {
     }
 }
 
-/// The least of 1, 2 or 5 times a power of ten that divides an extent into at most so many steps.
+/// Returns the smallest step of 1, 2 or 5 times a power of ten that divides `extent` into at most `most` steps.
 fn nice_step(extent: f64, most: usize) -> f64 {
     let extent = if extent > 0.0 { extent } else { 1.0 };
     let least = extent / most.max(1) as f64;
@@ -90,14 +90,14 @@ fn nice_step(extent: f64, most: usize) -> f64 {
     [1.0, 2.0, 5.0, 10.0].map(|m| m * power).into_iter().find(|&s| s >= least * (1.0 - 1e-9)).unwrap_or(10.0 * power)
 }
 
-/// The multiples of a step from low to high, rounding forgiven at both ends.
+/// Returns the multiples of `step` from `low` to `high`, with a tolerance for rounding at both ends.
 fn round_numbers(low: f64, high: f64, step: f64) -> impl Iterator<Item = f64> {
     let first = (low / step - 1e-6).ceil() as i64;
     let last = (high / step + 1e-6).floor() as i64;
     (first..=last).map(move |k| k as f64 * step)
 }
 
-/// Writes a multiple of a step with the decimals that the step has.
+/// Formats a multiple of `step` with as many decimals as the step has.
 fn label(value: f64, step: f64) -> String {
     if value == 0.0 {
         return "0".into();
@@ -109,7 +109,7 @@ fn label(value: f64, step: f64) -> String {
     format!("{value:.decimals$}").replace('-', "\u{2212}")
 }
 
-/// Writes a number with three significant digits, in full.
+/// Formats a number with three significant digits, without an exponent.
 pub(super) fn three_digits(value: f64) -> String {
     if value == 0.0 {
         return "0".into();
@@ -122,7 +122,7 @@ pub(super) fn three_digits(value: f64) -> String {
     format!("{value:.decimals$}").replace('-', "\u{2212}")
 }
 
-/// Writes a count with a comma between thousands.
+/// Formats a count with a comma between thousands.
 pub(super) fn grouped(count: usize) -> String {
     let digits = count.to_string();
     let mut out = String::with_capacity(digits.len() + digits.len() / 3);

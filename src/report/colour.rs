@@ -1,12 +1,12 @@
-//! Colours that everybody can tell apart.
+//! Colours that people with colour blindness can also distinguish.
 
-/// How a value becomes a colour.
+/// Colour map: how a value becomes a colour.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ColourMap {
-    /// Blue below zero, near white at zero, red above: ColorBrewer's RdBu of 11 classes, turned over and interpolated.
+    /// Blue below zero, near white at zero, red above: ColorBrewer's RdBu with 11 classes, reversed and interpolated.
     ///
-    /// Both arms darken alike and steadily, so that a print in grey still shows the size, and red against blue is told apart
-    /// with every common colour blindness. For signed quantities; the range is symmetric about zero.
+    /// Both arms darken equally and steadily, so that a grey print still shows the magnitude. Red and blue are
+    /// distinguishable with every common colour blindness. For signed quantities; the range is symmetric about zero.
     #[default]
     Diverging,
     /// Dark violet to yellow, lightening steadily: nine colours of matplotlib's viridis, interpolated.
@@ -24,7 +24,8 @@ const SEQUENTIAL: [u32; 9] =
     [0x44_0154, 0x47_2d7b, 0x3b_528b, 0x2c_728e, 0x21_918c, 0x28_ae80, 0x5e_c962, 0xad_dc30, 0xfd_e725];
 
 impl ColourMap {
-    /// Returns the colour at a share of the range, from 0 to 1; beyond it the colour of the nearer end.
+    /// Returns the colour at a share of the range, from 0 to 1. Outside that range it returns the colour of the nearer
+    /// end.
     ///
     /// Shape: red, green and blue of sRGB.
     pub fn at(self, share: f64) -> [u8; 3] {
@@ -36,7 +37,7 @@ impl ColourMap {
         std::array::from_fn(|k| (f64::from(low[k]) * (1.0 - t) + f64::from(high[k]) * t).round() as u8)
     }
 
-    /// The colours between which the map runs straight, at equal distances.
+    /// Returns the anchor colours, at equal distances. The map is linear between them.
     pub(super) fn anchors(self) -> &'static [u32] {
         match self {
             Self::Diverging => &DIVERGING,
@@ -44,7 +45,7 @@ impl ColourMap {
         }
     }
 
-    /// A name that is the same for the same colours, wherever figures are put together in one document.
+    /// Returns a name that depends only on the colours, so that figures in one document can share it.
     pub(super) fn id(self) -> &'static str {
         match self {
             Self::Diverging => "regrind-diverging",
@@ -53,7 +54,7 @@ impl ColourMap {
     }
 }
 
-/// How values become colours: a range, and perhaps a band of values that are in tolerance.
+/// Mapping of values to colours: a range, and an optional band of values that are in tolerance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Tones {
     pub(super) colours: ColourMap,
@@ -63,18 +64,19 @@ pub(super) struct Tones {
     pub(super) tolerance: Option<f64>,
 }
 
-/// Share of an arm of the diverging map that a value in tolerance takes: no more than a tint.
+/// Maximum share of an arm of the diverging map for a value in tolerance: only a tint.
 const TINT: f64 = 0.12;
-/// Share of an arm at which a value just beyond the tolerance stands: a step that is seen in print and with every eye.
+/// Share of an arm for a value just beyond the tolerance: a step that is visible in print and with colour blindness.
 const STEP: f64 = 0.4;
-/// A colour bar reaches beyond its band by this factor at least.
+/// Minimum ratio of the limit of a colour bar to its tolerance band.
 const BEYOND: f64 = 1.25;
 
 impl Tones {
-    /// Symmetric tones for values up to a limit, which grows where it would hide the band.
+    /// Returns symmetric tones for values up to a limit. The limit is increased if the band would otherwise fill the
+    /// bar.
     pub(super) fn symmetric(limit: f64, tolerance: Option<f64>) -> Self {
         let limit = limit.max(tolerance.map_or(0.0, |t| BEYOND * t));
-        // Values that are all zero have no range of their own.
+        // If all values are zero, they have no range of their own.
         let limit = if limit > 0.0 { limit } else { 1.0 };
         Self { colours: ColourMap::Diverging, range: [-limit, limit], tolerance }
     }
@@ -92,7 +94,8 @@ impl Tones {
         self.colours.at(0.5 + 0.5 * arm.copysign(value))
     }
 
-    /// Returns where along the bar, from 0 below to 1 above, which colour stands; it runs straight between two neighbours.
+    /// Returns positions along the bar, from 0 at the bottom to 1 at the top, with their colours. Colours are linear
+    /// between two neighbours.
     pub(super) fn stops(&self) -> Vec<(f64, [u8; 3])> {
         let [low, high] = self.range;
         let place = |value: f64| (value - low) / (high - low);
@@ -101,14 +104,14 @@ impl Tones {
             let value = |k: usize| low + (high - low) * k as f64 / steps as f64;
             return (0..=steps).map(|k| (k as f64 / steps as f64, self.at(value(k)))).collect();
         };
-        // On either side of an end of the band stand two colours.
+        // Each end of the band has two colours, one for each side.
         let outside = |k: i32| band.next_up() + (high - band) * f64::from(k) / 4.0;
         let below = (0..=4).rev().map(|k| -outside(k));
         let values = below.chain([-band, 0.0, band]).chain((0..=4).map(outside));
         values.map(|value| (place(value).clamp(0.0, 1.0), self.at(value))).collect()
     }
 
-    /// A name that is the same for the same colours, wherever figures are put together in one document.
+    /// Returns a name that depends only on the colours, so that figures in one document can share it.
     pub(super) fn id(&self) -> String {
         match self.tolerance {
             Some(band) => format!("{}-{:.0}", self.colours.id(), 1e4 * band / self.range[1]),
@@ -131,7 +134,7 @@ mod tests {
         if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
     }
 
-    /// CIE L* of an sRGB colour, from 0 to 100.
+    /// Returns CIE L* of an sRGB colour, from 0 to 100.
     fn lightness(colour: [u8; 3]) -> f64 {
         let [r, g, b] = colour.map(linear);
         let y = 0.2126 * r + 0.7152 * g + 0.0722 * b;
@@ -148,7 +151,8 @@ mod tests {
         }
     }
 
-    /// How an eye that lacks one kind of cones sees linear sRGB: Machado, Oliveira and Fernandes 2009, table 1, severity 1.
+    /// Matrices for linear sRGB as seen with one kind of cones missing: Machado, Oliveira and Fernandes 2009, table 1,
+    /// severity 1.
     const EYES: [(&str, [[f64; 3]; 3]); 3] = [
         (
             "protanopia",
@@ -164,7 +168,7 @@ mod tests {
         ),
     ];
 
-    /// CIE L*a*b* (D65) of a colour as an eye sees it.
+    /// Returns CIE L*a*b* (D65) of a colour as an eye perceives it.
     fn lab(colour: [u8; 3], eye: &[[f64; 3]; 3]) -> [f64; 3] {
         let times = |m: &[[f64; 3]; 3], v: [f64; 3]| m.map(|row| row[0] * v[0] + row[1] * v[1] + row[2] * v[2]);
         let seen = times(eye, colour.map(linear)).map(|c| c.clamp(0.0, 1.0));
@@ -184,7 +188,7 @@ mod tests {
                 let arm = f64::from(k) / 10.0;
                 let (proud, low) = (at(arm), at(-arm));
                 let apart = (0..3).map(|k| (proud[k] - low[k]).powi(2)).sum::<f64>().sqrt();
-                // 2.3 is just seen; a tenth of the range is told apart by four times that.
+                // A difference of 2.3 is just visible. A tenth of the range differs by four times that.
                 assert!(apart > 9.2, "{name}, {arm}: {proud:?} against {low:?}, {apart}");
                 for sign in [-1.0, 1.0] {
                     let (near, far) = (at(sign * (arm - 0.1)), at(sign * arm));

@@ -1,4 +1,4 @@
-//! How the figures came down from cycle to cycle, and how the last error is spread.
+//! Convergence of the figures from cycle to cycle, and distribution of the last error.
 
 use super::ReportError;
 use super::axis::{Ruler, Scale, grouped};
@@ -7,7 +7,7 @@ use super::plot::{Axis, Plot, Series};
 use super::story::Story;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
 
-/// PV and RMS of every cycle that was measured, with their limits; none where fewer than two were.
+/// Returns the plot of PV and RMS of each measured cycle, with their limits; `None` if fewer than two were measured.
 pub(super) fn convergence(story: &Story) -> Option<String> {
     let tolerance = story.tolerance()?;
     let measured = story.cycles.iter().filter_map(|(cycle, of)| {
@@ -29,16 +29,17 @@ pub(super) fn convergence(story: &Story) -> Option<String> {
         y: Axis { label: "\u{b5}m".into(), scale: Scale::Log },
         series: [0, 1].into_iter().flat_map(of).flatten().collect(),
     };
-    // A figure of zero has no place on it; the table has it.
+    // A figure of zero cannot be drawn on a logarithmic axis. The table contains it.
     plot.to_svg().ok()
 }
 
-/// Bars of a histogram.
+/// Number of bars of a histogram.
 const BARS: usize = 41;
 const CORNER: [f64; 2] = [70.0, 58.0];
 const SIZE: [f64; 2] = [460.0, 180.0];
 
-/// How many nodes of a map have which error, in the colours of the map: from minus to plus its largest.
+/// Returns the histogram of the errors at the nodes of a map, in the colours of the map, from minus to plus the largest
+/// magnitude.
 pub(super) fn histogram(title: &str, samples_um: &[[f64; 3]]) -> Result<String, ReportError> {
     let largest = samples_um.iter().fold(0.0_f64, |largest, [.., error]| largest.max(error.abs()));
     let limit = if largest > 0.0 { largest } else { 1.0 };

@@ -1,18 +1,19 @@
-//! Results as Q-DAS ASCII (DFQ): description and values in one file, a line a K-field, values in the order that they were measured.
+//! Results as Q-DAS ASCII (DFQ): description and values in one file, one K-field a line, values in the order of
+//! measurement.
 //!
 //! ```text
 //! K0100      how many characteristics          K2001/k .. K2402/k   each: number, name, digits, unit, limit, machine
 //! K1001 ..   the part, its machine, remarks    K0001/k ..           each value: value, attribute, time, text, serial
 //! ```
 //!
-//! Units: millimetres, so that a file is ASCII wherever the names in it are. Lines end as on Windows.
-//! A file with other texts is UTF-8 and begins with its mark.
+//! Units: millimetres, so that a file is pure ASCII if the names in it are. Lines end as on Windows. A file with other
+//! characters is UTF-8 and begins with the byte order mark.
 
 use std::fmt::Write;
 
 use super::results::{Kind, Measured, Results};
 
-/// What attribute a value has: valid, and left out of all statistics.
+/// Attribute of a value: valid, or excluded from all statistics.
 const VALID: u32 = 0;
 const LEFT_OUT: u32 = 255;
 
@@ -30,23 +31,23 @@ pub(super) fn text(results: &Results) -> String {
     file.whole()
 }
 
-/// A part of several, as it was judged last. Units: millimetres.
+/// Part of a batch, as it was judged last. Units: millimetres.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DfqPart {
-    /// Its serial number.
+    /// Serial number of the part.
     pub serial: String,
-    /// When it was begun, RFC 3339 in UTC.
+    /// Time of the start, RFC 3339 in UTC.
     pub utc: String,
-    /// What stands beside its values.
+    /// Text that is written with its values.
     pub words: String,
-    /// PV and RMS, each with its expanded uncertainty; none where nothing was measured.
+    /// PV and RMS, each with its expanded uncertainty; `None` if nothing was measured.
     pub figures: [Option<[f64; 2]>; 2],
-    /// What is allowed of each.
+    /// Limits of PV and RMS.
     pub limits_mm: [Option<f64>; 2],
 }
 
-/// Makes the file of several parts of one kind: PV and RMS, a value a part, in the order given. What is allowed stands in it where it is
-/// one and the same for all of them.
+/// Returns the file of several parts of one kind: PV and RMS, one value for each part, in the given order. A limit is
+/// written only if it is the same for all parts.
 pub fn dfq_of_parts(name: &str, remark: &str, parts: &[DfqPart]) -> String {
     let mut file = Fields::default();
     file.field("K0100", "2");
@@ -105,7 +106,7 @@ fn characteristic(file: &mut Fields, results: &Results, number: u32, kind: &Kind
     let mut field = |key: &str, value: &str| file.field(&format!("{key}/{number}"), value);
     field("K2001", &number.to_string());
     field("K2002", kind.name);
-    // A variable with one-sided natural limit: no figure of these is below 0.
+    // Variable with a one-sided natural limit: none of these figures is below 0.
     field("K2004", "0");
     field("K2022", "6");
     field("K2101", "0");
@@ -136,12 +137,12 @@ fn values(file: &mut Fields, results: &Results, of: &Measured) {
     }
 }
 
-/// A decimal to a picometre, as the other format has it.
+/// Formats a length as a decimal to a picometre, as in QIF.
 fn mm(value: f64) -> String {
     format!("{value:.9}")
 }
 
-/// `2026-07-04T12:00:00Z` as `04.07.2026/12:00:00`.
+/// Converts `2026-07-04T12:00:00Z` to `04.07.2026/12:00:00`.
 fn when(utc: &str) -> String {
     let (date, time) = utc.split_once('T').unwrap_or((utc, ""));
     let mut date: Vec<&str> = date.split('-').collect();
@@ -150,20 +151,20 @@ fn when(utc: &str) -> String {
     format!("{}/{time}", date.join("."))
 }
 
-/// The file, a line a field.
+/// DFQ file, one field a line.
 #[derive(Default)]
 struct Fields {
     text: String,
 }
 
 impl Fields {
-    /// The text, with the mark of UTF-8 where it is more than ASCII.
+    /// Returns the text, with the UTF-8 byte order mark if it is not pure ASCII.
     fn whole(self) -> String {
         if self.text.is_ascii() { self.text } else { format!("\u{feff}{}", self.text) }
     }
 
-    /// A field; one without a value is not written. What would end the line, or part a value from its companions, is a space; micrometres are um and ± is +-,
-    /// for the sake of readers that know ASCII alone.
+    /// Writes a field; a field without a value is not written. Characters that would end the line or split the value
+    /// become spaces. Micrometres become um and ± becomes +-, for readers that support ASCII only.
     fn field(&mut self, key: &str, value: &str) {
         let value = value
             .replace(|c: char| c.is_control() || c == '\u{a4}', " ")

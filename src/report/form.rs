@@ -1,4 +1,4 @@
-//! The figures of the form in the report of a run, and those of the points as they were measured.
+//! Figures of the form in the report of a run, and figures of the points as they were measured.
 
 use std::fmt::Write;
 use std::fs;
@@ -12,7 +12,8 @@ use super::axis::three_digits;
 use super::story::Story;
 use regrind_formats::{FormatError, escaped};
 
-/// The figures of every cycle that has some: a row a figure, a column a cycle, and what must be known of each figure.
+/// Returns the figures of all cycles that have some: a row for each figure, a column for each cycle, and notes on each
+/// figure.
 pub(super) fn form(story: &Story, folder: &Path) -> Result<String, ReportError> {
     let mut cycles = Vec::new();
     for (number, cycle) in &story.cycles {
@@ -43,7 +44,7 @@ fn heads(cycles: &[(u32, Value)]) -> String {
     cycles.iter().map(|(number, _)| format!("<th class=\"n\">cycle {number}</th>")).collect()
 }
 
-/// What the model tells, with its intervals; nothing in the files of earlier versions.
+/// Returns the figures that the model estimates, with their intervals; empty for files of earlier versions.
 fn told(cycles: &[(u32, Value)], last: &Value) -> String {
     let list = listed(last, "form");
     if list.is_empty() {
@@ -76,13 +77,13 @@ fn told(cycles: &[(u32, Value)], last: &Value) -> String {
     )
 }
 
-/// Median, low and high in digits.
+/// Returns the median and the low and high ends of the interval as text.
 fn interval(row: &Value) -> Option<[String; 3]> {
     let number = |key: &str| row[key].as_f64().map(three_digits);
     Some([number("median")?, number("low")?, number("high")?])
 }
 
-/// The figures of the points and of the map.
+/// Returns the figures of the points and of the map.
 fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
     let title = if listed(last, "form").is_empty() { "" } else { "<h3>Raw, as measured</h3>\n" };
     let mut html = format!(
@@ -109,7 +110,7 @@ fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
     html + "</table>\n"
 }
 
-/// The indications of ISO 10110-5 that are met.
+/// Returns the indications of ISO 10110-5 that the form meets.
 fn notations(cycles: &[(u32, Value)]) -> String {
     let mut html = "<p>What is told of a figure is that of the last cycle. All along the outward normal, positive where material stands proud; figures of the \
                     surface, not of a wavefront. ISO 10110-5, in nanometres, that the form meets in each value with 97.5 %, and that what was measured \

@@ -1,4 +1,4 @@
-//! Maps of a quantity over the part.
+//! Heat maps of a quantity over the part.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ use super::raster::Raster;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
 use super::{ReportError, range};
 
-/// A map of scattered samples in colours, with its peak to valley and root mean square.
+/// Heat map of scattered samples, with its peak to valley and root mean square.
 #[derive(Clone, Debug)]
 pub struct HeatMap {
     title: String,
@@ -24,16 +24,16 @@ pub struct HeatMap {
     unit: String,
     raster: Raster,
     tones: Tones,
-    /// What a millimetre is in the unit of the map.
+    /// Number of units of the map in a millimetre.
     per_mm: f64,
     pv: f64,
     rms: f64,
     points: usize,
     /// Lines below the title.
     lines: Vec<String>,
-    /// What the figures in the last line are of, and what is counted.
+    /// Object that the figures in the last line describe, and name of the counted items.
     figures_of: [&'static str; 2],
-    /// The largest map on the page, in pixels of the page.
+    /// Maximum size of the map on the page, in pixels of the page.
     largest: [f64; 2],
 }
 
@@ -43,7 +43,7 @@ impl HeatMap {
     /// Shapes: two or more samples (x, y, value) in any order. Units: x and y in millimetres, the value in `unit`.
     ///
     /// # Errors
-    /// Too few samples, one that is not finite, or all at one place.
+    /// Fails if there are too few samples, if a sample is not finite, or if all samples are at one place.
     pub fn new(title: &str, quantity: &str, unit: &str, samples: &[[f64; 3]]) -> Result<Self, ReportError> {
         let raster = Raster::new(title, samples)?;
         let [low, high] = range(samples.iter().map(|s| s[2]));
@@ -65,12 +65,13 @@ impl HeatMap {
         Ok(map.with_colours(ColourMap::Diverging))
     }
 
-    /// Draws lengths given in millimetres, in micrometres or, below a tenth of one from peak to valley, in nanometres.
+    /// Draws lengths given in millimetres. The map is in micrometres, or in nanometres if the peak to valley is below
+    /// 0.1 µm.
     ///
     /// Shapes: two or more samples (x, y, length) in any order. Units: millimetres.
     ///
     /// # Errors
-    /// As [`HeatMap::new`].
+    /// Fails as [`HeatMap::new`] does.
     pub fn of_lengths(title: &str, quantity: &str, samples_mm: &[[f64; 3]]) -> Result<Self, ReportError> {
         let [low, high] = range(samples_mm.iter().map(|s| s[2]));
         let (per_mm, unit) = if high - low < 1e-4 { (1e6, "nm") } else { (1e3, "µm") };
@@ -78,37 +79,37 @@ impl HeatMap {
         Ok(Self { per_mm, ..Self::new(title, quantity, unit, &samples)? })
     }
 
-    /// Draws the deviations of a registration at their contact points; points that took no part in the fit are left out.
+    /// Draws the deviations of a registration at their contact points. Points that the fit did not use are left out.
     ///
-    /// Frame: model. Red is proud of the nominal surface, blue below it.
+    /// Frame: model. Red is above the nominal surface, blue is below it.
     ///
     /// # Errors
-    /// As [`HeatMap::new`].
+    /// Fails as [`HeatMap::new`] does.
     pub fn of_deviations(title: &str, deviations: &[Deviation]) -> Result<Self, ReportError> {
         let used = deviations.iter().filter(|d| d.status == PointStatus::Used);
         let samples: Vec<[f64; 3]> = used.map(|d| [d.point.x, d.point.y, d.deviation_mm]).collect();
         Self::of_lengths(title, "deviation", &samples)
     }
 
-    /// Chooses the colours, and with them the range: symmetric about zero, or from the least value to the largest.
+    /// Sets the colours and the range that belongs to them: symmetric about zero, or from the minimum to the maximum.
     pub fn with_colours(self, colours: ColourMap) -> Self {
         let [low, high] = range(self.raster.values.iter().copied());
         let range = match colours {
             ColourMap::Diverging => [-low.abs().max(high.abs()), low.abs().max(high.abs())],
             ColourMap::Sequential => [low, high],
         };
-        // A map of one value has no range of its own.
+        // A map with only one value has no range of its own.
         let range = if range[1] > range[0] { range } else { [range[0] - 1.0, range[1] + 1.0] };
         Self { tones: Tones { colours, range, tolerance: None }, ..self }
     }
 
-    /// Draws what lies within plus and minus a tolerance as no more than a tint, and marks the band on the colour bar; where the
-    /// colour bar would end within the band it is made longer.
+    /// Draws values within plus and minus a tolerance with only a tint, and marks the band on the colour bar. The
+    /// colour bar is made longer if it would end within the band.
     ///
     /// Units: millimetres for a map of lengths, those of the map for any other.
     ///
     /// # Errors
-    /// A tolerance that is not a finite number above 0.
+    /// Fails if the tolerance is not a finite number above 0.
     pub fn with_tolerance(self, tolerance: f64) -> Result<Self, ReportError> {
         if !(tolerance > 0.0 && tolerance.is_finite()) {
             return Err(ReportError::ColourLimit { figure: self.title, limit: tolerance });
@@ -118,12 +119,13 @@ impl HeatMap {
         Ok(Self { tones, ..self })
     }
 
-    /// Lets the colours reach from minus to plus a limit, so that maps with the same limit compare; what lies beyond takes the end.
+    /// Sets the range of the colours from minus to plus a limit, so that maps with the same limit can be compared.
+    /// Values beyond the limit get the colour of the end.
     ///
     /// Units: those of the map.
     ///
     /// # Errors
-    /// A limit that is negative or not finite.
+    /// Fails if the limit is negative or not finite.
     pub fn with_limit(self, limit: f64) -> Result<Self, ReportError> {
         if !(limit >= 0.0 && limit.is_finite()) {
             return Err(ReportError::ColourLimit { figure: self.title, limit });
@@ -131,29 +133,30 @@ impl HeatMap {
         Ok(Self { tones: Tones::symmetric(limit, None), ..self })
     }
 
-    /// Puts further lines below the title.
+    /// Adds further lines below the title.
     pub fn with_lines(self, lines: Vec<String>) -> Self {
         Self { lines, ..self }
     }
 
-    /// Says that the samples are the nodes of a map: PV and RMS are then those of the map and not of the points that it was made from.
+    /// Declares that the samples are the nodes of a map. PV and RMS are then those of the map and not of the points
+    /// that it was made from.
     pub fn of_nodes(self) -> Self {
         Self { figures_of: [" of the map", "nodes"], ..self }
     }
 
-    /// Draws the map no larger than a number of pixels of the page, along x and along y.
+    /// Sets the maximum size of the map in pixels of the page, along x and along y.
     pub fn at_most(self, largest: [f64; 2]) -> Self {
         Self { largest, ..self }
     }
 
-    /// Leaves open what lies outside of an aperture, even where a gap between samples would be filled.
+    /// Clears all pixels outside an aperture, even where a gap between samples would be filled.
     ///
     /// Units: millimetres. Frame: that of the samples.
     pub fn within(mut self, aperture: &Aperture) -> Self {
         let grid = self.raster.grid;
         for (k, value) in self.raster.values.iter_mut().enumerate() {
             let [x, y] = grid.place_mm(k);
-            // A sample on the rim fills a pixel that reaches half its width beyond.
+            // A sample on the rim fills a pixel that extends half its width beyond the rim.
             if aperture.distance_mm(x, y) > 0.5 * grid.spacing_mm[0].hypot(grid.spacing_mm[1]) {
                 *value = f64::NAN;
             }
@@ -166,7 +169,7 @@ impl HeatMap {
         self.tones.range[1]
     }
 
-    /// Returns the largest less the least sample, in the unit of the map.
+    /// Returns the maximum sample minus the minimum sample, in the unit of the map.
     pub fn pv(&self) -> f64 {
         self.pv
     }
@@ -176,10 +179,11 @@ impl HeatMap {
         self.rms
     }
 
-    /// Returns the bare pixels as a PNG of 255 colours: one pixel a bin, y upwards, transparent where nothing was measured.
+    /// Returns only the pixels, as a PNG of 255 colours: one pixel for each bin, y upwards, transparent where nothing
+    /// was measured.
     ///
     /// # Errors
-    /// What the encoder says.
+    /// Fails if the encoder fails.
     pub fn to_png(&self) -> Result<Vec<u8>, ReportError> {
         let mut palette = vec![0; 3];
         let [low, high] = self.tones.range;
@@ -204,7 +208,7 @@ impl HeatMap {
         encoded().map_err(|source| ReportError::Encoding { figure: self.title.clone(), source })
     }
 
-    /// The place of a value in the palette; 0 is transparent.
+    /// Returns the index of a value in the palette; 0 is transparent.
     fn level(&self, value: f64) -> u8 {
         if value.is_nan() {
             return 0;
@@ -214,10 +218,10 @@ impl HeatMap {
         1 + (share.clamp(0.0, 1.0) * f64::from(LEVELS - 1)).round() as u8
     }
 
-    /// Returns the figure: the pixels within axes in millimetres, a colour bar, and a line of PV and RMS.
+    /// Returns the figure: the pixels within axes in millimetres, a colour bar, and a line with PV and RMS.
     ///
     /// # Errors
-    /// What the encoder says.
+    /// Fails if the encoder fails.
     pub fn to_svg(&self) -> Result<String, ReportError> {
         let lines = self.lines_within(self.size()[0] + BESIDE);
         let frame = self.frame(lines.len());
@@ -228,7 +232,7 @@ impl HeatMap {
             svg.text([left, y], Anchor::Start, SMALL, line);
         }
         let pixel = width / self.raster.grid.columns as f64;
-        // Few samples are shown as the blocks they are; many are smoothed when the figure is scaled.
+        // Few samples are shown as blocks. Many samples are smoothed when the figure is scaled.
         let rendering = if pixel > 4.0 { "pixelated" } else { "auto" };
         svg.image(frame.corner, frame.size, &STANDARD.encode(self.to_png()?), rendering);
         svg.frame(&frame);
@@ -236,7 +240,7 @@ impl HeatMap {
         Ok(svg.finish())
     }
 
-    /// The lines below the title, the summary last, broken where they would end beyond the picture.
+    /// Returns the lines below the title, with the summary last. Lines that are too long for the picture are broken.
     fn lines_within(&self, width: f64) -> Vec<String> {
         let summary = self.summary();
         self.lines.iter().chain([&summary]).flat_map(|line| broken(line, (width / LETTER) as usize)).collect()
@@ -247,11 +251,11 @@ impl HeatMap {
         [columns as f64 * spacing_mm[0], rows as f64 * spacing_mm[1]]
     }
 
-    /// The map in pixels of the page.
+    /// Returns the size of the map in pixels of the page.
     fn size(&self) -> [f64; 2] {
         let extent_mm = self.extent_mm();
         let scale = (self.largest[0] / extent_mm[0]).min(self.largest[1] / extent_mm[1]);
-        // A part like a strip is drawn out of scale rather than as a line.
+        // A long narrow part is drawn out of scale, because otherwise it would be only a line.
         extent_mm.map(|e| (e * scale).max(90.0))
     }
 
@@ -301,7 +305,7 @@ impl HeatMap {
         }
     }
 
-    /// The share of the pixels whose values lie within a band about zero.
+    /// Returns the share of the pixels whose values lie within a band about zero.
     fn share_within(&self, band: f64) -> f64 {
         let known = || self.raster.values.iter().filter(|v| !v.is_nan());
         known().filter(|v| v.abs() <= band).count() as f64 / known().count().max(1) as f64
@@ -310,23 +314,23 @@ impl HeatMap {
     /// Saves the figure.
     ///
     /// # Errors
-    /// A file that cannot be written.
+    /// Fails if the figure cannot be encoded or if the file cannot be written.
     pub fn save_svg(&self, path: &Path) -> Result<(), ReportError> {
         Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
     }
 
-    /// Saves the bare pixels.
+    /// Saves only the pixels, as PNG.
     ///
     /// # Errors
-    /// A file that cannot be written.
+    /// Fails if the pixels cannot be encoded or if the file cannot be written.
     pub fn save_png(&self, path: &Path) -> Result<(), ReportError> {
         Ok(write_atomic(path, &self.to_png()?)?)
     }
 
-    /// Saves the pixels under the word SIMULATION, enlarged where there are too few for it.
+    /// Saves the pixels below the word SIMULATION, enlarged if there are too few pixels for the word.
     ///
     /// # Errors
-    /// What the encoder says, and a file that cannot be written.
+    /// Fails if the encoder fails, or if the file cannot be written.
     pub fn save_simulated_png(&self, path: &Path) -> Result<(), ReportError> {
         let columns = self.raster.grid.columns;
         let tone = |value: &f64| {
@@ -351,23 +355,23 @@ impl HeatMap {
     }
 }
 
-/// Colours of the palette: an odd number, so that zero has one of its own.
+/// Number of colours of the palette. It is odd, so that zero has its own colour.
 const LEVELS: u8 = 255;
 
-/// The largest map on the page, in pixels of the page.
+/// Maximum size of the map on the page, in pixels of the page.
 const WIDTH: f64 = 600.0;
 const HEIGHT: f64 = 460.0;
 
-/// What stands on the right of a map, its colour bar, in pixels of the page.
+/// Width of the colour bar to the right of a map, in pixels of the page.
 const BESIDE: f64 = 106.0;
 
-/// From one line of text below the title to the next.
+/// Distance between lines of text below the title.
 const LINE: f64 = 18.0;
 
-/// A letter of such a line, on average, also where a wider face stands in for the one that is wanted.
+/// Average width of a letter in those lines. It is also sufficient if a wider typeface replaces the intended one.
 const LETTER: f64 = 6.8;
 
-/// Breaks a line into some of at most so many letters: behind a comma if there is one, else behind a word.
+/// Breaks a line into lines of at most `most` letters: after a comma if there is one, otherwise after a word.
 fn broken(line: &str, most: usize) -> Vec<String> {
     let (mut lines, mut rest) = (Vec::new(), line);
     while let Some((end, _)) = rest.char_indices().nth(most) {
@@ -405,7 +409,7 @@ mod tests {
         let (info, pixels) = decoded(&map.to_png().unwrap());
         assert_eq!((info.width, info.height), (3, 2));
         let pixel = |i: usize, j: usize| <[u8; 4]>::try_from(&pixels[(j * 3 + i) * 4..][..4]).unwrap();
-        // The picture's first row is the one of largest y.
+        // The first row of the picture is the row with the largest y.
         assert_eq!(pixel(0, 1), [0x05, 0x30, 0x61, 255]);
         assert_eq!(pixel(1, 1), [0xf7, 0xf7, 0xf7, 255]);
         assert_eq!(pixel(2, 1), [0x67, 0x00, 0x1f, 255]);
@@ -424,7 +428,7 @@ mod tests {
         assert!(svg.contains("66.7 % of the area within \u{b1} 1.50 µm"), "{svg}");
         roxmltree::Document::parse(&svg).unwrap();
         assert!(map.clone().with_tolerance(0.0).is_err() && map.with_tolerance(f64::NAN).is_err());
-        // A tolerance beyond every value is still to be seen.
+        // A tolerance beyond all values is still visible.
         let wide = HeatMap::of_lengths("band", "height", &SMALL_MAP).unwrap().with_tolerance(4e-3).unwrap();
         assert_eq!(wide.limit(), 5.0);
         assert!(wide.to_svg().unwrap().contains("100.0 % of the area"));
@@ -454,7 +458,7 @@ mod tests {
         assert_eq!(broken(line, 33), [line]);
         assert_eq!(broken(line, 32), ["PV 4.00 µm, RMS 1.29 µm,", "6 points"]);
         assert_eq!(broken(line, 12), ["PV 4.00 µm,", "RMS 1.29", "µm, 6 points"]);
-        // What has no place to be broken at stays whole.
+        // A text without a place to break stays whole.
         assert_eq!((broken("unbroken", 3), broken("", 5)), (vec!["unbroken".to_owned()], vec![String::new()]));
         let narrow = HeatMap::of_lengths("strip", "height", &SMALL_MAP).unwrap().at_most([10.0, 90.0]);
         let narrow = narrow.with_tolerance(1e-3).unwrap();
@@ -472,7 +476,7 @@ mod tests {
 
     #[test]
     fn outside_of_the_aperture_nothing_is_drawn() {
-        // A narrow slot between two halves would be filled as a gap.
+        // Without an aperture, a narrow slot between two halves would be filled as a gap.
         let half = |sign: f64| (0..400).map(move |k| [sign * (1.2 + f64::from(k % 20)), f64::from(k / 20), 1e-3]);
         let samples: Vec<[f64; 3]> = half(1.0).chain(half(-1.0)).collect();
         let slot = Aperture::Annulus { centre_mm: [0.0, 10.0], inner_radius_mm: 4.0, outer_radius_mm: 60.0 };

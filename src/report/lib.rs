@@ -11,8 +11,8 @@
 //!                                       +------------> its results for other systems: QIF, Q-DAS ASCII
 //! ```
 //!
-//! A figure is a plain value until it is saved, and the same figure gives the same bytes. Frame: maps are drawn over x and y
-//! of the model frame {M}, y upwards. Units: axes in millimetres, deviations in micrometres or nanometres.
+//! A figure is a plain value until it is saved. The same figure always gives the same bytes. Frame: maps are drawn over
+//! x and y of the model frame {M}, with y upwards. Units: axes in millimetres, deviations in micrometres or nanometres.
 
 mod axis;
 mod colour;
@@ -56,54 +56,55 @@ pub use story::AlarmStory;
 pub use summary::{CycleSummary, RunResult, RunSummary, run_summary};
 pub use words::{ending_words, in_air, words};
 
-/// Why a figure could not be drawn or saved. A figure goes by its title, a line of it by its name; an index counts from 0.
+/// Reasons why a figure could not be drawn or saved. The title identifies a figure, and the name identifies one of its
+/// lines. Indices count from 0.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum ReportError {
-    /// There is nothing to draw.
+    /// Fewer points than the figure needs.
     #[error("{figure}: there is nothing to draw; at least {least} points are needed, {found} were given")]
     TooFewPoints { figure: String, found: usize, least: usize },
-    /// A number that no figure can show.
+    /// Number that is not finite, so that no figure can show it.
     #[error("{figure}: point {} has the {what} {value}; a figure shows finite numbers only", index + 1)]
     NotFinite { figure: String, index: usize, what: &'static str, value: f64 },
-    /// A number that has no logarithm.
+    /// Number at or below 0, which has no logarithm.
     #[error("{figure}: point {} has the {what} {value}; a logarithmic axis shows numbers above 0 only", index + 1)]
     NoLogarithm { figure: String, index: usize, what: &'static str, value: f64 },
-    /// All points lie at one place.
+    /// Points that all lie at one place.
     #[error("{figure}: all {points} points share one place in x and y; a map needs an extent")]
     NoExtent { figure: String, points: usize },
-    /// The limit of a colour bar is no limit.
+    /// Limit of a colour bar that is not a finite number above 0.
     #[error("{figure}: the colour bar was to end at {limit}; give a finite number above 0")]
     ColourLimit { figure: String, limit: f64 },
-    /// A triangle has a corner that is no point.
+    /// Triangle with a corner index that refers to no point.
     #[error("{figure}: a triangle has the corner {corner}, and there are {points} points, counted from 0")]
     Corner { figure: String, corner: u32, points: usize },
-    /// The pixels could not be encoded.
+    /// Failure to encode the pixels as PNG.
     #[error("{figure}: the picture could not be encoded: {source}")]
     Encoding { figure: String, source: png::EncodingError },
-    /// A run of which there are no results.
+    /// Run without results.
     #[error(
         "run {run}: nothing was measured that could be registered, so there are no results to write; `regrind report` tells why"
     )]
     NothingMeasured { run: String },
-    /// The record of the run cannot be read or believed.
+    /// Record of the run that cannot be read or does not pass verification.
     #[error(transparent)]
     Record(#[from] regrind_journal::JournalError),
-    /// A file could not be read or written.
+    /// File that cannot be read or written.
     #[error(transparent)]
     File(#[from] FormatError),
 }
 
-/// Writes a text as a whole file.
+/// Writes `text` to a file atomically, replacing the whole file.
 ///
 /// # Errors
-/// A file that cannot be written.
+/// Fails if the file cannot be written.
 pub fn save_text(path: &Path, text: &str) -> Result<(), ReportError> {
     Ok(write_atomic(path, text.as_bytes())?)
 }
 
-/// Returns the least and the largest of some values, of those that are numbers.
+/// Returns the minimum and the maximum of the values, ignoring NaN.
 fn range(values: impl Iterator<Item = f64>) -> [f64; 2] {
     values.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
 }

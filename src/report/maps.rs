@@ -1,4 +1,4 @@
-//! The maps in the report of a run: the first and the last cycle on one scale, and the last on its own.
+//! Maps in the report of a run: the first and the last cycle on one scale, and the last cycle on its own scale.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -12,14 +12,14 @@ use super::story::Story;
 use super::{ReportError, range};
 use regrind_formats::{MapNode, escaped, read_error_map};
 
-/// Largest map of a pair, and of one that stands alone, in pixels of the page.
+/// Maximum size of a map of a pair, and of a single map, in pixels of the page.
 const OF_A_PAIR: [f64; 2] = [262.0, 262.0];
 const ALONE: [f64; 2] = [600.0, 460.0];
 
-/// What stands beside a map of that width, axes and colour bar, in pixels of the page.
+/// Width of the axes and the colour bar next to a map of that size, in pixels of the page.
 const BESIDE: f64 = 172.0;
 
-/// The map of a cycle with its heading.
+/// Map of a cycle with its heading.
 struct Drawn {
     cycle: u32,
     title: String,
@@ -33,7 +33,7 @@ impl Drawn {
         low.abs().max(high.abs())
     }
 
-    /// The figure, from minus to plus a limit; in words why there is none.
+    /// Returns the figure with colours from minus to plus `limit_um`, or a sentence that says why it cannot be drawn.
     fn figure(&self, limit_um: f64, largest: [f64; 2], caption: &str) -> Result<String, ReportError> {
         let width = largest[0] + BESIDE;
         let svg = HeatMap::new(&shortened(&self.title, width, 8.5), "deviation", "\u{b5}m", &self.samples_um)
@@ -48,12 +48,12 @@ impl Drawn {
     }
 }
 
-/// Takes a figure into a page: within HTML it needs no name of its language.
+/// Prepares an SVG figure for a page: removes the XML namespace, which is not needed within HTML.
 pub(super) fn within_html(svg: &str) -> String {
     svg.replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1)
 }
 
-/// Cuts a text where it would be wider than so many pixels.
+/// Shortens a text that would be wider than `width`, for letters of the width `letter`.
 fn shortened(text: &str, width: f64, letter: f64) -> String {
     let most = (width / letter) as usize;
     if text.chars().count() <= most {
@@ -62,7 +62,7 @@ fn shortened(text: &str, width: f64, letter: f64) -> String {
     text.chars().take(most.saturating_sub(1)).chain(['\u{2026}']).collect()
 }
 
-/// Draws the maps on record.
+/// Draws the maps that are on record.
 pub(super) fn maps(story: &Story, folder: &Path, begin: &Value) -> Result<String, ReportError> {
     let mapped = || story.cycles.iter().filter_map(|(cycle, told)| Some((*cycle, told.map.as_ref()?)));
     let Some(last) = mapped().next_back() else { return Ok(String::new()) };

@@ -1,8 +1,8 @@
-//! Pixels under a word: a picture of a simulated part is not taken for one of a real part, wherever it is shown.
+//! Pictures marked with a word, so that nobody mistakes a picture of a simulated part for one of a real part.
 
-/// The word that stands on whatever comes from a simulated cell.
+/// Word on everything that comes from a simulated cell.
 const WORD: &str = "SIMULATION";
-/// The letters of the word in 5 by 7 pixels, rows from the top, the leftmost pixel in the highest of five bits.
+/// Letters of the word in 5 by 7 pixels. Rows run from the top; the leftmost pixel is the highest of five bits.
 const LETTERS: [(char, [u8; 7]); 9] = [
     ('S', [0b01111, 0b10000, 0b10000, 0b01110, 0b00001, 0b00001, 0b11110]),
     ('I', [0b01110, 0b00100, 0b00100, 0b00100, 0b00100, 0b00100, 0b01110]),
@@ -14,22 +14,23 @@ const LETTERS: [(char, [u8; 7]); 9] = [
     ('O', [0b01110, 0b10001, 0b10001, 0b10001, 0b10001, 0b10001, 0b01110]),
     ('N', [0b10001, 0b11001, 0b10101, 0b10011, 0b10001, 0b10001, 0b10001]),
 ];
-/// Pixels from one letter to the next, and from the top of the band to its end.
+/// Distance from one letter to the next, and height of the band, in pixels.
 const ADVANCE: usize = 6;
 const BAND: usize = 11;
-/// The least width of a picture with the word on it.
+/// Minimum width of a picture with the word on it, in pixels.
 const LEAST_WIDTH: usize = 120;
 const INK: [u8; 4] = [0, 0, 0, 255];
 const GROUND: [u8; 4] = [0xff, 0xc8, 0x00, 255];
 
-/// A picture in red, green, blue and opacity, rows from the top.
+/// Picture in red, green, blue and opacity, rows from the top.
 pub(super) struct Marked {
     pub width: usize,
     pub height: usize,
     pub rgba: Vec<u8>,
 }
 
-/// Lays the word SIMULATION in a band above pixels; a small picture is enlarged, each pixel to a square of several.
+/// Puts the word SIMULATION in a band above the pixels. A small picture is enlarged: each pixel becomes a square of
+/// several pixels.
 pub(super) fn marked(pixels: &[[u8; 4]], columns: usize) -> Marked {
     let rows = pixels.len() / columns;
     let enlarged = LEAST_WIDTH.div_ceil(columns);
@@ -51,7 +52,7 @@ pub(super) fn marked(pixels: &[[u8; 4]], columns: usize) -> Marked {
     Marked { width, height: band + rows * enlarged, rgba }
 }
 
-/// Whether a pixel of the band belongs to a letter; x from the first letter on.
+/// Returns true if a pixel of the band belongs to a letter. `x` counts from the first letter.
 fn is_inked(x: usize, y: usize) -> bool {
     const ABOVE: usize = 2;
     const WIDE: usize = 5;

@@ -1,4 +1,4 @@
-//! What a part was made and measured with, how well its place was known, and where people sign.
+//! Equipment that made and measured a part, quality of its registration, and the fields for signatures.
 
 use std::fmt::Write;
 use std::fs;
@@ -12,7 +12,7 @@ use super::story::Story;
 use regrind_cell::Device;
 use regrind_formats::{FormatError, escaped};
 
-/// Machines, wheel and probe, as far as the record tells of them.
+/// Returns machines, wheel and probe, as far as they are on record.
 pub(super) fn means(story: &Story, registration: Option<&Value>) -> String {
     let not_told = || "not told".to_owned();
     let machine = |device: Device| {
@@ -38,14 +38,14 @@ pub(super) fn means(story: &Story, registration: Option<&Value>) -> String {
     format!("<h2>Machines, wheel and probe</h2>\n<table id=\"means\">\n{rows}</table>\n")
 }
 
-/// Reads what the model says of the measurement whose registration this is; none where it says nothing.
+/// Reads the model file of the measurement with the last registration; `None` if there is no such file.
 pub(super) fn last_model(story: &Story, folder: &Path) -> Option<Value> {
     let registration = story.cycles.values().rev().find_map(|of| of.registration.as_ref())?;
     let bytes = fs::read(folder.join(registration).with_file_name("model.json")).ok()?;
     serde_json::from_slice(&bytes).ok()
 }
 
-/// Reads how the last measurement was registered; none where none was.
+/// Reads the last registration and its cycle; `None` if no measurement was registered.
 pub(super) fn last_registration(story: &Story, folder: &Path) -> Result<Option<(u32, Value)>, ReportError> {
     let last = story.cycles.iter().rev().find_map(|(cycle, of)| Some((*cycle, of.registration.as_ref()?)));
     let Some((cycle, name)) = last else { return Ok(None) };
@@ -56,12 +56,12 @@ pub(super) fn last_registration(story: &Story, folder: &Path) -> Result<Option<(
     Ok(Some((cycle, found)))
 }
 
-/// Where the part lay, and how well that is known.
+/// Returns the pose of the part and its uncertainty.
 pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> String {
     let number = |key: &str| found[key].as_f64();
     let count = |key: &str| found[key].as_array().map_or(0, Vec::len);
     let um = |mm: f64| format!("{:.2} \u{b5}m", 1e3 * mm);
-    // A direction that is held has no uncertainty in one file, and 0 in the other.
+    // A locked direction has no uncertainty in one file, and 0 in the other.
     let place = |stated: &Value| {
         let sigma = |key: &str| stated[key].as_f64().filter(|sigma| *sigma > 0.0);
         let shift = ["x_mm", "y_mm", "z_mm"].map(|key| sigma(key).map_or("held".to_owned(), um)).join(", ");
@@ -103,7 +103,7 @@ pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> St
     html + "</table>\n" + &model.map_or(String::new(), budget)
 }
 
-/// What the uncertainty of the figures comes from, source by source; nothing where the record has none.
+/// Returns the uncertainty budget of the figures, source by source; empty if the record contains none.
 fn budget(model: &Value) -> String {
     let Some(shares) = model["budget"].as_array().filter(|shares| !shares.is_empty()) else { return String::new() };
     let um = |share: &Value, key: &str| match (share["is_stated"] == true, share[key].as_f64()) {
@@ -130,7 +130,7 @@ fn budget(model: &Value) -> String {
     )
 }
 
-/// A source of uncertainty by the name that it has in `model.json`.
+/// Returns a source of uncertainty in words, from its name in `model.json`.
 fn source_words(name: &str) -> &str {
     match name {
         "scatter" => "scatter of the probe",
@@ -146,7 +146,7 @@ fn source_words(name: &str) -> &str {
     }
 }
 
-/// Where those sign who answer for it.
+/// Returns the table in which the responsible people sign.
 pub(super) fn signatures() -> String {
     let row = |role: &str| format!("<tr><th>{role}</th><td></td><td></td><td></td></tr>\n");
     let rows: String = ["Recipe approved by", "Made by", "Checked by", "Released by"].map(row).concat();

@@ -1,4 +1,4 @@
-//! Lines over a pair of axes.
+//! Line plots.
 
 use std::path::Path;
 
@@ -7,48 +7,49 @@ use super::axis::{Ruler, Scale};
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
 use regrind_formats::write_atomic;
 
-/// One axis of a plot.
+/// Axis of a plot.
 #[derive(Clone, Debug, Default)]
 pub struct Axis {
-    /// What stands beside it, with the unit.
+    /// Label of the axis, with the unit.
     pub label: String,
-    /// How the coordinate runs along it.
+    /// Scale of the axis, linear or logarithmic.
     pub scale: Scale,
 }
 
-/// One line of a plot.
+/// Line of a plot.
 #[derive(Clone, Debug, Default)]
 pub struct Series {
-    /// What the legend calls it.
+    /// Name in the legend.
     pub name: String,
-    /// Its points, joined in this order.
+    /// Points, joined in this order.
     pub points: Vec<[f64; 2]>,
 }
 
-/// Several lines over one pair of axes, each with a colour and a marker of its own, and a legend beside them.
+/// Several lines over one pair of axes. Each line has its own colour and marker; a legend is drawn next to the axes.
 #[derive(Clone, Debug, Default)]
 pub struct Plot {
-    /// What stands above it.
+    /// Title above the plot.
     pub title: String,
-    /// The axis to the right.
+    /// Horizontal axis, to the right.
     pub x: Axis,
-    /// The axis upwards.
+    /// Vertical axis, upwards.
     pub y: Axis,
-    /// The lines, in the order of the legend.
+    /// Lines, in the order of the legend.
     pub series: Vec<Series>,
 }
 
-/// Okabe and Ito's colours for every kind of sight, the yellow left out for want of contrast on white.
+/// Okabe and Ito's colours, which people with colour blindness can distinguish. Their yellow is left out because its
+/// contrast on white is too low.
 const COLOURS: [&str; 7] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000"];
 
 const CORNER: [f64; 2] = [70.0, 44.0];
 const SIZE: [f64; 2] = [520.0, 340.0];
 
 impl Plot {
-    /// Returns the figure.
+    /// Returns the figure as SVG.
     ///
     /// # Errors
-    /// No points at all, one that is not finite, or one that is not above 0 on a logarithmic axis.
+    /// Fails if there are no points, if a point is not finite, or if a point is not above 0 on a logarithmic axis.
     pub fn to_svg(&self) -> Result<String, ReportError> {
         let [x, y] = [self.ruler(0)?, self.ruler(1)?];
         let longest = self.series.iter().map(|s| s.name.chars().count()).max().unwrap_or(0);
@@ -74,15 +75,15 @@ impl Plot {
         Ok(svg.finish())
     }
 
-    /// Saves the figure.
+    /// Saves the figure as SVG.
     ///
     /// # Errors
-    /// As [`Plot::to_svg`], and a file that cannot be written.
+    /// Fails as [`Plot::to_svg`] does, or if the file cannot be written.
     pub fn save_svg(&self, path: &Path) -> Result<(), ReportError> {
         Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
     }
 
-    /// Things that are counted have no halves.
+    /// Returns the maximum number of ticks of the x axis. Counts get no ticks at fractions.
     fn most_x_ticks(&self) -> usize {
         const MOST: usize = 10;
         let all = || self.series.iter().flat_map(|series| &series.points).map(|point| point[0]);
@@ -90,7 +91,7 @@ impl Plot {
         if all().all(|x| x.fract() == 0.0) { ((high - low) as usize).clamp(1, MOST) } else { MOST }
     }
 
-    /// Checks one coordinate of all points and lays their range on the page.
+    /// Checks one coordinate of all points and maps their range to the pixels of the page.
     fn ruler(&self, k: usize) -> Result<Ruler, ReportError> {
         let (axis, what) = if k == 0 { (&self.x, "x") } else { (&self.y, "y") };
         let [mut low, mut high] = [f64::INFINITY, f64::NEG_INFINITY];
@@ -114,7 +115,7 @@ impl Plot {
     }
 }
 
-/// Draws a line with a marker at each point; colours, markers and dashes differ from line to line.
+/// Draws a line with a marker at each point. Colours, markers and dashes differ from line to line.
 fn draw(svg: &mut Svg, k: usize, pixels: &[[f64; 2]]) {
     let colour = COLOURS[k % COLOURS.len()];
     let dashes = if k < COLOURS.len() { "none" } else { "6 3" };

@@ -1,4 +1,4 @@
-//! Points coloured by their deviation, for programs that show clouds and meshes.
+//! Points coloured by their deviation, for programs that show point clouds and meshes.
 
 use std::path::Path;
 
@@ -6,14 +6,14 @@ use super::ReportError;
 use super::colour::Tones;
 use regrind_formats::write_atomic;
 
-/// Returns points, and triangles between them if there are any, as binary PLY with a colour and the deviation at every point.
+/// Returns points, and optional triangles between them, as binary PLY with a colour and the deviation at each point.
 ///
-/// Shapes: a row (x, y, z, deviation) a point; corners of triangles as indices of rows from 0. Units: millimetres; the property
-/// `scalar_deviation_um` holds micrometres. Colours: those of the heat maps, symmetric about zero; what lies within the
-/// tolerance is no more than a tint. A `comment` is written for each remark.
+/// Shapes: a row (x, y, z, deviation) for each point; corners of triangles as indices of rows from 0. Units:
+/// millimetres; the property `scalar_deviation_um` is in micrometres. Colours: those of the heat maps, symmetric about
+/// zero. Values within the tolerance get only a tint. A `comment` is written for each remark.
 ///
 /// # Errors
-/// No point, a number that is not finite, a corner that is no point.
+/// Fails if there is no point, if a number is not finite, or if a corner refers to no point.
 pub fn coloured_ply(
     title: &str,
     rows_mm: &[[f64; 4]],
@@ -52,10 +52,10 @@ pub fn coloured_ply(
     Ok(bytes)
 }
 
-/// Saves what [`coloured_ply`] returns.
+/// Saves the result of [`coloured_ply`].
 ///
 /// # Errors
-/// Those of [`coloured_ply`], and a file that cannot be written.
+/// Fails as [`coloured_ply`] does, or if the file cannot be written.
 pub fn save_coloured_ply(
     path: &Path,
     title: &str,
@@ -121,7 +121,7 @@ mod tests {
         let mut bad = ROWS;
         bad[1][3] = f64::NAN;
         assert!(matches!(made(&bad, &[], None), Err(ReportError::NotFinite { index: 1, what: "deviation", .. })));
-        // A flat part is one colour.
+        // A flat part has one colour.
         assert!(made(&[[0.0; 4]], &[], None).is_ok());
     }
 }

@@ -1,13 +1,14 @@
-//! Results as QIF 3.0 (ANSI/DMSC QIF 3.0, `QIFDocument.xsd`): a set of measurement results, one for each measurement of the run.
+//! Results as QIF 3.0 (ANSI/DMSC QIF 3.0, `QIFDocument.xsd`): a set of measurement results, one for each measurement of
+//! the run.
 //!
-//! The figures are user-defined linear characteristics, for QIF has none that is a peak to valley or a root mean square along the
-//! normal; its surface profile is another figure (twice the largest deviation). Units: millimetres. `combinedUncertainty` is the
-//! standard one, half of the expanded uncertainty that reports show.
+//! The figures are user-defined linear characteristics, because QIF has no characteristic for a peak to valley or a
+//! root mean square along the normal. Its surface profile is a different figure (twice the largest deviation). Units:
+//! millimetres. `combinedUncertainty` is the standard uncertainty, half of the expanded uncertainty that reports show.
 
 use super::results::{Figure, Measured, Results, Standing};
 use super::xml::Xml;
 
-/// Identifiers within the document; those of figures and measurements are counted on from the last.
+/// Identifiers within the document. Those of figures and measurements continue from the last one.
 const STANDARD: u32 = 1;
 const PART: u32 = 2;
 const SOFTWARE: u32 = 3;
@@ -126,7 +127,7 @@ fn attributes(xml: &mut Xml, list: &[(&str, &str)]) {
     });
 }
 
-/// Definition, nominal and item of each figure: numbers `FIRST_FIGURE + 3 k`, and the two behind it.
+/// Writes the definition, nominal and item of each figure, with the numbers `FIRST_FIGURE + 3 k` and the two after it.
 fn characteristics(xml: &mut Xml, results: &Results) {
     let kinds: Vec<_> = (FIRST_FIGURE..).step_by(3).zip(results.kinds()).collect();
     let n = kinds.len().to_string();
@@ -257,12 +258,12 @@ fn inspection_status(of: &Measured) -> &'static str {
     }
 }
 
-/// A decimal, which in XML has no exponent, to a picometre.
+/// Formats a length as a decimal to a picometre, because decimals in XML have no exponent.
 fn mm(value: f64) -> String {
     format!("{value:.9}")
 }
 
-/// The identity (UUID, version 8) of a document or of a part of it: it follows from the record that it was made of.
+/// Returns the identity (UUID, version 8) of a document or of a part of it. It is derived from the hash of the record.
 fn identity(head: &str, number: u32) -> String {
     let hex: String = head.chars().filter(char::is_ascii_hexdigit).take(24).collect();
     let hex = format!("{hex:0<24}{number:08x}");

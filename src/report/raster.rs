@@ -1,33 +1,35 @@
-//! From scattered samples to pixels.
+//! Conversion of scattered samples to pixels.
 
 use super::{ReportError, range};
 use regrind_core::geometry::Grid;
 
-/// A picture of values: NaN where nothing is known.
+/// Picture of values. A value is NaN where nothing is known.
 #[derive(Clone, Debug)]
 pub(super) struct Raster {
-    /// Where the centres of the pixels are.
+    /// Positions of the centres of the pixels.
     pub(super) grid: Grid,
-    /// One for each pixel.
+    /// Values, one for each pixel.
     pub(super) values: Vec<f64>,
 }
 
-/// Pixels on the longer side: finer than a screen shows a figure, and small enough for a page.
+/// Maximum number of pixels on the longer side: finer than a screen shows a figure, and small enough for a page.
 const MOST_PIXELS: usize = 480;
 
-/// Gaps of up to twice this many pixels within the cloud are filled from their sides.
+/// Reach in pixels: gaps of up to twice this width within the cloud are filled from their sides.
 const REACH: usize = 2;
 
-/// The same for a cloud in scan lines: dense along them, sparse across.
+/// Reach for a cloud in scan lines, which is dense along the lines and sparse across them.
 const LINES_REACH: usize = 8;
 
-/// A pixel on which less than this share of a sample falls knows nothing of its own.
+/// Minimum weight of a pixel. A pixel that gets less than this share of a sample has no value of its own.
 const LEAST_WEIGHT: f64 = 1e-3;
 
 impl Raster {
-    /// Shares every sample (x, y, value) among the four pixels around it and takes the mean of each pixel.
+    /// Distributes each sample (x, y, value) among the four pixels around it and computes the weighted mean of each
+    /// pixel.
     ///
-    /// A pixel is about as wide as the samples are apart. Gaps within the cloud are filled from their neighbours.
+    /// The width of a pixel is approximately the distance between samples. Gaps within the cloud are filled from their
+    /// neighbours.
     pub(super) fn new(title: &str, samples: &[[f64; 3]]) -> Result<Self, ReportError> {
         check(title, samples)?;
         let (low, size) = extent(samples);
@@ -64,7 +66,7 @@ impl Raster {
         sums.into_iter().map(|[sum, total]| if total >= LEAST_WEIGHT { sum / total } else { f64::NAN }).collect()
     }
 
-    /// Fills gaps narrower than the reach by the mean of the neighbours, from the sides inwards.
+    /// Fills gaps narrower than the reach with the mean of the neighbours, from the sides inwards.
     fn fill(&mut self) {
         let known: Vec<bool> = self.values.iter().map(|v| !v.is_nan()).collect();
         let count = |mask: &[bool]| mask.iter().filter(|&&m| m).count();
@@ -99,7 +101,7 @@ impl Raster {
         sum / total
     }
 
-    /// The morphological closing of a mask by a square: grown by a reach, then shrunk by it.
+    /// Returns the morphological closing of a mask by a square: the mask is dilated by `reach`, then eroded by `reach`.
     fn closed(&self, mask: &[bool], reach: usize) -> Vec<bool> {
         let (columns, rows) = (self.grid.columns + 2 * reach, self.grid.rows + 2 * reach);
         let mut wide = vec![false; columns * rows];
@@ -114,7 +116,7 @@ impl Raster {
     }
 }
 
-/// Gives every pixel a value if any pixel within reach, along columns and then along rows, has it.
+/// Sets each pixel to `value` if any pixel within `reach`, along columns and then along rows, has that value.
 fn spread(mask: &[bool], columns: usize, rows: usize, reach: usize, value: bool) -> Vec<bool> {
     let mut along = vec![!value; mask.len()];
     let mut out = vec![!value; mask.len()];
@@ -131,13 +133,13 @@ fn spread(mask: &[bool], columns: usize, rows: usize, reach: usize, value: bool)
     out
 }
 
-/// The spacing of a square grid of so many points over a rectangle: (n - 1) s^2 = (w + h) s + w h.
+/// Returns the spacing s of a square grid of n points over a rectangle of w by h: (n - 1) s^2 = (w + h) s + w h.
 fn spacing([width, height]: [f64; 2], points: usize) -> f64 {
     let (sum, n) = (width + height, (points - 1) as f64);
     (sum + (sum * sum + 4.0 * n * width * height).sqrt()) / (2.0 * n)
 }
 
-/// The least x and y, and how far it is to the largest.
+/// Returns the minimum x and y, and the extent in x and y.
 fn extent(samples: &[[f64; 3]]) -> ([f64; 2], [f64; 2]) {
     let [[x0, x1], [y0, y1]] = [0, 1].map(|k| range(samples.iter().map(|s| s[k])));
     ([x0, y0], [x1 - x0, y1 - y0])

@@ -1,5 +1,5 @@
-//! What other systems for quality take of a run: who measured which part when, each judged figure with its limit and uncertainty,
-//! and the verdict. The two formats are written from this alone, so that they cannot say two things.
+//! Results of a run for other quality systems: who measured which part and when, each judged figure with its limit and
+//! uncertainty, and the verdict. Both formats are written from this data alone, so they cannot disagree.
 
 use std::path::{Path, PathBuf};
 
@@ -11,13 +11,13 @@ use regrind_cell::{Conformity, Ending, Figures, Tolerance, Verdict};
 use regrind_formats::write_atomic;
 use regrind_journal::Record;
 
-/// The results of a run as QIF 3.0, in its folder.
+/// File name of the results of a run as QIF 3.0, in the run folder.
 pub const RUN_QIF: &str = "results.qif";
 
-/// The results of a run as Q-DAS ASCII, in its folder.
+/// File name of the results of a run as Q-DAS ASCII, in the run folder.
 pub const RUN_DFQ: &str = "results.dfq";
 
-/// What the results of a run can be written as.
+/// File formats of the results of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ResultsFormat {
     /// QIF 3.0 results (ANSI/DMSC), XML.
@@ -26,10 +26,12 @@ pub enum ResultsFormat {
     Dfq,
 }
 
-/// Proves the record of a run, writes its results and returns the name of the file: `path`, or the usual one in the folder.
+/// Verifies the record of a run, writes its results and returns the path of the file: `path`, or the default name in
+/// the run folder.
 ///
 /// # Errors
-/// A record that is not there or cannot be believed, or in which nothing was measured; a file that cannot be written.
+/// Fails if the record is missing, does not pass verification or contains no measurement, or if the file cannot be
+/// written.
 pub fn write_run_results(folder: &Path, format: ResultsFormat, path: Option<&Path>) -> Result<PathBuf, ReportError> {
     let usual = match format {
         ResultsFormat::Qif => RUN_QIF,
@@ -40,10 +42,10 @@ pub fn write_run_results(folder: &Path, format: ResultsFormat, path: Option<&Pat
     Ok(path)
 }
 
-/// Makes the results of a run from its record. The same record gives the same bytes.
+/// Returns the results of a run from its record. The same record gives the same bytes.
 ///
 /// # Errors
-/// A record that cannot be believed, or in which nothing was measured.
+/// Fails if the record does not pass verification, or if nothing was measured.
 pub fn run_results(folder: &Path, format: ResultsFormat) -> Result<String, ReportError> {
     let (story, verified) = Story::proven(folder)?;
     let results = Results::of(&story, verified.head.to_string()).with_areas(&story, folder)?;
@@ -56,14 +58,14 @@ pub fn run_results(folder: &Path, format: ResultsFormat) -> Result<String, Repor
     })
 }
 
-/// Everything that a file of results tells. Texts are as they stand in the record. Times are RFC 3339 in UTC.
+/// Content of a file of results. Texts are the same as in the record. Times are RFC 3339 in UTC.
 pub(super) struct Results {
     pub(super) run: String,
     pub(super) part: String,
     pub(super) name: String,
     /// Name of the recipe and the hash of its bytes.
     pub(super) recipe: [String; 2],
-    /// The same of the cell.
+    /// Name of the cell and the hash of the bytes of its file.
     pub(super) cell: [String; 2],
     pub(super) operator: String,
     pub(super) station: String,
@@ -74,52 +76,52 @@ pub(super) struct Results {
     pub(super) accepted: Option<bool>,
     pub(super) verdict: String,
     pub(super) decision_rule: Option<String>,
-    /// Name and address of the measuring machine, as it answered.
+    /// Name and address of the measuring machine, as it reported them.
     pub(super) cmm: Option<[String; 2]>,
-    /// Each measurement of each cycle, in its order.
+    /// Measurements of all cycles, in their order.
     pub(super) measured: Vec<Measured>,
-    /// The hash of the last record.
+    /// Hash of the last record.
     pub(super) head: String,
 }
 
-/// A measurement.
+/// Measurement of the part.
 pub(super) struct Measured {
     pub(super) cycle: u32,
     pub(super) utc: String,
-    /// Empty where there is nothing that could be believed.
+    /// Figures; empty if the measurement is not usable.
     pub(super) figures: Vec<Figure>,
     pub(super) standing: Standing,
     pub(super) verdict: String,
     pub(super) reason: String,
-    /// Points used, and points left out as outliers.
+    /// Number of points used, and number of outliers.
     pub(super) points: Option<[u32; 2]>,
     pub(super) coverage: Option<f64>,
 }
 
-/// A figure of a measurement. Units: millimetres.
+/// Figure of a measurement. Units: millimetres.
 pub(super) struct Figure {
     pub(super) kind: Kind,
     pub(super) found_mm: f64,
-    /// Expanded, k = 2.
+    /// Expanded uncertainty, k = 2.
     pub(super) expanded_mm: f64,
     pub(super) standing: Standing,
 }
 
-/// What a figure is.
+/// Kind of a figure: its name, its meaning and its limit.
 pub(super) struct Kind {
     pub(super) name: &'static str,
     pub(super) what: &'static str,
-    /// None where there is none.
+    /// Limit; `None` if the figure has no limit.
     pub(super) limit_mm: Option<f64>,
 }
 
-/// Where a figure, or a measurement, stands beside what is allowed.
+/// Position of a figure, or of a measurement, relative to its limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Standing {
     Within,
     Undecided,
     Beyond,
-    /// Nothing was judged: there is no limit, or nobody came to it.
+    /// Nothing was judged: there is no limit, or the run did not reach the judgement.
     NotJudged,
 }
 
@@ -155,13 +157,14 @@ impl Results {
         }
     }
 
-    /// What is told of each figure, by its place in every measurement: those that not all of them have come last.
+    /// Returns the kinds of figures in their order, from the measurement with the most figures. Figures that some
+    /// measurements lack come last.
     pub(super) fn kinds(&self) -> impl Iterator<Item = &Kind> {
         let most = self.measured.iter().max_by_key(|of| of.figures.len());
         most.into_iter().flat_map(|of| &of.figures).map(|figure| &figure.kind)
     }
 
-    /// The same with the figures of an area, which stand in a file of each cycle: its last measurement has them.
+    /// Adds the figures of an area to the last measurement of each cycle. They are read from a file of the cycle.
     fn with_areas(mut self, story: &Story, folder: &Path) -> Result<Self, ReportError> {
         for (cycle, of) in &story.cycles {
             let Some(name) = &of.form else { continue };
@@ -181,7 +184,7 @@ impl Measured {
         let figures = of.figures.as_ref().map(|figures| figures_of(figures, tolerance, judgement.is_some()));
         let mut figures = figures.unwrap_or_default();
         if judgement.is_some_and(|last| last.verdict == Verdict::LeftOut) {
-            // Until those places are touched again nobody knows.
+            // The result is undecided until those places are measured again.
             let within = figures.iter_mut().filter(|figure| figure.standing == Standing::Within);
             within.for_each(|figure| figure.standing = Standing::Undecided);
         }
@@ -209,10 +212,10 @@ fn decision_rule(tolerance: &Tolerance) -> String {
     }
 }
 
-/// The figures that are judged first, then the peak to valley of all points where another is judged.
+/// Returns the judged figures, then the peak to valley of all points if another figure is judged.
 fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) -> Vec<Figure> {
     let compared = tolerance.map(|tolerance| tolerance.compare(figures));
-    // What is judged is the form; that of the points, with the scatter of the probe in it, stands beside it.
+    // The form is judged. The figure of the points, which contains the noise of the probe, is added for information.
     let of_form = figures.form.is_some();
     let all_points = Figure {
         kind: Kind { name: if of_form { "PV as measured" } else { "PV" }, what: PV, limit_mm: None },
@@ -274,7 +277,7 @@ fn what_of(name: &str, of_form: bool) -> &'static str {
     }
 }
 
-/// The lengths of ISO 10110-5, by what `figures.json` calls them.
+/// Lengths of ISO 10110-5, with their names in `figures.json`.
 const AREAS: [(&str, &str, &str); 6] = [
     ("power", "ISO 10110-5 A", "peak to valley of the best sphere of the form"),
     ("irregularity", "ISO 10110-5 B", "peak to valley of what piston, tilt and power leave of the form"),
@@ -292,7 +295,7 @@ const AREAS: [(&str, &str, &str); 6] = [
     ),
 ];
 
-/// The figures of an area that a file tells with their intervals; all of them, or none.
+/// Returns the figures of an area that a file contains with their intervals: all of them, or `None` if one is missing.
 fn areas(told: &serde_json::Value) -> Option<Vec<Figure>> {
     const MM_OF_NM: f64 = 1e-6;
     let rows = told["form"].as_array()?;
@@ -309,7 +312,7 @@ fn areas(told: &serde_json::Value) -> Option<Vec<Figure>> {
     AREAS.into_iter().map(figure).collect()
 }
 
-/// Beyond where any figure is; within where each that has a limit is.
+/// Returns `Beyond` if any figure is beyond its limit, and `Within` only if each figure with a limit is within it.
 fn standing_of_all(figures: &[Figure]) -> Standing {
     let any = |standing| figures.iter().any(|figure| figure.standing == standing);
     [Standing::Beyond, Standing::Undecided, Standing::Within]

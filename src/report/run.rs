@@ -1,7 +1,7 @@
-//! The report of a run: one HTML file that opens without a network, made from the journal and the files on record.
+//! Report of a run: one HTML file that opens without a network, made from the journal and the files on record.
 //!
-//! It is made only from a record that can be believed, and it ends with the hash of the last record: whoever holds the
-//! report can tell whether a journal is the one that it was made from.
+//! It is made only from a record that passes verification. It ends with the hash of the last record, so that a reader
+//! of the report can check if a journal is the one that the report was made from.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -19,7 +19,7 @@ use regrind_cell::{Compared, Conformity, Ending, Figures, JobResult, ParameterTo
 use regrind_formats::{escaped, write_atomic};
 use regrind_journal::{Record, Verified};
 
-/// The report in a run folder.
+/// File name of the report in a run folder.
 pub const RUN_REPORT: &str = "report.html";
 
 const STYLE: &str = "body{font:15px/1.45 Helvetica,Arial,sans-serif;color:#222;max-width:62em;margin:2em auto;padding:0 1em}\
@@ -36,20 +36,21 @@ footer{margin-top:2.5em;border-top:1px solid #ddd;color:#555}\
 h2{break-after:avoid}figure,tr,#signatures,footer{break-inside:avoid}.good,.bad,.mark{print-color-adjust:exact}\
 td,th{padding:.2em .5em}}";
 
-/// Proves the record of a run, writes its report beside it and returns the name of the report.
+/// Verifies the record of a run, writes its report into the run folder and returns the path of the report.
 ///
 /// # Errors
-/// A record that is not there or cannot be believed, a file that cannot be read, a folder that cannot be written.
+/// Fails if the record is missing or does not pass verification, if a file cannot be read, or if the folder cannot be
+/// written.
 pub fn write_run_report(folder: &Path) -> Result<PathBuf, ReportError> {
     let path = folder.join(RUN_REPORT);
     write_atomic(&path, run_report(folder)?.as_bytes())?;
     Ok(path)
 }
 
-/// Makes the report of a run from its record.
+/// Returns the report of a run as HTML, from its record.
 ///
 /// # Errors
-/// A record that cannot be believed, a file on it that cannot be read.
+/// Fails if the record does not pass verification, or if a file on record cannot be read.
 pub fn run_report(folder: &Path) -> Result<String, ReportError> {
     let (story, verified) = Story::proven(folder)?;
     html(&story, folder, &verified)
@@ -107,7 +108,7 @@ fn verdict(story: &Story) -> String {
     format!("<p class=\"{class}\">{}</p>\n{more}", escaped(&words))
 }
 
-/// How far the last pass came, where it did not come to its end: the rest of the part stands as it did before.
+/// Returns how far the last pass came, if it did not reach its end. The rest of the part is unchanged.
 fn broken_off_pass(story: &Story) -> String {
     let Some(PassStory { cycle, ground, result }) = story.pass else { return String::new() };
     let how = match result {
@@ -131,7 +132,7 @@ fn broken_off_pass(story: &Story) -> String {
     )
 }
 
-/// The figures that are judged, of the last measurement, beside their limits.
+/// Returns the judged figures of the last measurement with their limits.
 fn judged(story: &Story) -> String {
     let (Some(tolerance), Some((cycle, of, figures))) = (story.tolerance(), story.last_found()) else {
         return String::new();
@@ -163,7 +164,7 @@ fn um(mm: f64) -> String {
     format!("{:.2}", 1e3 * mm)
 }
 
-/// How a figure lies beside its limit, reckoned before the reader's eyes.
+/// Returns the comparison of a figure with its limit, with the calculation shown to the reader.
 fn comparison(compared: &Compared, with_uncertainty: bool) -> String {
     let Compared { found_mm, held_mm: [low_mm, high_mm], limit_mm, conformity, .. } = *compared;
     if !limit_mm.is_finite() {
@@ -176,7 +177,7 @@ fn comparison(compared: &Compared, with_uncertainty: bool) -> String {
     };
     let beside = |what: &str, value: f64| {
         let is = if value <= limit_mm { "\u{2264}" } else { "&gt;" };
-        // Two numbers that differ are not shown as the same.
+        // Two different numbers must not be shown as the same number.
         let alike = um(value) == um(limit_mm) && value != limit_mm;
         let digits = if alike { 5 } else { 2 };
         let [value, limit] = [value, limit_mm].map(|mm| format!("{:.digits$}", 1e3 * mm));
@@ -234,13 +235,13 @@ fn facts(story: &Story, begin: &Value) -> String {
     format!("<h2>Run</h2>\n<table>\n{}</table>\n", rows.collect::<String>())
 }
 
-/// A time of the record to the second, for people.
+/// Formats a time of the record to the second, for people.
 pub(super) fn when(utc: &str) -> String {
     let second: String = utc.chars().take(19).collect();
     format!("{} UTC", second.replacen('T', " ", 1))
 }
 
-/// A row a measurement with its verdict, and below it why, and what else a person should know.
+/// Returns a row for each measurement with its verdict, and below it the reason and further remarks.
 fn cycles(story: &Story) -> String {
     let tolerance = story.tolerance();
     let named = |m: &Measurement| Some(tolerance.as_ref()?.compare(m.figures.as_ref()?)[0].name);
@@ -271,7 +272,8 @@ fn cycles(story: &Story) -> String {
             (k = 2). The level is the height of the surface that was wanted over the nominal one.</p>\n"
 }
 
-/// Which part of a correction went into parameters of the machine, and what was left for the map; nothing where the recipe takes none back.
+/// Returns which part of a correction went into parameters of the machine, and which part was left for the map; empty
+/// if the recipe compensates no parameters.
 fn parameters(story: &Story) -> String {
     let row = |number: u32, of: &ParameterTold| {
         let ParameterTold { name, unit, off, expanded, taken, told, removes_rms_um } = of;
@@ -314,9 +316,10 @@ fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, lev
     )
 }
 
-/// The figures of a measurement: those that are judged where the record tells which, or else those of all points.
+/// Returns the figures of a measurement: the judged figures if the record contains the tolerance, otherwise the figures
+/// of all points.
 fn figures_row(f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> String {
-    // The record tells of every run what is accepted; of one that ends before, the points tell.
+    // Each record contains the tolerance of the run; if the run ended before that, the figures of the points are shown.
     let points = || [[f.pv_mm, f.pv_expanded_mm], [f.rms_mm, f.rms_expanded_mm]];
     let of = |tolerance: &Tolerance| tolerance.compare(f).map(|compared| [compared.found_mm, compared.expanded_mm]);
     let [[pv_mm, pv_expanded_mm], [rms_mm, rms_expanded_mm]] = tolerance.map_or_else(points, of);
@@ -333,7 +336,7 @@ fn figures_row(f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> Strin
     )
 }
 
-/// The verdict of a measurement and its reason; where there is none, what there is instead.
+/// Returns the verdict of a measurement and its reason, or a replacement if it was not judged.
 fn judgement_of(measurement: &Measurement) -> (String, String) {
     let unusable = || measurement.unusable.clone().unwrap_or_default();
     let Some((last, earlier)) = measurement.judgements.split_last() else {

@@ -1,8 +1,8 @@
-//! The picture of the state machine, drawn from its transition table.
+//! Picture of the state machine, drawn from its transition table.
 //!
-//! Where the boxes stand is written down here; which arrows there are is not: they are what the table says. An arrow takes
-//! the straightest way that touches no other box, and its label the first free place along it, so that the same table gives
-//! the same picture. An arrow is named for at most two of its events; the table itself has all of them.
+//! The positions of the boxes are fixed in this file. The arrows come from the table. An arrow takes the straightest
+//! way that touches no other box, and its label takes the first free place along it, so the same table gives the same
+//! picture. The label of an arrow names at most two of its events; the table itself contains all of them.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,12 +11,13 @@ use regrind_cell::{Row, State};
 
 const WIDTH_PX: f64 = 1300.0;
 const HEIGHT_PX: f64 = 1260.0;
-/// Of labels.
+/// Size of labels.
 const FINE_PX: f64 = 10.0;
-/// Where the second drawing begins.
+/// Top of the second drawing.
 const CYCLE_TOP_PX: f64 = 850.0;
 
-/// Arrows that follow an order of a person, go the way of a run, or tell that something went wrong.
+/// Colours of arrows that follow an order of a person, and of arrows that show a fault. Other arrows are the normal
+/// course of a run.
 const ORDER: &str = "#2166ac";
 const TROUBLE: &str = "#b2182b";
 
@@ -36,7 +37,7 @@ const TROUBLES: [&str; 12] = [
     "start_unknown",
 ];
 
-/// The states of PackML and the middles of their boxes.
+/// States of PackML and the centres of their boxes.
 const STATES: [(&str, [f64; 2]); 15] = [
     ("Idle", [80.0, 320.0]),
     ("Starting", [240.0, 320.0]),
@@ -55,17 +56,17 @@ const STATES: [(&str, [f64; 2]); 15] = [
     ("Aborted", [1210.0, 770.0]),
 ];
 
-/// The states in which a run goes on, or can.
+/// States in which a run is active or can continue.
 const AT_WORK: [&str; 9] =
     ["Idle", "Starting", "Execute", "Holding", "Held", "Unholding", "Suspending", "Suspended", "Unsuspending"];
 
-/// A frame around states that all have the same way out.
+/// Frame around states that all have the same exit.
 struct Frame {
     corner: [f64; 2],
     size: [f64; 2],
-    /// What lies within besides the states at work.
+    /// States within the frame in addition to `AT_WORK`.
     and: &'static [&'static str],
-    /// The two states that the way leads to, by way of the machines or at once.
+    /// The two states that the exit leads to: by way of the machines, or at once.
     to: [&'static str; 2],
     label: [&'static str; 2],
 }
@@ -87,7 +88,7 @@ const FRAMES: [Frame; 2] = [
     },
 ];
 
-/// The phases and steps within `Execute`, and the middles of their boxes within the second drawing.
+/// Phases and steps within `Execute`, and the centres of their boxes within the second drawing.
 const PHASES: [(&str, [f64; 2]); 22] = [
     ("Load", [0.0, 0.0]),
     ("Grind, Send", [1.0, 0.0]),
@@ -110,29 +111,29 @@ const PHASES: [(&str, [f64; 2]); 22] = [
     ("Measure, Reconcile", [6.0, 2.0]),
     ("Measure, Discard", [3.0, 2.0]),
     ("Register", [1.0, 3.0]),
-    // What it makes leads back to the first step of the next pass.
+    // The correction that this phase makes leads back to the first step of the next pass.
     ("Compensate", [0.0, 2.0]),
 ];
 
-/// Half of width and height of a box.
+/// Half of the width and height of a box.
 const HALF_STATE: [f64; 2] = [62.0, 21.0];
 const HALF_PHASE: [f64; 2] = [47.0, 18.0];
 
-/// A box with a name.
+/// Box with a name.
 struct Node {
     name: &'static str,
     middle: [f64; 2],
     half: [f64; 2],
 }
 
-/// An arrow between two boxes, and the events that it stands for.
+/// Arrow between two boxes, and the events that it represents.
 struct Edge {
     from: usize,
     to: usize,
     events: BTreeSet<String>,
 }
 
-/// A rectangle that is taken: middle and half of width and height.
+/// Occupied rectangle: centre, and half of width and height.
 type Taken = ([f64; 2], [f64; 2]);
 
 /// Draws the state machine as SVG from its table.
@@ -155,7 +156,7 @@ pub fn state_picture(rows: &[Row]) -> String {
     svg.finish()
 }
 
-/// The events that lead from one place to another; what is refused leads nowhere.
+/// Events that lead from one place to another, without refused events.
 type Ways = BTreeMap<(String, String), BTreeSet<String>>;
 
 fn ways(rows: &[Row], name: impl Fn(State) -> Option<String>) -> Ways {
@@ -188,7 +189,7 @@ fn draw_states(svg: &mut Svg, ways: &Ways) {
     for frame in &FRAMES {
         let around = [&AT_WORK[..], frame.and].concat();
         let leads = |from: &&str| frame.to.iter().any(|to| ways.contains_key(&((**from).to_owned(), (*to).to_owned())));
-        // A frame stands only for a way that all within it have.
+        // A frame is drawn only for an exit that all states within it have.
         if around.iter().all(leads) {
             ways.retain(|(from, to), _| !(around.contains(&from.as_str()) && frame.to.contains(&to.as_str())));
             draw_frame(svg, frame, &mut taken);
@@ -249,7 +250,7 @@ fn boxes(nodes: &[Node]) -> Vec<Taken> {
     nodes.iter().map(|node| (node.middle, node.half)).collect()
 }
 
-/// Turns ways into arrows between boxes that are there.
+/// Converts ways to arrows between the boxes that exist.
 fn edges(nodes: &[Node], ways: &Ways) -> Vec<Edge> {
     let index = |name: &str| nodes.iter().position(|node| node.name == name);
     let known = ways
@@ -267,7 +268,7 @@ fn draw(svg: &mut Svg, nodes: &[Node], edges: &[Edge], taken: &mut Vec<Taken>) {
         svg.arrow(curve[0], curve[1], curve[2], colour);
         labels.push((curve, label_of(&edge.events), colour));
     }
-    // Labels last: no arrow runs over them.
+    // Labels are drawn last, so that no arrow runs over them.
     for (curve, label, colour) in labels {
         let half = [2.75 * label.chars().count() as f64 + 1.0, 6.0];
         let place = free_place(&curve, half, taken);
@@ -286,7 +287,7 @@ fn colour_of(events: &BTreeSet<String>) -> &'static str {
     }
 }
 
-/// Names at most two events: orders first, then the way of a run, then what went wrong.
+/// Returns the names of at most two events: orders first, then the normal course of a run, then faults.
 fn label_of(events: &BTreeSet<String>) -> String {
     let rank = |event: &&String| {
         let known = |names: &[&str]| names.contains(&event.as_str());
@@ -318,14 +319,14 @@ fn route(nodes: &[Node], edge: &Edge, both: bool) -> [[f64; 2]; 3] {
     bows.into_iter().map(curve).find(|c| is_free(c)).unwrap_or_else(|| curve(least))
 }
 
-/// Returns where the line from the middle of a box to a point leaves the box.
+/// Returns the point at which the line from the centre of a box to `to` leaves the box.
 fn border(node: &Node, to: [f64; 2]) -> [f64; 2] {
     let [dx, dy] = [to[0] - node.middle[0], to[1] - node.middle[1]];
     let share = (node.half[0] / dx.abs()).min(node.half[1] / dy.abs()).min(1.0);
     [node.middle[0] + share * dx, node.middle[1] + share * dy]
 }
 
-/// Returns the point of a quadratic curve at a share of its way.
+/// Returns the point of a quadratic Bézier curve at the parameter `t`.
 fn on([a, b, c]: &[[f64; 2]; 3], t: f64) -> [f64; 2] {
     let weights = [(1.0 - t) * (1.0 - t), 2.0 * t * (1.0 - t), t * t];
     std::array::from_fn(|k| weights[0] * a[k] + weights[1] * b[k] + weights[2] * c[k])
@@ -335,7 +336,7 @@ fn within(point: [f64; 2], middle: [f64; 2], half: [f64; 2], margin: f64) -> boo
     (0..2).all(|k| (point[k] - middle[k]).abs() < half[k] + margin)
 }
 
-/// Returns the first place along a curve, or beside it, where a label covers nothing.
+/// Returns the first place along a curve, or next to it, at which a label covers nothing.
 fn free_place(curve: &[[f64; 2]; 3], half: [f64; 2], taken: &[Taken]) -> [f64; 2] {
     let is_free = |place: &[f64; 2]| {
         !taken.iter().any(|(middle, other)| within(*place, *middle, [other[0] + half[0], other[1] + half[1]], 1.0))

@@ -1,4 +1,4 @@
-//! What the journal tells of a run, as far as a report shows it.
+//! History of a run from its journal, as far as a report shows it.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,16 +14,16 @@ use regrind_cell::{
 };
 use regrind_journal::{Reader, Record, Verified, verify};
 
-/// The map of a cycle's error, as text.
+/// File of the error map of a cycle, as text.
 const MAP: &str = "error_map.csv";
 
-/// The points of a cycle with their deviations, as text.
+/// File of the points of a cycle with their deviations, as text.
 const DEVIATIONS: &str = "deviations.csv";
 
-/// How a cycle was registered.
+/// File of the registration of a cycle.
 const REGISTRATION: &str = "registration.json";
 
-/// The figures of a cycle.
+/// File of the figures of a cycle.
 const FIGURES: &str = "figures.json";
 
 #[derive(Default)]
@@ -31,96 +31,96 @@ pub(super) struct Story {
     pub(super) begin: Option<Record>,
     pub(super) end: Option<Record>,
     pub(super) ending: Option<Ending>,
-    /// Whether each machine came home, where this is the record of a recovery.
+    /// For each machine, true if it came home; `None` if this is not the record of a recovery.
     pub(super) home: Option<[bool; 2]>,
     pub(super) cycles: BTreeMap<u32, CycleStory>,
-    /// Name and address of each machine, as it answered.
+    /// Name and address of each machine, as it reported them.
     pub(super) machines: [Option<[String; 2]>; 2],
-    /// What the grinder told of its wheel last.
+    /// Radius of the wheel that the grinder reported last.
     pub(super) wheel_radius_mm: Option<f64>,
-    /// By how much the probe's radius was off on the reference sphere last, and in which cycle.
+    /// Cycle and value of the last error of the probe's radius on the reference sphere.
     pub(super) radius_error_mm: Option<(u32, f64)>,
     pub(super) alarms: Vec<AlarmStory>,
     pub(super) orders: Vec<Order>,
-    /// The pass that was begun last.
+    /// Pass that was started last.
     pub(super) pass: Option<PassStory>,
-    /// When the last record was written.
+    /// Time of the last record.
     pub(super) last: String,
 }
 
-/// How far a pass came.
+/// Progress of a pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct PassStory {
     pub(super) cycle: u32,
-    /// So much of its path was ground, of so much, as the grinder told last.
+    /// Ground part of its path and whole path, as the grinder reported them last.
     pub(super) ground: Option<[u32; 2]>,
-    /// How it ended; none where that is not on record.
+    /// Result of the pass; `None` if it is not on record.
     pub(super) result: Option<JobResult>,
 }
 
 #[derive(Default)]
 pub(super) struct CycleStory {
     pub(super) measurements: Vec<Measurement>,
-    /// Height of the surface that was wanted over the nominal one.
+    /// Height of the target surface above the nominal one.
     pub(super) level_um: Option<f64>,
-    /// Name of the map within the run folder, and when it came on record.
+    /// Name of the map within the run folder, and the time at which it was recorded.
     pub(super) map: Option<(String, String)>,
-    /// Name of the points with their deviations within the run folder.
+    /// Name of the file of points with their deviations within the run folder.
     pub(super) deviations: Option<String>,
-    /// Name of the file that tells how it was registered, within the run folder.
+    /// Name of the registration file within the run folder.
     pub(super) registration: Option<String>,
     /// Name of the file of figures within the run folder.
     pub(super) form: Option<String>,
-    /// PV and RMS that the next pass is expected to leave, in millimetres.
+    /// PV and RMS that are expected after the next pass, in millimetres.
     pub(super) expected_mm: Option<[f64; 2]>,
-    /// What was told of parameters of the machine.
+    /// Estimates of the parameters of the machine.
     pub(super) parameters: Vec<ParameterTold>,
-    /// Root mean square of what was left for the map beside them, in millimetres.
+    /// Root mean square of the error that is left for the map in addition to the parameters, in millimetres.
     pub(super) map_rms_mm: Option<f64>,
 }
 
-/// A measurement of a cycle: what was found, or why there is nothing.
+/// Measurement of a cycle: its figures, or the reason why there are none.
 #[derive(Default)]
 pub(super) struct Measurement {
-    /// When the last that is told of it came on record.
+    /// Time of the last record about the measurement.
     pub(super) utc: String,
     pub(super) figures: Option<Figures>,
     pub(super) unusable: Option<String>,
-    /// A judgement may be amended: the last counts.
+    /// Judgements in their order. A judgement can be amended; the last one counts.
     pub(super) judgements: Vec<Judgement>,
 }
 
 impl Measurement {
-    /// Whether more touches belong to it.
+    /// Returns true if further touches belong to this measurement.
     fn goes_on(&self) -> bool {
         self.figures.as_ref().is_some_and(|figures| figures.touch_on.is_some())
     }
 }
 
-/// An alarm as the record tells it.
+/// Alarm from the record.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AlarmStory {
-    /// The alarm.
+    /// Alarm itself.
     pub alarm: Alarm,
-    /// When it was raised, RFC 3339 in UTC.
+    /// Time at which it was raised, RFC 3339 in UTC.
     pub raised: String,
-    /// When it was gone; none where it stood to the end of the record.
+    /// Time at which it was withdrawn; `None` if it was active until the end of the record.
     pub withdrawn: Option<String>,
 }
 
-/// What a person ordered, or said of a machine.
+/// Order of a person, or confirmation of the state of a machine.
 pub(super) struct Order {
     pub(super) record: Record,
-    /// As the cell took it in; none for what goes to a machine past the cell.
+    /// Event that the cell processed; `None` for an order that goes directly to a machine, past the cell.
     event: Option<Event>,
     pub(super) refused: Option<String>,
 }
 
 impl Story {
-    /// Proves the record of a run and reads what it tells, as far as it is proven.
+    /// Verifies the record of a run and reads its history, as far as the record is verified.
     ///
     /// # Errors
-    /// A record that cannot be read or believed.
+    /// Fails if the record cannot be read or does not pass verification.
     pub(super) fn proven(folder: &Path) -> Result<(Self, Verified), ReportError> {
         let verified = verify(folder)?;
         let mut story = Self::default();
@@ -189,14 +189,15 @@ impl Story {
                 let unusable = Some(&gate).filter(|gate| **gate != Gate::Passed).map(gate_words);
                 let measurements = &mut self.cycle(cycle).measurements;
                 match measurements.last_mut().filter(|last| last.goes_on()) {
-                    // What goes on with the touches before is the same measurement, and is what they showed until more is known.
+                    // Further touches belong to the same measurement. Its earlier result stays valid until more is
+                    // known.
                     Some(last) if unusable.is_none() => last.utc = record.utc,
                     Some(last) => *last = Measurement { utc: record.utc, unusable, ..Measurement::default() },
                     None => measurements.push(Measurement { utc: record.utc, unusable, ..Measurement::default() }),
                 }
             }
             Event::Registered { cycle, figures } => {
-                // What was judged keeps its figures.
+                // A judged measurement keeps its figures.
                 if self.measurement(cycle).figures.is_some() && !self.measurement(cycle).goes_on() {
                     self.cycle(cycle).measurements.push(Measurement::default());
                 }
@@ -239,7 +240,7 @@ impl Story {
     }
 
     fn take_file(&mut self, record: &Record, name: &str) {
-        // What was computed again after an interruption stands in a folder of its own; the last counts.
+        // Results computed again after an interruption are in a separate folder. The last ones count.
         if !name.starts_with(&format!("cycle-{}/", record.cycle)) {
             return;
         }
@@ -266,7 +267,7 @@ impl Story {
         self.cycles.entry(number).or_default()
     }
 
-    /// The last measurement of a cycle.
+    /// Returns the last measurement of a cycle.
     fn measurement(&mut self, number: u32) -> &mut Measurement {
         let measurements = &mut self.cycle(number).measurements;
         if measurements.is_empty() {
@@ -276,13 +277,13 @@ impl Story {
         &mut measurements[last]
     }
 
-    /// What the recipe accepts, as the run began with it; none where the record does not tell.
+    /// Returns the tolerance of the recipe at the start of the run; `None` if it is not on record.
     pub(super) fn tolerance(&self) -> Option<Tolerance> {
         let begin = self.begin.as_ref()?.value();
         serde_json::from_value(begin["content"]["plan"]["tolerance"].clone()).ok()
     }
 
-    /// The last measurement with figures, and its cycle.
+    /// Returns the last measurement with figures, and its cycle.
     pub(super) fn last_found(&self) -> Option<(u32, &Measurement, &Figures)> {
         let all = self.cycles.iter().flat_map(|(cycle, story)| story.measurements.iter().map(|of| (*cycle, of)));
         all.rev().find_map(|(cycle, of)| Some((cycle, of, of.figures.as_ref()?)))
@@ -294,12 +295,12 @@ impl Order {
         words(&self.record)
     }
 
-    /// What became of it.
+    /// Returns the result of the order in words.
     pub(super) fn answer(&self) -> String {
         match (&self.refused, &self.event) {
             (Some(why), _) => format!("refused: {why}"),
             (None, Some(_)) => "taken".to_owned(),
-            // It went to the machine, and the record goes on with what came of it.
+            // The order went to the machine; later records show the result.
             (None, None) => "on record".to_owned(),
         }
     }

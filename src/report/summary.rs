@@ -1,4 +1,4 @@
-//! What a list of runs shows of each, and where its maps are.
+//! Summary of a run for a list of runs, and the names of its maps.
 
 use std::path::Path;
 
@@ -8,90 +8,91 @@ use super::words::{ending_words, home_words, verdict_words};
 use regrind_cell::{Ending, Tolerance};
 use regrind_journal::{Reader, Record};
 
-/// What the record of a run tells at a glance. It is read and not proven: `regrind audit verify` does that, and so does the report.
+/// Summary of the record of a run. The record is read but not verified; `regrind audit verify` and the report verify
+/// it.
 #[derive(Clone, Debug, Default)]
 pub struct RunSummary {
-    /// What the run is called.
+    /// Name of the run.
     pub run: String,
-    /// The serial number of the part.
+    /// Serial number of the part.
     pub part: String,
-    /// What the part is.
+    /// Name of the part.
     pub name: String,
     /// Name of the recipe.
     pub recipe: String,
-    /// Who began it.
+    /// Operator who started the run.
     pub operator: String,
-    /// When it began, RFC 3339 in UTC.
+    /// Time of the start, RFC 3339 in UTC.
     pub began: String,
-    /// When it ended; none where that is not on record.
+    /// Time of the end; `None` if the end is not on record.
     pub ended: Option<String>,
-    /// Whether any machine of it is simulated.
+    /// True if any machine of the run is simulated.
     pub simulation: bool,
-    /// Whether its machines were simulated by the program that ran it, and ended with that.
+    /// True if the program that ran the run also simulated its machines, so that they ended with the program.
     pub machines_within: bool,
-    /// How it ended.
+    /// Result of the run.
     pub result: RunResult,
-    /// The same for people.
+    /// Result in words, for people.
     pub verdict: String,
-    /// What its figures are judged by.
+    /// Tolerance that the figures are judged by.
     pub tolerance: Option<Tolerance>,
-    /// Each cycle of which something is known.
+    /// Cycles about which something is on record.
     pub cycles: Vec<CycleSummary>,
-    /// The alarms that were raised, in that order.
+    /// Alarms, in the order in which they were raised.
     pub alarms: Vec<AlarmStory>,
-    /// When the last record was written, RFC 3339 in UTC.
+    /// Time of the last record, RFC 3339 in UTC.
     pub last: String,
-    /// What each machine called itself: the measuring machine, the grinder; none where it has not answered.
+    /// Names that the measuring machine and the grinder reported; `None` for a machine that has not answered.
     pub machines: [Option<String>; 2],
-    /// The radius of the wheel as the grinder told it last, in millimetres.
+    /// Radius of the wheel that the grinder reported last, in millimetres.
     pub wheel_radius_mm: Option<f64>,
-    /// By how much the probe's radius was off on the reference sphere last, in micrometres.
+    /// Last error of the probe's radius on the reference sphere, in micrometres.
     pub probe_off_um: Option<f64>,
 }
 
-/// How a run ended.
+/// Result of a run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum RunResult {
-    /// It has no end on record.
+    /// The run has no end on record.
     #[default]
     Open,
     /// The part is accepted.
     Accepted,
-    /// It came to its end, and the part is not accepted.
+    /// The run is complete and the part is not accepted.
     NotAccepted,
-    /// It was stopped.
+    /// The run was stopped.
     Stopped,
-    /// It was aborted.
+    /// The run was aborted.
     Aborted,
-    /// It brought machines home, and made no part.
+    /// The run was a recovery: it brought machines home and made no part.
     Recovery,
 }
 
-/// What is known of a cycle. Units: micrometres.
+/// Summary of a cycle. Units: micrometres.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CycleSummary {
-    /// Its number, from 1.
+    /// Number of the cycle, from 1.
     pub cycle: u32,
-    /// How it was judged; none where it was not.
+    /// Verdict; `None` if the cycle was not judged.
     pub verdict: Option<String>,
-    /// Why.
+    /// Reason for the verdict.
     pub reason: String,
-    /// PV, RMS and the expanded uncertainty of each, as they were judged; none where nothing was measured.
+    /// PV and RMS, each with its expanded uncertainty, as they were judged; `None` if nothing was measured.
     pub figures: Option<[[f64; 2]; 2]>,
-    /// The points that were left out of these, where they are and by how much; none where all count.
+    /// Outliers that these figures leave out, with their places and deviations; `None` if all points count.
     pub left_out: Option<String>,
-    /// PV and RMS that the correction made from it is expected to leave; none where none was made.
+    /// PV and RMS that are expected after the correction made from this cycle; `None` if no correction was made.
     pub expected: Option<[f64; 2]>,
-    /// Name of its error map within the run folder.
+    /// Name of the error map within the run folder.
     pub map: Option<String>,
-    /// Name of its points within the run folder.
+    /// Name of the file of points within the run folder.
     pub deviations: Option<String>,
 }
 
-/// Reads what a list shows of a run.
+/// Reads the summary of a run for a list.
 ///
 /// # Errors
-/// No record of a run, and one that cannot be read.
+/// Fails if the folder contains no record of a run, or if the record cannot be read.
 pub fn run_summary(folder: &Path) -> Result<RunSummary, ReportError> {
     let mut story = Story::default();
     for record in Reader::open(folder)?.records(0) {

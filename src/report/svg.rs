@@ -1,26 +1,26 @@
-//! The few elements of SVG that figures are made of.
+//! SVG elements that figures are made of.
 
 use std::fmt::Write;
 
 use super::axis::Tick;
 use regrind_formats::escaped;
 
-/// Ink of axes and text.
+/// Colour of axes and text.
 pub(super) const INK: &str = "#222222";
-/// Ink of grid lines.
+/// Colour of grid lines.
 pub(super) const FAINT: &str = "#dddddd";
 /// Size of labels in pixels.
 pub(super) const SMALL: f64 = 12.0;
 /// Size of titles in pixels.
 pub(super) const LARGE: f64 = 15.0;
 
-/// An SVG document that is being written: pixels, y downwards, two decimals.
+/// SVG document that is being written: coordinates in pixels, y downwards, two decimals.
 #[derive(Debug)]
 pub(super) struct Svg {
     text: String,
 }
 
-/// On which side of its place a text stands.
+/// Alignment of a text relative to its place.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Anchor {
     Start,
@@ -38,10 +38,10 @@ impl Anchor {
     }
 }
 
-/// A rectangle with ticks on its left and lower side.
+/// Rectangle with ticks on its left and lower side.
 #[derive(Debug)]
 pub(super) struct Frame<'a> {
-    /// The upper left corner.
+    /// Upper left corner.
     pub(super) corner: [f64; 2],
     /// Width and height.
     pub(super) size: [f64; 2],
@@ -49,12 +49,12 @@ pub(super) struct Frame<'a> {
     pub(super) y_ticks: Vec<Tick>,
     pub(super) x_label: &'a str,
     pub(super) y_label: &'a str,
-    /// Whether lines cross the frame at the ticks.
+    /// True if grid lines cross the frame at the ticks.
     pub(super) grid: bool,
 }
 
 impl Svg {
-    /// Begins a document on white paper.
+    /// Begins a document with a white background.
     pub(super) fn new(width: f64, height: f64) -> Self {
         let mut svg = Self { text: String::new() };
         svg.put(format_args!(
@@ -81,7 +81,7 @@ impl Svg {
         ));
     }
 
-    /// An unfilled or filled rectangle with a thin outline.
+    /// Draws a filled or unfilled rectangle with a thin outline.
     pub(super) fn rectangle(&mut self, [x, y]: [f64; 2], [width, height]: [f64; 2], fill: &str) {
         self.put(format_args!(
             "<rect x=\"{x:.2}\" y=\"{y:.2}\" width=\"{width:.2}\" height=\"{height:.2}\" fill=\"{fill}\" stroke=\"{INK}\"/>\n"
@@ -99,7 +99,7 @@ impl Svg {
         ));
     }
 
-    /// A quadratic curve from a place to another with a head at its end.
+    /// Draws a quadratic curve between two places, with an arrow head at its end.
     pub(super) fn arrow(&mut self, [x1, y1]: [f64; 2], [cx, cy]: [f64; 2], [x2, y2]: [f64; 2], colour: &str) {
         let (dx, dy) = if (cx - x2).hypot(cy - y2) > 1.0 { (x2 - cx, y2 - cy) } else { (x2 - x1, y2 - y1) };
         let length = dx.hypot(dy).max(f64::MIN_POSITIVE);
@@ -111,7 +111,7 @@ impl Svg {
         ));
     }
 
-    /// A piece of paper over what was drawn before.
+    /// Draws a white plate that covers earlier drawing.
     pub(super) fn plate(&mut self, [x, y]: [f64; 2], [width, height]: [f64; 2]) {
         self.put(format_args!(
             "<rect x=\"{x:.2}\" y=\"{y:.2}\" width=\"{width:.2}\" height=\"{height:.2}\" fill=\"#ffffff\" \
@@ -119,7 +119,7 @@ impl Svg {
         ));
     }
 
-    /// A text in a colour, centred on a place.
+    /// Draws a text in a colour, centred on a place.
     pub(super) fn coloured_text(&mut self, [x, y]: [f64; 2], size: f64, content: &str, colour: &str) {
         let content = escaped(content);
         self.put(format_args!(
@@ -127,7 +127,7 @@ impl Svg {
         ));
     }
 
-    /// A marker: shape 0 is a disc, 1 a square, 2 a triangle, 3 a diamond.
+    /// Draws a marker: shape 0 is a disc, 1 a square, 2 a triangle, 3 a diamond.
     pub(super) fn marker(&mut self, [x, y]: [f64; 2], shape: usize, colour: &str) {
         if shape == 0 {
             return self.put(format_args!("<circle cx=\"{x:.2}\" cy=\"{y:.2}\" r=\"3.5\" fill=\"{colour}\"/>\n"));
@@ -140,7 +140,7 @@ impl Svg {
         self.put(format_args!("<path d=\"M{x:.2},{y:.2}{outline}\" fill=\"{colour}\"/>\n"));
     }
 
-    /// The frame of a figure with its ticks, their labels and the names of both axes; grid lines where wanted.
+    /// Draws the frame of a figure with its ticks, their labels, the names of both axes and optional grid lines.
     pub(super) fn frame(&mut self, frame: &Frame) {
         let Frame { corner: [left, top], size: [width, height], .. } = *frame;
         let (right, bottom) = (left + width, top + height);
@@ -159,7 +159,7 @@ impl Svg {
         self.upright([left - 46.0, top + height / 2.0], frame.y_label);
     }
 
-    /// A text whose base line passes through a place.
+    /// Draws a text with its base line through a place.
     pub(super) fn text(&mut self, [x, y]: [f64; 2], anchor: Anchor, size: f64, content: &str) {
         let (anchor, content) = (anchor.name(), escaped(content));
         self.put(format_args!(
@@ -167,7 +167,7 @@ impl Svg {
         ));
     }
 
-    /// A text that reads upwards, centred on a place.
+    /// Draws a text that reads upwards, centred on a place.
     pub(super) fn upright(&mut self, [x, y]: [f64; 2], content: &str) {
         let content = escaped(content);
         self.put(format_args!(
@@ -175,7 +175,7 @@ impl Svg {
         ));
     }
 
-    /// The label of a tick, its exponent raised.
+    /// Draws the label of a tick, with its exponent raised.
     pub(super) fn tick_label(&mut self, at: [f64; 2], anchor: Anchor, tick: &Tick) {
         let Some(exponent) = tick.exponent else { return self.text(at, anchor, SMALL, &tick.label) };
         let ([x, y], anchor, exponent) = (at, anchor.name(), exponent.to_string().replace('-', "\u{2212}"));
@@ -186,7 +186,7 @@ impl Svg {
         ));
     }
 
-    /// A PNG, given in base 64, stretched over a rectangle.
+    /// Draws a PNG, given in base 64, stretched over a rectangle.
     pub(super) fn image(&mut self, [x, y]: [f64; 2], [width, height]: [f64; 2], base64: &str, rendering: &str) {
         self.put(format_args!(
             "<image x=\"{x:.2}\" y=\"{y:.2}\" width=\"{width:.2}\" height=\"{height:.2}\" preserveAspectRatio=\"none\" \
@@ -194,7 +194,7 @@ impl Svg {
         ));
     }
 
-    /// A gradient from bottom to top through colours at their places from 0 to 1, to be used as the fill `url(#id)`.
+    /// Defines a gradient from bottom to top through colours at places from 0 to 1. It is used as the fill `url(#id)`.
     pub(super) fn gradient(&mut self, id: &str, stops: &[(f64, [u8; 3])]) {
         self.put(format_args!("<defs><linearGradient id=\"{id}\" x1=\"0\" y1=\"1\" x2=\"0\" y2=\"0\">"));
         for (offset, [r, g, b]) in stops {

@@ -1,52 +1,52 @@
-//! What a record of the journal tells: by what stands in it, whatever kind it stands as.
+//! Content of a record of the journal. The fields of a command or a note decide what it is, not the kind of the record.
 //!
-//! A command that is answered stands as an intent and one that is not as a note; who reads them by their kind misses the half of
-//! them. Every reader of records for people begins here.
+//! A command that is answered is recorded as an intent, a command that is not answered as a note. A reader that looks
+//! only at one kind misses half of the commands. All readers of records for people use this module.
 
 use serde_json::Value;
 
 use regrind_cell::{Command, Device, Ending, Event};
 use regrind_journal::{Kind, Record};
 
-/// What a record tells. Values are as they stand in the record.
+/// Content of a record. Values are the same as in the record.
 #[derive(Debug)]
 pub(super) enum Told {
-    /// The run began.
+    /// Start of the run.
     Begun(Value),
-    /// The journal was opened again.
+    /// Reopening of the journal.
     OpenedAgain,
-    /// The cell commanded.
+    /// Command of the cell.
     Command(Box<Command>),
-    /// The cell took an event in.
+    /// Event that the cell processed.
     Event(Box<Event>),
-    /// What became of a command.
+    /// Result of a command.
     Answer(String),
-    /// A person's word about a machine that cannot tell it itself.
+    /// Confirmation by a person of the state of a machine that cannot report it itself.
     Word(Device, Value),
-    /// A step that a person gave a machine to bring it home.
+    /// Step that a person ordered a machine to make, to bring it home.
     Step(Device, Value),
-    /// Words of a machine.
+    /// Messages of a machine.
     Remarks(Device, Vec<String>),
-    /// What a program that speaks for people had to have on record.
+    /// Remark that a user interface (a program that acts for people) put on record.
     Remark(String),
-    /// What a grinder tells of a pass.
+    /// Report of a grinder about a pass.
     Pass(Value),
-    /// How points came over the wire.
+    /// Description of the transfer of points over the network.
     Transfer(Value),
-    /// A file of the run.
+    /// File of the run.
     File(Value),
-    /// The record was signed.
+    /// Signature of the record.
     Seal(Value),
-    /// The end of a run.
+    /// End of a run.
     End(Ending, Value),
-    /// The end of a recovery: whether each machine is home.
+    /// End of a recovery: for each machine, true if it is home.
     Home([bool; 2]),
-    /// What this version of the program cannot read.
+    /// Content that this version of the program cannot read.
     Unknown,
 }
 
 impl Told {
-    /// Reads a record.
+    /// Reads the content of a record.
     pub(super) fn of(record: &Record) -> Self {
         let value = record.value();
         let told = match record.kind {
@@ -92,7 +92,7 @@ impl Told {
         if let (Some(cmm), Some(grinder)) = (value["cmm_home"].as_bool(), value["grinder_home"].as_bool()) {
             return Some(Self::Home([cmm, grinder]));
         }
-        // The drive puts the ending beside the figures of all cycles.
+        // The driver loop writes the ending together with the figures of all cycles.
         let ending = value.get("ending").filter(|inner| inner.is_object()).unwrap_or(value);
         let ending = serde_json::from_value(ending.clone()).ok()?;
         Some(Self::End(ending, value["cycles"].clone()))

@@ -1,4 +1,4 @@
-//! What a record of the journal says, in one line for a person.
+//! Content of a record of the journal, in one line for a person.
 
 use std::fmt::Write;
 
@@ -11,7 +11,8 @@ use regrind_cell::{
 };
 use regrind_journal::Record;
 
-/// Returns what a record says, in one line. What this version of the program cannot read stands as it was written.
+/// Returns the content of a record in one line. Content that this version of the program cannot read is returned as it
+/// was written.
 pub fn words(record: &Record) -> String {
     let told = told_words(&Told::of(record));
     let as_written = || record.value().as_str().map_or_else(|| record.payload.clone(), str::to_owned);
@@ -19,7 +20,7 @@ pub fn words(record: &Record) -> String {
     if !record.reason.is_empty() {
         let _ = write!(line, " ({})", record.reason);
     }
-    // Words may come from a machine; what controls a terminal stays out.
+    // Some texts come from a machine. Control characters could change the terminal, so they are replaced.
     line.replace(|c: char| c.is_control(), " ")
 }
 
@@ -66,7 +67,7 @@ fn seal_words(value: &Value) -> Option<String> {
     Some(format!("sealed up to record {}, key {}...", value["records"], key.get(..12).unwrap_or(key)))
 }
 
-/// A person's word about a machine: what is so, with which map, by which file.
+/// Returns a person's confirmation about a machine: its state, with which map, by which file.
 fn person_words(device: Device, value: &Value) -> Option<String> {
     let mut line = format!("{device}: {}", value["confirmed"].as_str()?);
     for key in ["map", "file"] {
@@ -82,13 +83,13 @@ fn step_words(device: Device, value: &Value) -> Option<String> {
     Some(format!("{device}: to be brought home by {step}, it was seen {seen}"))
 }
 
-/// Whether each machine is home, CMM and grinder.
+/// Returns in words, for CMM and grinder, if each is home.
 pub(super) fn home_words(home: [bool; 2]) -> String {
     let of = |(device, home): (Device, bool)| format!("{device} {}", if home { "home" } else { "not home" });
     Device::BOTH.into_iter().zip(home).map(of).collect::<Vec<_>>().join(", ")
 }
 
-/// Returns how much of the part the wheel passes over without reaching it, in words. Units: a share from 0 to 1.
+/// Returns in words the share of the part that the wheel passes over without contact. Units: a share from 0 to 1.
 pub fn in_air(share: f64) -> String {
     match 100.0 * share {
         0.0 => "none in air".to_owned(),
@@ -97,7 +98,7 @@ pub fn in_air(share: f64) -> String {
     }
 }
 
-/// What a grinder tells of a pass; what it does not tell is left out.
+/// Returns the report of a grinder about a pass. Values that it does not report are omitted.
 fn pass_words(value: &Value) -> Option<String> {
     let number = |key: &str| value[key].as_f64();
     let told = [
@@ -133,7 +134,7 @@ fn transfer_words(value: &Value) -> Option<String> {
     Some(line)
 }
 
-/// Returns how a run ended, and why.
+/// Returns the ending of a run and its reason.
 pub fn ending_words(ending: &Ending) -> String {
     match ending {
         Ending::Accepted { reason, .. } => format!("ACCEPTED: {reason}"),
@@ -146,7 +147,7 @@ pub fn ending_words(ending: &Ending) -> String {
     }
 }
 
-/// `load_confirmed` and `LoadConfirmed` become `load confirmed`.
+/// Converts `load_confirmed` and `LoadConfirmed` to `load confirmed`.
 fn spaced(name: &str) -> String {
     let mut words = String::new();
     for c in name.chars() {
@@ -158,27 +159,27 @@ fn spaced(name: &str) -> String {
     words
 }
 
-/// The name of a command or event in words, with the machine named as it is.
+/// Returns the name of a command or event in words, after the name of the machine if there is one.
 fn named(name: &str, device: Option<Device>) -> String {
     device.map_or_else(|| spaced(name), |device| format!("{device}: {}", spaced(name)))
 }
 
-/// How a cycle was judged, and why.
+/// Returns the judgement of a cycle and its reason.
 pub(super) fn judgement_words(judgement: &Judgement) -> String {
     format!("judged, {}: {}", verdict_words(judgement), judgement.reason)
 }
 
-/// The verdict, by the name that it has in `result.json`.
+/// Returns the verdict, with the same name as in `result.json`.
 pub(super) fn verdict_words(judgement: &Judgement) -> String {
     spaced(&format!("{:?}", judgement.verdict))
 }
 
-/// What happened, what follows, what to do.
+/// Returns the cause of an alarm, its consequence and its remedy.
 pub(super) fn alarm_words(alarm: &Alarm) -> String {
     format!("{} {} {}", alarm.what, alarm.consequence, alarm.remedy.join(" "))
 }
 
-/// Who may clear an alarm.
+/// Returns the role that can clear an alarm.
 pub(super) fn role_words(alarm: &Alarm) -> String {
     match alarm.clears {
         Role::Nobody => "itself".to_owned(),
@@ -281,7 +282,7 @@ fn reconciliation_words(outcome: &Reconciliation) -> String {
     }
 }
 
-/// Whether a measurement is usable, and why not.
+/// Returns in words if a measurement is usable, and if not, why.
 pub(super) fn gate_words(gate: &Gate) -> String {
     match gate {
         Gate::Passed => "usable".to_owned(),
@@ -317,7 +318,8 @@ fn figures_words(figures: &Figures) -> String {
     line
 }
 
-/// What was told of parameters of the machine, and what of it went where.
+/// Returns in words the estimates of the parameters of the machine with their compensation, and the error that is left
+/// for the map.
 pub(super) fn parameters_words(summary: &regrind_cell::CompensationSummary) -> Vec<String> {
     let told = summary.parameters.iter().map(regrind_cell::ParameterTold::in_words);
     let left = summary.map_rms_mm.filter(|_| !summary.parameters.is_empty());

@@ -1,10 +1,10 @@
-//! XML, written element by element: whatever stands in a text, the document stays well formed.
+//! XML writer, element by element. Texts are escaped, so the document is always well formed.
 
 use std::fmt::Write;
 
 use regrind_formats::escaped;
 
-/// A document as it grows.
+/// Document that is being written.
 pub(super) struct Xml {
     text: String,
     open: Vec<&'static str>,
@@ -15,7 +15,7 @@ impl Xml {
         Self { text: "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n".to_owned(), open: Vec::new() }
     }
 
-    /// An element with what stands in it.
+    /// Writes an element with child elements, which `inner` writes.
     pub(super) fn within(&mut self, name: &'static str, attributes: &[(&str, &str)], inner: impl FnOnce(&mut Self)) {
         self.begin(name, attributes);
         self.text.push_str(">\n");
@@ -26,18 +26,18 @@ impl Xml {
         let _ = writeln!(self.text, "</{name}>");
     }
 
-    /// An element that holds a text.
+    /// Writes an element that contains a text.
     pub(super) fn text(&mut self, name: &'static str, text: &str) {
         self.text_with(name, &[], text);
     }
 
-    /// The same with attributes.
+    /// Writes an element that contains a text, with attributes.
     pub(super) fn text_with(&mut self, name: &'static str, attributes: &[(&str, &str)], text: &str) {
         self.begin(name, attributes);
         let _ = writeln!(self.text, ">{}</{name}>", escaped(text));
     }
 
-    /// An element that holds nothing.
+    /// Writes an element without content.
     pub(super) fn empty(&mut self, name: &'static str, attributes: &[(&str, &str)]) {
         self.begin(name, attributes);
         self.text.push_str("/>\n");

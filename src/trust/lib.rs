@@ -1,6 +1,7 @@
-//! By what a cell and the servers of its plant prove themselves to each other.
+//! Credentials by which a cell and the servers of its plant authenticate each other.
 //!
-//! A server on another computer proves itself by certificates, whoever signs in to it by a password that nobody else may read.
+//! A server on another computer proves its identity with certificates. A client signs in to it with a password that no
+//! other user can read.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -15,10 +16,10 @@ use rustls::pki_types::pem::PemObject;
 use rustls::{ClientConfig, RootCertStore};
 use thiserror::Error;
 
-/// The longest file of a password.
+/// Maximum length of a password file, in bytes.
 const MOST_BYTES: u64 = 4096;
 
-/// What is wrong with what one proves oneself by.
+/// Error of a password or of certificates.
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the messages tell them")]
 pub enum TrustError {
@@ -36,12 +37,14 @@ pub enum TrustError {
     Unproven { host: String, table: &'static str },
 }
 
-/// Says how a server proves itself: by those who sign its certificate; one on this computer need not.
+/// Returns the TLS configuration that verifies a server with the given certificates. Returns `None` for a server on
+/// this computer without certificates, which needs no proof.
 ///
-/// `host` is a name, an address or the folder of a socket, `table` the one of the file that names it, for messages.
+/// `host` is a name, an address or the folder of a socket. `table` is the table of the file that names the host, for
+/// messages.
 ///
 /// # Errors
-/// Certificates that cannot be read, and a server on another computer without any.
+/// The certificates cannot be read, or a server on another computer has none.
 pub fn proof(host: &str, certificates: Option<&Path>, table: &'static str) -> Result<Option<ClientConfig>, TrustError> {
     let is_here = host.starts_with('/') || host == "localhost" || host.parse().is_ok_and(|ip: IpAddr| ip.is_loopback());
     match certificates {
@@ -53,10 +56,10 @@ pub fn proof(host: &str, certificates: Option<&Path>, table: &'static str) -> Re
     }
 }
 
-/// Reads a password that nobody else may read; the end of its line is none of it.
+/// Reads a password from a file that no other user can read. The line ending is not a part of the password.
 ///
 /// # Errors
-/// A file that cannot be read, is longer than a password, or that others may read.
+/// The file cannot be read, is longer than the maximum, or other users can read it.
 pub fn password(path: &Path) -> Result<String, TrustError> {
     let unread = |source| TrustError::Password { path: path.to_owned(), source };
     if let Some(open) = readable_by_others(path).map_err(unread)? {
@@ -110,7 +113,7 @@ mod tests {
         assert!(missing.starts_with(&path.display().to_string()), "{missing}");
         for text in ["", "no PEM", "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"] {
             fs::write(&path, text).unwrap();
-            // One that is named is read, even where none were needed.
+            // Named certificates are read even if the host needs none.
             for host in ["plant", "localhost"] {
                 let refused = proof(host, Some(&path), "[database]").unwrap_err().to_string();
                 assert!(refused.contains("ca.pem: no certificates in PEM"), "{text:?}: {refused}");

@@ -1,9 +1,10 @@
-//! The way into the process of a running cell, for other programs of this computer: a module for each system, with the same functions.
+//! Entrance to the process of a running cell for other programs on this computer: one module for each operating system,
+//! with the same functions.
 //!
 //! ```text
-//!  Door      opened by the cell in its run folder; lets one client in after another
-//!  Caller    a client that was let in: who it is by the word of the operating system, and its two directions
-//!  Knocked   the client's side: what it reads from, and what it writes to
+//!  Door      the cell opens it in its run folder; it accepts one client after another
+//!  Caller    an accepted client: its user, as identified by the operating system, and its two directions
+//!  Knocked   the side of the client: the half that it reads from, and the half that it writes to
 //! ```
 
 #[cfg(unix)]
@@ -24,14 +25,14 @@ mod tests {
 
     use super::*;
 
-    /// Answers each of so many clients with its own words.
+    /// Echoes one line to each of `clients` clients.
     async fn echo(mut door: Door, clients: usize) {
         for _ in 0..clients {
             let caller = door.let_in().await.unwrap();
             assert!(caller.actor().unwrap().station.ends_with(&format!("process {}", std::process::id())));
             let (says, mut tell) = caller.into_halves();
             let mut line = String::new();
-            // Who only looks whether somebody is there says nothing.
+            // A client that only checks for a listener sends nothing.
             if BufReader::new(says).read_line(&mut line).await.is_ok_and(|read| read > 0) {
                 tell.write_all(line.as_bytes()).await.unwrap();
             }

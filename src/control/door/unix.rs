@@ -1,4 +1,4 @@
-//! A socket in the run folder; who may write to it may come in.
+//! Unix socket in the run folder. A user who can write to it can connect.
 
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
@@ -9,28 +9,28 @@ use regrind_cell::Actor;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::net::{UnixListener, UnixStream};
 
-/// The socket in a run folder.
+/// File name of the socket in a run folder.
 const SOCKET: &str = "control.sock";
 
-/// What a client that was let in says.
+/// Data from an accepted client.
 pub(crate) type CallerSays = OwnedReadHalf;
-/// What is said to a client that was let in.
+/// Data to an accepted client.
 pub(crate) type TellCaller = OwnedWriteHalf;
-/// What a cell says to its client.
+/// Data from the cell, at the client.
 pub(crate) type CellSays = OwnedReadHalf;
-/// What a client says to its cell.
+/// Data to the cell, at the client.
 pub(crate) type TellCell = OwnedWriteHalf;
 
-/// Where clients are let in.
+/// Listening socket that accepts clients.
 pub(crate) struct Door {
     listener: UnixListener,
-    /// None for one that is not watched.
+    /// Identity of the socket; `None` if it is not watched.
     mark: Option<Mark>,
-    /// Whether it is for the user of this program and root alone, whatever the modes of the place say.
+    /// True if only the user of this program and root may connect, whatever the file modes are.
     is_for_user: bool,
 }
 
-/// The socket of a door, by which it is known again.
+/// Path and identity of the socket of a door, to detect that it was removed or replaced.
 #[derive(Clone)]
 pub(crate) struct Mark {
     path: PathBuf,
@@ -39,13 +39,13 @@ pub(crate) struct Mark {
 }
 
 impl Door {
-    /// Opens it in a run folder.
+    /// Opens the socket in a run folder.
     pub(crate) fn open(folder: &Path) -> io::Result<Self> {
         Self::open_at(path_in(folder))
     }
 
     fn open_at(path: PathBuf) -> io::Result<Self> {
-        // One that a killed process left behind; the lock of the journal says that nobody lives there.
+        // Remove a socket that a killed process left. The lock of the journal proves that no process listens on it.
         if path.exists() {
             regrind_formats::remove_socket(&path)?;
         }
@@ -54,17 +54,17 @@ impl Door {
         Ok(Self { listener, mark, is_for_user: false })
     }
 
-    /// Opens one that lies in no run folder, for the user of this program and root alone; none where this system has none.
+    /// Opens a socket outside a run folder, for the user of this program and root only. Always returns `Some` on Unix.
     pub(crate) fn open_for_user(place: &Path) -> io::Result<Option<Self>> {
         Self::open_at(place.to_owned()).map(|door| Some(Self { is_for_user: true, ..door }))
     }
 
-    /// Returns by which it is known again.
+    /// Returns the identity of the socket.
     pub(crate) fn mark(&self) -> Option<Mark> {
         self.mark.clone()
     }
 
-    /// Waits for the next client.
+    /// Waits for the next client and returns it.
     pub(crate) async fn let_in(&mut self) -> io::Result<Caller> {
         loop {
             let (stream, _) = self.listener.accept().await?;
@@ -76,16 +76,16 @@ impl Door {
 }
 
 impl Mark {
-    /// Whether the socket still lies where it was made.
+    /// Returns true if the socket is still at the path where it was made.
     pub(crate) fn is_in_place(&self) -> bool {
         match identity(&self.path) {
             Ok(identity) => identity == self.identity,
-            // A folder that cannot be looked into just now is no folder that is gone.
+            // A folder that cannot be read at the moment is not a missing folder.
             Err(error) => error.kind() != io::ErrorKind::NotFound,
         }
     }
 
-    /// Makes the socket again, and the folder around it.
+    /// Creates the socket again, with its folder.
     pub(crate) fn open_again(&self) -> io::Result<Door> {
         if let Some(folder) = self.path.parent() {
             std::fs::DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
@@ -98,31 +98,32 @@ fn identity(path: &Path) -> io::Result<[u64; 2]> {
     std::fs::symlink_metadata(path).map(|found| [found.dev(), found.ino()])
 }
 
-/// Whether what belongs to a user may be believed: the user of this program, or root.
+/// Returns true if the files of a user can be trusted: the user of this program, or root.
 fn is_trusted(uid: u32) -> bool {
     uid == 0 || Some(uid) == own_uid()
 }
 
-/// Takes the door out of a run folder.
+/// Removes the socket from a run folder.
 pub(crate) fn take_away(folder: &Path) {
     take_away_at(&path_in(folder));
 }
 
-/// Takes a door away from where it lies.
+/// Removes the socket at a path.
 pub(crate) fn take_away_at(path: &Path) {
-    // Nobody listens any more; a socket left behind is replaced by the next run.
+    // No process listens any more. The next run replaces a socket that could not be removed.
     let _ = regrind_formats::remove_socket(path);
 }
 
-/// A client that was let in.
+/// Accepted client.
 pub(crate) struct Caller(UnixStream);
 
 impl Caller {
-    /// Names the person by what the operating system vouches for.
+    /// Returns the person at the other end, as identified by the operating system.
     pub(crate) fn actor(&self) -> io::Result<Actor> {
         let peer = self.0.peer_cred()?;
         let uid = peer.uid();
-        // A user of a directory service stands in no list of this computer; the same one as this process is known by its own name.
+        // A user of a directory service can be missing in the local user list. The user of this process is then named
+        // by `USER`.
         let own = || std::env::var("USER").ok().filter(|_| Some(uid) == own_uid());
         let name = regrind_formats::user_name(uid).or_else(own);
         let name = name.map_or_else(|| format!("uid {uid}"), |name| format!("{name} (uid {uid})"));
@@ -135,7 +136,7 @@ impl Caller {
     }
 }
 
-/// Whether a client has closed its end by now.
+/// Returns true if a client has already closed its end.
 pub(crate) fn has_gone(says: &CallerSays) -> bool {
     use rustix::event::{PollFd, PollFlags, Timespec, poll};
     let closed = PollFlags::RDHUP | PollFlags::HUP | PollFlags::ERR;
@@ -152,28 +153,29 @@ fn path_in(folder: &Path) -> PathBuf {
     folder.join(SOCKET)
 }
 
-/// Whether somebody listens behind the door of a run folder.
+/// Returns true if a process listens on the socket of a run folder.
 pub(crate) fn is_open(folder: &Path) -> bool {
-    // One that has no room for another caller is there all the same.
+    // A listener whose queue is full exists all the same.
     connected(&path_in(folder)).map_or_else(|error| error.kind() == io::ErrorKind::TimedOut, |_| true)
 }
 
-/// Whether somebody whom one may believe listens behind a door that lies in no run folder.
+/// Returns true if a trusted user's process listens on a socket outside a run folder.
 pub(crate) fn is_open_at(place: &Path) -> bool {
     connected_at(place).map_or_else(|error| error.kind() == io::ErrorKind::TimedOut, |_| true)
 }
 
-/// Says a line to the cell of a run folder, and waits for the line that it answers.
+/// Sends a line to the cell of a run folder, and returns the line of its answer. `patience` is the timeout.
 pub(crate) fn ask(folder: &Path, line: &[u8], patience: Duration) -> io::Result<String> {
     exchanged(connected(&path_in(folder))?, line, patience)
 }
 
-/// Says a line to the cell behind a door that lies in no run folder, and waits for the line that it answers.
+/// Sends a line to the cell of a socket outside a run folder, and returns the line of its answer.
 pub(crate) fn ask_at(place: &Path, line: &[u8], patience: Duration) -> io::Result<String> {
     exchanged(connected_at(place)?, line, patience)
 }
 
-/// Others may write where it lies: only the socket of this user, or of root, is spoken to.
+/// Connects to a socket outside a run folder. Others can write to that place, so only a socket of this user or of root
+/// is used.
 fn connected_at(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     if !is_trusted(std::fs::symlink_metadata(place)?.uid()) {
         return Err(io::Error::new(io::ErrorKind::PermissionDenied, "the socket belongs to another user"));
@@ -181,7 +183,8 @@ fn connected_at(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     connected(place)
 }
 
-/// Connects without waiting: where as many wait at the door as may, whoever is behind it does not answer.
+/// Connects without waiting. Returns a timeout error if the queue of the listener is full, because its process does not
+/// answer.
 fn connected(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
@@ -201,14 +204,14 @@ fn exchanged(mut stream: std::os::unix::net::UnixStream, line: &[u8], patience: 
     stream.write_all(line)?;
     let mut text = String::new();
     match BufReader::new(stream).read_line(&mut text) {
-        // The system's word for a time that is over.
+        // The operating system reports a timeout as `WouldBlock`.
         Err(error) if error.kind() == io::ErrorKind::WouldBlock => Err(io::ErrorKind::TimedOut.into()),
         Err(error) => Err(error),
         Ok(_) => Ok(text),
     }
 }
 
-/// Comes to the cell of a run folder, to stay.
+/// Opens a lasting connection to the cell of a run folder.
 pub(crate) async fn knock(folder: &Path) -> io::Result<(CellSays, TellCell)> {
     UnixStream::connect(path_in(folder)).await.map(UnixStream::into_split)
 }

@@ -1,4 +1,5 @@
-//! A named pipe, called after the run folder; only the user whose cell it is may open it, and only from this computer.
+//! Named pipe with a name derived from the run folder. Only the user of the cell can open it, and only from this
+//! computer.
 
 use std::io;
 use std::path::Path;
@@ -9,34 +10,34 @@ use sha2::{Digest, Sha256};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, ReadHalf, WriteHalf};
 use tokio::net::windows::named_pipe::{ClientOptions, NamedPipeClient, NamedPipeServer};
 
-/// Windows says so where every end of a pipe has its client, and the next end is being made (ERROR_PIPE_BUSY).
+/// Windows error code ERROR_PIPE_BUSY: every instance of the pipe has a client, and the next instance is not ready yet.
 const ALL_TAKEN: i32 = 231;
-/// How long a client waits for an end of its own, and between two tries.
+/// Timeout of a client that waits for a free instance, and the pause between two attempts.
 const FOR_AN_END: Duration = Duration::from_secs(2);
 const BETWEEN_TRIES: Duration = Duration::from_millis(20);
 
-/// What a client that was let in says.
+/// Data from an accepted client.
 pub(crate) type CallerSays = ReadHalf<NamedPipeServer>;
-/// What is said to a client that was let in.
+/// Data to an accepted client.
 pub(crate) type TellCaller = WriteHalf<NamedPipeServer>;
-/// What a cell says to its client.
+/// Data from the cell, at the client.
 pub(crate) type CellSays = ReadHalf<NamedPipeClient>;
-/// What a client says to its cell.
+/// Data to the cell, at the client.
 pub(crate) type TellCell = WriteHalf<NamedPipeClient>;
 
-/// Where clients are let in.
+/// Named pipe that accepts clients.
 pub(crate) struct Door {
     name: String,
-    /// The end of the pipe for the next client.
+    /// Instance of the pipe for the next client.
     next: NamedPipeServer,
 }
 
 impl Door {
-    /// Opens it for a run folder.
+    /// Opens the pipe of a run folder.
     pub(crate) fn open(folder: &Path) -> io::Result<Self> {
         let name = name_of(folder)?;
         let next = regrind_windows::listen(&name, true).map_err(|error| match error.kind() {
-            // Windows says of a name that is taken that it is not allowed.
+            // Windows reports a name in use as access denied.
             io::ErrorKind::PermissionDenied => {
                 io::Error::new(io::ErrorKind::AddrInUse, "another program has the control pipe of this run")
             }
@@ -45,20 +46,20 @@ impl Door {
         Ok(Self { name, next })
     }
 
-    /// Opens one that lies in no run folder: a pipe lies in none, and cannot be taken away.
+    /// Returns `None`: a pipe is in no folder and cannot be removed, so no second one is needed.
     pub(crate) fn open_for_user(_: &Path) -> io::Result<Option<Self>> {
         Ok(None)
     }
 
-    /// Returns by which it is known again: a pipe is not watched, for nobody can take it away.
+    /// Returns `None`: a pipe is not watched, because nobody can remove it.
     pub(crate) fn mark(&self) -> Option<Mark> {
         None
     }
 
-    /// Waits for the next client.
+    /// Waits for the next client and returns it.
     pub(crate) async fn let_in(&mut self) -> io::Result<Caller> {
         if let Err(error) = self.next.connect().await {
-            // The client has gone before it was let in; the end is good for the next one.
+            // The client disconnected before it was accepted; the instance can serve the next one.
             let _ = self.next.disconnect();
             return Err(error);
         }
@@ -67,7 +68,7 @@ impl Door {
     }
 }
 
-/// No door of this system has one.
+/// Identity of a door. It has no value on Windows, where no door is watched.
 #[derive(Clone)]
 pub(crate) enum Mark {}
 
@@ -81,27 +82,27 @@ impl Mark {
     }
 }
 
-/// No door lies anywhere else.
+/// Does nothing: on Windows there is no door outside a run folder.
 pub(crate) fn take_away_at(_: &Path) {}
 
-/// No door lies anywhere else.
+/// Returns false: on Windows there is no door outside a run folder.
 pub(crate) fn is_open_at(_: &Path) -> bool {
     false
 }
 
-/// No door lies anywhere else.
+/// Returns an error: on Windows there is no door outside a run folder.
 pub(crate) fn ask_at(_: &Path, _: &[u8], _: Duration) -> io::Result<String> {
     Err(io::ErrorKind::NotFound.into())
 }
 
-/// Takes the door away: a pipe goes with its last end, and lies in no folder.
+/// Does nothing: a pipe ends with its last instance, and is in no folder.
 pub(crate) fn take_away(_: &Path) {}
 
-/// A client that was let in.
+/// Accepted client.
 pub(crate) struct Caller(NamedPipeServer);
 
 impl Caller {
-    /// Names the person by what the operating system vouches for: it lets nobody but this user in.
+    /// Returns the person at the other end, as identified by the operating system. It lets only this user connect.
     pub(crate) fn actor(&self) -> io::Result<Actor> {
         let process = regrind_windows::client_process(&self.0);
         let station = process.map_or("local console".to_owned(), |pid| format!("local console, process {pid}"));
@@ -113,12 +114,12 @@ impl Caller {
     }
 }
 
-/// Whether a client has closed its end: a process that is held up here is in a debugger, whose user knows of it.
+/// Returns false without a check: a process can be suspended here only by a debugger, whose user knows about it.
 pub(crate) fn has_gone(_: &CallerSays) -> bool {
     false
 }
 
-/// The name of the pipe of a run folder, however the folder is called by who asks.
+/// Returns the name of the pipe of a run folder. Different paths to the same folder give the same name.
 fn name_of(folder: &Path) -> io::Result<String> {
     let whole = std::fs::canonicalize(folder)?;
     let digest = Sha256::digest(whole.as_os_str().as_encoded_bytes());
@@ -126,13 +127,13 @@ fn name_of(folder: &Path) -> io::Result<String> {
     Ok(format!(r"\\.\pipe\regrind-{digits}"))
 }
 
-/// Whether somebody listens behind the door of a run folder.
+/// Returns true if a process listens on the pipe of a run folder.
 pub(crate) fn is_open(folder: &Path) -> bool {
     let Ok(name) = name_of(folder) else { return false };
     on_a_thread_of_its_own(async move { connected(&name).await.map(drop) }).is_ok()
 }
 
-/// Says a line to the cell of a run folder, and waits for the line that it answers.
+/// Sends a line to the cell of a run folder, and returns the line of its answer. `patience` is the timeout.
 pub(crate) fn ask(folder: &Path, line: &[u8], patience: Duration) -> io::Result<String> {
     let (name, line) = (name_of(folder)?, line.to_owned());
     on_a_thread_of_its_own(async move {
@@ -144,7 +145,7 @@ pub(crate) fn ask(folder: &Path, line: &[u8], patience: Duration) -> io::Result<
     })
 }
 
-/// Comes to the cell of a run folder, to stay.
+/// Opens a lasting connection to the cell of a run folder.
 pub(crate) async fn knock(folder: &Path) -> io::Result<(CellSays, TellCell)> {
     connected(&name_of(folder)?).await.map(tokio::io::split)
 }
@@ -162,8 +163,8 @@ async fn connected(name: &str) -> io::Result<NamedPipeClient> {
     }
 }
 
-/// Waits for something that may take a while, for who cannot wait himself. Only what waits can end before a pipe answers, and whoever
-/// asks may be a part of something that waits already: so a thread, and a runtime, of its own.
+/// Runs a future to its end from synchronous code. Only asynchronous code can stop waiting before a pipe answers, and
+/// the caller can itself be part of a runtime. The future therefore gets a thread and a runtime of its own.
 fn on_a_thread_of_its_own<T: Send + 'static>(
     what: impl Future<Output = io::Result<T>> + Send + 'static,
 ) -> io::Result<T> {

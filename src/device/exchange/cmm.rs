@@ -1,8 +1,8 @@
-//! The folders of a measuring machine: the plan out, the measurement in.
+//! Folders of a measuring machine: the plan goes out, the measurement comes in.
 //!
-//! `plan.csv` holds a row a target, `index,x,y,z,nx,ny,nz,what`; `plan.json` says the rest, and what is expected back. A result belongs to
-//! a hand-over if its name fits the pattern, or if it says part and cycle or the plan's identity itself; one that says otherwise is
-//! left alone, whatever its name.
+//! `plan.csv` has one row per target, `index,x,y,z,nx,ny,nz,what`. `plan.json` gives the remaining data and the
+//! expected result. A result belongs to a hand-over if its name matches the pattern, or if it states part and cycle or
+//! the identity of the plan itself. A file that states something else is ignored, whatever its name.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -23,43 +23,44 @@ use regrind_formats::FormatError;
 use regrind_formats::references::{References, parse_references, read_references};
 use regrind_formats::result::{Content, Coordinates, ResultFile, parse_result, read_bytes, read_statements};
 
-/// How a measuring machine exchanges files.
+/// Settings of the file exchange with a measuring machine.
 #[derive(Clone, Debug)]
 pub struct CmmExchange {
-    /// The part, as it stands in names of files and in headers.
+    /// Name of the part in file names and headers.
     pub part: String,
-    /// Where plans are put.
+    /// Folder for the plans.
     pub outbox: PathBuf,
-    /// Where results appear.
+    /// Folder in which results appear.
     pub inbox: PathBuf,
-    /// A file that has not changed for so long is complete.
+    /// Time without a change after which a file is complete.
     pub stable_for: Duration,
-    /// How long a look waits for what it finds to be read. What takes longer is told by a later look; meanwhile the job can be held.
+    /// Time for which a look waits until the found files are read. A longer read is reported by a later look; meanwhile
+    /// the job can be held.
     pub read_within: Duration,
-    /// What is known of the result files.
+    /// Known properties of the result files.
     pub content: Content,
-    /// The names of result files; `{part}`, `{job}`, `{cycle}` and `*`.
+    /// Pattern for the names of result files, with `{part}`, `{job}`, `{cycle}` and `*`.
     pub result: Pattern,
-    /// Where a measurement is made from several stations.
+    /// Stations, if a measurement is made from several stations.
     pub stations: Option<Stations>,
-    /// Whether a result may have any number of points, which then stand for themselves; else a point for every target.
+    /// True if a result may have any number of points without targets; false if it needs a point for every target.
     pub free_count: bool,
-    /// Whether files may be taken that lay in the inbox before the plan was handed over.
+    /// True if files are accepted that were in the inbox before the plan was handed over.
     pub take_earlier: bool,
-    /// With a free count: fewer points than this are waited on.
+    /// Minimum number of points with a free count; with fewer points the driver waits for further stations.
     pub least_points: usize,
-    /// The share of the targets of which a result must have a point.
+    /// Minimum fraction of the targets that need a point in a result.
     pub least_found: f64,
-    /// Whether the plan itself may be given back as what was measured.
+    /// True if the plan itself may be returned as the measurement.
     pub rehearsal: bool,
-    /// By how much the probe radius in a file may differ from the plan's.
+    /// Maximum difference in mm between the probe radius in a file and that of the plan.
     pub probe_tolerance_mm: f64,
-    /// The sensor of a DMIS program, where the plan is written as one too.
+    /// Sensor of the DMIS program, if the plan is also written as one.
     pub dmis_sensor: Option<String>,
 }
 
 impl CmmExchange {
-    /// Returns the usual settings for a part and two folders.
+    /// Returns the default settings for a part and two folders.
     pub fn new(part: impl Into<String>, outbox: impl Into<PathBuf>, inbox: impl Into<PathBuf>) -> Self {
         Self {
             part: part.into(),
@@ -81,53 +82,54 @@ impl CmmExchange {
     }
 }
 
-/// A measurement from several stations, each with its own frame.
+/// Settings of a measurement from several stations, each with its own frame.
 #[derive(Clone, Debug)]
 pub struct Stations {
-    /// For each station the names of its points and of its reference points. With one `*` in both names they stand for as many
-    /// stations as there are pairs of files in which the star is the same; such a measurement is complete when nothing in the inbox
-    /// changes any more and there are `least_points`.
+    /// File names of the points and of the reference points of each station. If both names have one `*`, they represent
+    /// as many stations as there are pairs of files with the same star. This measurement is complete when its files no
+    /// longer change and have at least `least_points` points.
     pub files: Vec<StationFiles>,
-    /// The file of the reference points in the CMM's frame.
+    /// File of the reference points in the frame of the CMM.
     pub nominal: PathBuf,
-    /// The group of points in the YAML files, where these hold several.
+    /// Group of points in the YAML files, if they hold several groups.
     pub group: Option<String>,
-    /// By how much a reference point may be off after the fit.
+    /// Maximum residual of a reference point after the fit, in mm.
     pub limit_mm: f64,
 }
 
-/// The files of one station.
+/// File names of one station.
 #[derive(Clone, Debug)]
 pub struct StationFiles {
-    /// The points: one file of the inbox.
+    /// Points: one file of the inbox.
     pub points: Pattern,
-    /// The reference points as this station sees them: one file of the inbox.
+    /// Reference points as this station sees them: one file of the inbox.
     pub references: Pattern,
 }
 
-/// The folders of a measuring machine.
+/// Folders of a measuring machine.
 #[derive(Debug)]
 pub struct CmmFolders {
     judge: Arc<Judge>,
     watch: Watch,
-    /// A judgement that is not over yet.
+    /// Judgement that still runs.
     judging: Option<Judging>,
-    /// The plan that this program handed over last.
+    /// Plan that this program handed over last.
     published: Option<(Job, Arc<Plan>)>,
-    /// What is waited for, once it was handed over or found again.
+    /// Expected result, once the plan was handed over or found again.
     expected: Option<Expected>,
-    /// What the folder looked like when it was judged last, and how.
+    /// Content of the folder at the last judgement, and the result of that judgement.
     judged: Option<(Vec<WatchedFile>, Look<Measurement>)>,
 }
 
-/// Reads the files of the inbox and holds them against what is waited for.
+/// Judge that reads the files of the inbox and compares them with the expected result.
 #[derive(Debug)]
 struct Judge {
     settings: CmmExchange,
     outbox: Outbox,
 }
 
-/// What a thread of its own finds in the inbox: a file that takes long to read keeps nobody from holding or aborting the job.
+/// Judgement of the inbox on a thread of its own, so that a file that takes long to read does not prevent a hold or an
+/// abort.
 #[derive(Debug)]
 struct Judging {
     job: Job,
@@ -135,23 +137,23 @@ struct Judging {
     judged: mpsc::Receiver<(Judgement, Vec<String>)>,
 }
 
-/// How long a look waits for what it finds to be read, as a rule.
+/// Default time for which a look waits until the found files are read.
 const READ_WITHIN: Duration = Duration::from_millis(40);
-/// A file whose name says nothing is not looked into to see whether it belongs here, if it is larger.
+/// Maximum size in bytes of a file that is read although its name does not match the pattern.
 const MOST_TO_LOOK_INTO: u64 = 16 << 20;
 
-/// What is waited for.
+/// Expected result.
 #[derive(Clone, Debug)]
 struct Expected {
     stored: StoredHandover,
-    /// The plan that was handed over; none where any number of points will do.
+    /// Plan that was handed over; `None` if any number of points is allowed, or if the stored plan cannot be read.
     plan: Option<Arc<Plan>>,
-    /// The numbers of its targets, in its order.
+    /// Numbers of its targets, in the order of the plan.
     targets: Arc<[u32]>,
     since: Option<Duration>,
 }
 
-/// An answer that was made of some files.
+/// Measurement that was accepted from files.
 #[derive(Debug)]
 struct Accepted {
     measurement: Measurement,
@@ -159,21 +161,21 @@ struct Accepted {
     notes: Vec<String>,
 }
 
-/// What a judgement of the folder comes to: an answer, or only words.
+/// Result of a judgement of the folder: an accepted measurement, or none.
 type Judgement = Result<Option<Accepted>, ExchangeError>;
 
-/// A judgement, with words and the files as they were.
+/// Judgement, with its notes and the files as they were.
 struct Judged {
     judgement: Judgement,
     notes: Vec<String>,
     of: Vec<WatchedFile>,
 }
 
-/// The files of a station: its points, and the reference points as it sees them.
+/// Files of a station: its points, and the reference points as it sees them.
 type Pair<'f> = (&'f WatchedFile, &'f WatchedFile);
 
 impl CmmFolders {
-    /// Takes the settings; nothing is looked at before the driver opens the folders.
+    /// Creates the folders from their settings. Reads nothing before the driver opens them.
     pub fn new(settings: CmmExchange) -> Self {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
@@ -181,18 +183,18 @@ impl CmmFolders {
         Self { judge, watch, judging: None, published: None, expected: None, judged: None }
     }
 
-    /// Finds a hand-over again that was made before a restart.
+    /// Returns the expected result of a job. Finds the hand-over again if it was made before a restart.
     fn expect(&mut self, job: Job) -> Result<Expected, ExchangeError> {
         if let Some(expected) = self.expected.as_ref().filter(|e| e.stored.ticket.job() == job) {
             return Ok(expected.clone());
         }
         let stored = self.judge.outbox.handed_over(job)?;
         let (mut plan, mut targets) = (None, Arc::default());
-        // Where any number of points will do the plan may name none.
+        // If any number of points is allowed, the plan may have no targets.
         if !self.judge.settings.free_count {
             match self.published.as_ref().filter(|(of, _)| *of == job) {
                 Some((_, published)) => plan = Some(Arc::clone(published)),
-                // One that somebody saved anew in between names its targets still.
+                // A plan that somebody saved again in another layout still gives the numbers of its targets.
                 None => plan = stored_plan(&stored.path).ok().map(Arc::new),
             }
             targets = match &plan {
@@ -208,7 +210,8 @@ impl CmmFolders {
         Ok(expected)
     }
 
-    /// Returns what some files come to, and as they were then, where that is known by now; begins to read them, unless others are still being read.
+    /// Returns the judgement of some files, with the files as they were, if it is complete. Starts a judgement, unless
+    /// one still runs.
     fn judged_by_now(&mut self, expected: &Expected, found: &[WatchedFile]) -> Option<Judged> {
         let job = expected.stored.ticket.job();
         if self.judging.is_none() {
@@ -217,7 +220,7 @@ impl CmmFolders {
             std::thread::spawn(move || {
                 let mut notes = Vec::new();
                 let judgement = judge.judge(&expected, &files, &mut notes);
-                // Nobody may want to know any more.
+                // The receiver may be gone.
                 let _ = tell.send((judgement, notes));
             });
             self.judging = Some(Judging { job, found: found.to_owned(), judged });
@@ -229,7 +232,8 @@ impl CmmFolders {
         let Judging { job: asked, found: of, .. } = self.judging.take()?;
         let broken = || (Err(ExchangeError::NotRead { folder: self.judge.settings.inbox.clone() }), Vec::new());
         let (judgement, notes) = judged.unwrap_or_else(|_| broken());
-        // Other files may have come or changed meanwhile, as a log does again and again; those of an answer have not.
+        // Other files may have arrived or changed meanwhile, as a log does repeatedly. The files of an answer must not
+        // have changed.
         let stands = |name: &str| of.iter().find(|file| file.name == name).is_some_and(|file| found.contains(file));
         let holds = match &judgement {
             Ok(Some(accepted)) => accepted.files.iter().all(|(name, _)| stands(name)),
@@ -253,7 +257,7 @@ impl Judge {
         Ok(accepted)
     }
 
-    /// Returns whether a file may be looked at, and says why not.
+    /// Returns true if a file may be read; otherwise adds the reason to the notes.
     fn is_new(&self, expected: &Expected, file: &WatchedFile, notes: &mut Vec<String>) -> bool {
         let earlier = !self.settings.take_earlier && expected.stored.ticket.is_earlier(&file.name, &file.look);
         if earlier {
@@ -262,7 +266,7 @@ impl Judge {
         !earlier
     }
 
-    // ---- one file -------------------------------------------------------------------------------------------------------------
+    // ---- one file --------------------------------------------------------------------------------------------------
 
     fn judge_single(&self, expected: &Expected, found: &[WatchedFile], notes: &mut Vec<String>) -> Judgement {
         let ticket = &expected.stored.ticket;
@@ -274,7 +278,7 @@ impl Judge {
             }
             if !file.settled {
                 notes.push(format!("{} is still changing, or has only just stopped; waiting", file.name));
-                // A file that will be ours must not be overtaken by another one.
+                // Another file must not be accepted before a file that matches the pattern has settled.
                 if pattern.fits(&file.name) {
                     return Ok(None);
                 }
@@ -304,7 +308,7 @@ impl Judge {
         }
     }
 
-    /// Returns why a file does not belong to a hand-over, or nothing if it does.
+    /// Returns the reason why a file does not belong to a hand-over, or `None` if it does.
     fn belongs(&self, ticket: &Ticket, pattern: &Pattern, file: &WatchedFile) -> Result<Option<String>, ExchangeError> {
         if file.look.bytes > MOST_TO_LOOK_INTO && !pattern.fits(&file.name) {
             let most = MOST_TO_LOOK_INTO >> 20;
@@ -334,7 +338,7 @@ impl Judge {
         Ok(Accepted { measurement, files: vec![(file.name.clone(), sha)], notes })
     }
 
-    /// Reads a file of points and holds it against plan and cell.
+    /// Reads a file of points and checks it against plan and cell. Returns it with the SHA-256 of its bytes.
     fn read(&self, expected: &Expected, path: &Path) -> Result<(ResultFile, String), ExchangeError> {
         let bytes = read_bytes(path)?;
         let sha = hex(&Sha256::digest(&bytes));
@@ -342,7 +346,7 @@ impl Judge {
         Ok((self.wanted(expected).read(path, &bytes)?, sha))
     }
 
-    /// What a result of a hand-over must fit.
+    /// Returns the requirements for a result of a hand-over.
     fn wanted<'a>(&'a self, expected: &'a Expected) -> Wanted<'a> {
         Wanted {
             targets: (!self.settings.free_count).then_some(&*expected.targets),
@@ -352,13 +356,14 @@ impl Judge {
         }
     }
 
-    /// Refuses bytes that were the answer to another hand-over.
+    /// Rejects bytes that were the answer to another hand-over.
     fn check_not_taken(&self, expected: &Expected, path: &Path, sha: &str) -> Result<(), ExchangeError> {
         let own = (expected.stored.ticket.job, expected.stored.ticket.cycle);
         let taken = self.outbox.list()?.into_iter().filter_map(|stored| stored.taken);
         let before = taken.filter(|t| (t.job, t.cycle) != own).find(|t| t.files.iter().any(|(_, s)| s == sha));
         match before {
-            // Another run may be fed with the same measurement where the cell says so; another cycle never.
+            // Another run may use the same measurement if the cell file allows it; another cycle of the same run never
+            // may.
             Some(Taken { job, cycle, .. }) if job == own.0 || !self.settings.take_earlier => {
                 Err(ExchangeError::TakenBefore { path: path.to_owned(), job, cycle })
             }
@@ -371,7 +376,7 @@ impl Judge {
         measurement(points, results, ticket.job(), unhex(&ticket.identity), ticket.start_number)
     }
 
-    // ---- several stations -----------------------------------------------------------------------------------------------------
+    // ---- several stations ------------------------------------------------------------------------------------------
 
     fn judge_stations(
         &self,
@@ -405,7 +410,7 @@ impl Judge {
         Ok(Some(accepted))
     }
 
-    /// Returns the files of the stations that are there, points and references, and what is waited for.
+    /// Returns the files of the stations that are there, points and references, and the names of the missing ones.
     fn paired<'f>(
         &self,
         ticket: &Ticket,
@@ -425,7 +430,7 @@ impl Judge {
         Ok((pairs, waiting))
     }
 
-    /// Returns the one file whose name fits once it has settled, or what is waited for.
+    /// Returns the one file whose name matches once it has settled, or a description of what is missing.
     fn settled<'f>(
         &self,
         pattern: &Pattern,
@@ -440,7 +445,7 @@ impl Judge {
         }
     }
 
-    /// Returns the stations with their stars replaced by what they stand for, in the order of their names.
+    /// Returns the stations with each star replaced by the characters that it matches, in the order of their names.
     fn named_stations(&self, ticket: &Ticket, stations: &Stations, files: &[&WatchedFile]) -> Vec<StationFiles> {
         let mut named = Vec::new();
         for station in &stations.files {
@@ -504,7 +509,7 @@ impl Judge {
         place_station(&format!("{} ({name})", index + 1), seen, nominal, stations.limit_mm)
     }
 
-    /// Refuses a station's file that says it is of another part, cycle or plan.
+    /// Returns an error for the file of a station that states another part, cycle or plan.
     fn says_otherwise(&self, expected: &Expected, file: &WatchedFile) -> Result<Option<ExchangeError>, ExchangeError> {
         let ticket = &expected.stored.ticket;
         let why = self.belongs(ticket, &Pattern::new("*"), file)?;
@@ -593,7 +598,7 @@ fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
     (off > 0).then(|| format!("{name}: {off} rows are switched off and were left out"))
 }
 
-/// Reads the plan of a hand-over as it was written.
+/// Reads the plan of a hand-over from its files as they were written.
 fn stored_plan(folder: &Path) -> Result<Plan, ExchangeError> {
     #[derive(Deserialize)]
     struct Stored {
@@ -621,7 +626,7 @@ fn stored_plan(folder: &Path) -> Result<Plan, ExchangeError> {
     Ok(Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful: None })
 }
 
-/// A row of `plan.csv`; none where it is another row.
+/// Parses a row of `plan.csv`; returns `None` for any other row.
 fn stored_target(row: &str) -> Option<Target> {
     let cells: Vec<&str> = row.split(',').collect();
     let [index, x, y, z, nx, ny, nz, what] = cells[..] else { return None };
@@ -634,7 +639,7 @@ fn stored_target(row: &str) -> Option<Target> {
     Some(Target { index: index.parse().ok()?, what, point_mm: three([x, y, z])?, normal: three([nx, ny, nz])? })
 }
 
-/// The plan as a table, with what it is about above it.
+/// Returns the plan as a CSV table, with a header that identifies it.
 pub(crate) fn plan_csv(part: &str, job: Job, identity: &str, plan: &Plan) -> String {
     let mut text = format!(
         "# Regrind measuring plan\n# part: {}\n# job: {}\n# cycle: {}\n# plan: {}\n# units: mm\n# probe_radius_mm: {}\n\
@@ -673,7 +678,7 @@ fn plan_json(ticket: &Ticket, order: &MeasureOrder, settings: &CmmExchange, expe
         "units": "mm", "frame": "measuring machine", "targets": plan.targets.len(), "probe_radius_mm": plan.probe_radius_mm,
         "approach_mm": plan.approach_mm, "search_mm": plan.search_mm, "speed_mm_s": plan.speed_mm_s,
         "safe_height_mm": plan.safe_height_mm, "expected_back": expects,
-        // After a measurement that could not be used: the part may lie elsewhere than it should.
+        // After an unusable measurement the part may not lie where it should.
         "careful_targets": plan.careful.map_or(0, |careful| careful.targets),
         "careful_speed_mm_s": plan.careful.map(|careful| careful.speed_mm_s),
     }))

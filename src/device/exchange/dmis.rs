@@ -1,32 +1,33 @@
-//! The measuring plan as a DMIS program (ISO 22093).
+//! Measuring plan as a DMIS program (ISO 22093).
 //!
-//! A sensor that the machine has qualified is recalled by its name; the program defines none. `PRCOMP` says whether the machine takes the radius of
-//! the probe off. What the program is about (part, cycle, identity of the plan) is written into its output by `TEXT/OUTFIL`, which comes back with
-//! the points: that is how a result is known for that of its plan. Between two points the probe travels over the highest target.
+//! The program recalls a sensor by its name, which the machine has qualified; it defines none. `PRCOMP` says if the
+//! machine subtracts the probe radius. `TEXT/OUTFIL` writes part, cycle and identity of the plan into the output, which
+//! returns with the points. This identifies the plan of a result. Between two points the probe travels above the
+//! highest target.
 
 use std::fmt::Write as _;
 
 use crate::payload::Plan;
 use regrind_formats::result::Coordinates;
 
-/// What a program is about.
+/// Data that identify a program.
 pub(super) struct About<'a> {
     pub(super) part: &'a str,
     pub(super) cycle: u16,
-    /// The identity of the plan.
+    /// Identity of the plan.
     pub(super) identity: &'a str,
-    /// The name of the sensor, as the machine has it.
+    /// Name of the sensor at the machine.
     pub(super) sensor: &'a str,
     pub(super) coordinates: Coordinates,
 }
 
-/// Returns a text as it may stand between quotes: plain characters, and no quote.
+/// Returns a text if it may be written between quotes: at most 60 printable ASCII characters, without `'` and `$`.
 fn quotable(text: &str) -> Option<&str> {
     let is_plain = |c: char| matches!(c, ' '..='~') && c != '\'' && c != '$';
     (text.len() <= 60 && text.chars().all(is_plain)).then_some(text)
 }
 
-/// Writes the program of a plan.
+/// Returns the DMIS program of a plan.
 pub(super) fn program(plan: &Plan, about: &About<'_>) -> String {
     let (compensation, what) = match about.coordinates {
         Coordinates::Centres => ("OFF", "centres"),
@@ -102,14 +103,14 @@ mod tests {
             assert!(text.contains(statement), "{statement}\n---\n{text}");
         }
         assert!(text.ends_with("ENDMES\nOUTPUT/FA(P9)\nENDFIL\n") && text.lines().all(|line| line.len() <= 80));
-        // What the program has written into its output is what the reader knows it by.
+        // The reader identifies the output by the lines that the program has written into it.
         let said: String = text.split_inclusive('\n').filter(|line| line.starts_with(['T', '\''])).collect();
         let output = format!("UNITS/MM,ANGDEC\n{said}FA(P7)=FEAT/POINT,CART,1.5,-2.25,4.5,0.6,0,0.8\nENDFIL\n");
         let read = parse_result(std::path::Path::new("x.res"), output.as_bytes(), &Content::default()).unwrap();
         assert_eq!(read.statements.part.as_deref(), Some("SN-7"));
         assert_eq!((read.statements.cycle, read.statements.plan.as_deref()), (Some(2), Some(PLAN)));
         assert_eq!((read.coordinates, read.indices), (Some(Coordinates::Centres), Some(vec![7])));
-        // A name that would end its quotes stands nowhere.
+        // A name that would end its quotes is not written.
         let odd = program(&plan(), &About { part: "SN'7", ..about });
         assert!(!odd.contains("SN'7") && !odd.contains("'part:"));
     }

@@ -1,4 +1,4 @@
-//! What can be wrong with files that stand for a machine, said so that the person at the machine can mend it.
+//! Errors of the files that are exchanged with a machine, in words by which the person at the machine can correct them.
 
 use std::path::PathBuf;
 
@@ -8,88 +8,88 @@ use crate::hex;
 use regrind_core::geometry::RigidError;
 use regrind_formats::FormatError;
 
-/// Why a file that was exchanged with a machine is not taken. Lines count from 1.
+/// Reason why a file that was exchanged with a machine is not accepted. Lines count from 1.
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the message of each tells what its fields are")]
 #[non_exhaustive]
 pub enum ExchangeError {
-    /// The file itself is not good.
+    /// The file itself is not valid.
     #[error(transparent)]
     Format(#[from] FormatError),
-    /// Nothing tells centres from contact points.
+    /// Neither file nor cell states if the coordinates are probe centres or contact points.
     #[error(
         "{path}: neither the file nor the cell says whether the coordinates are probe centres or contact points, and a wrong guess is \
          off by the probe radius; put `# coordinates: centres` or `# coordinates: contacts` above the points, or `what = \"centres\"` \
          into the cell file"
     )]
     CoordinatesUnstated { path: PathBuf },
-    /// Another number of points than the plan has targets.
+    /// The number of points differs from the number of targets of the plan.
     #[error(
         "{path}: {found} points for a plan of {expected} targets; export the whole measurement, or give it a column `index` with the \
          numbers of the plan's targets"
     )]
     Count { path: PathBuf, found: usize, expected: usize },
-    /// Points of too few of the plan's targets.
+    /// Too few targets of the plan have a point.
     #[error(
         "{path}: points of {found} of {expected} targets, and {least} are needed; export the whole measurement, or touch what is missing first"
     )]
     Short { path: PathBuf, found: usize, expected: usize, least: usize },
-    /// The radius of the probe is not the plan's.
+    /// The radius of the probe differs from that of the plan.
     #[error(
         "{path}: measured with a probe radius of {found_mm} mm, the recipe says {expected_mm} mm; they may differ by {limit_mm} mm: \
          measure with the right probe or correct the recipe"
     )]
     ProbeRadius { path: PathBuf, found_mm: f64, expected_mm: f64, limit_mm: f64 },
-    /// A station that sees too few, or too many, reference points.
+    /// A station sees too few or too many reference points.
     #[error(
         "station {station} sees {seen} reference points without names, the nominal file has {nominal} ({names}); {why}: give one \
          for each, or give them the nominal names"
     )]
     ReferenceCount { station: String, seen: usize, nominal: usize, names: String, why: &'static str },
-    /// Names that are not nominal ones.
+    /// Too few reference points have a nominal name.
     #[error(
         "station {station}: fewer than 3 of its reference points bear a nominal name; missing are {missing}, not known are {extra}"
     )]
     ReferenceNames { station: String, missing: String, extra: String },
-    /// Reference points that fix no pose.
+    /// The reference points determine no pose.
     #[error("station {station}: {source}")]
     Fit { station: String, source: RigidError },
-    /// A reference point that is not where it belongs.
+    /// A reference point is too far from its nominal position.
     #[error("station {station}: reference point {point} is off by {off_mm:.3} mm, limit {limit_mm} mm; {diagnosis}")]
     ReferenceOff { station: String, point: String, off_mm: f64, limit_mm: f64, diagnosis: String },
-    /// Several files where there should be one.
+    /// Several files match where one is required.
     #[error("{folder}: {} files fit `{pattern}`: {}; leave only the right one there", names.len(), names.join(", "))]
     Several { folder: PathBuf, pattern: String, names: Vec<String> },
-    /// A file that was taken for another cycle already.
+    /// The file was already accepted for another cycle.
     #[error("{path}: the same bytes were the result of job {job} cycle {cycle}; export the new measurement")]
     TakenBefore { path: PathBuf, job: u32, cycle: u16 },
-    /// A confirmation for something else.
+    /// The confirmation is for another hand-over.
     #[error("{path}: confirms {found}, handed over was {expected}; {remedy}")]
     Confirmation { path: PathBuf, found: String, expected: String, remedy: &'static str },
-    /// The same job and cycle a second time.
+    /// The same job and cycle was handed over before.
     #[error("job {job} cycle {cycle} was handed over before, see {folder}; it is never handed over twice")]
     HandedOver { job: u32, cycle: u16, folder: PathBuf },
     /// Nobody waits for the hand-over any more; it was not made.
     #[error("job {job} cycle {cycle} was not handed over: it took too long, and nobody waited for it any more")]
     Withdrawn { job: u32, cycle: u16 },
-    /// A confirmation that names another map than was handed over.
+    /// The confirmation names another map than the one that was handed over.
     #[error("the confirmation names the map {}, handed over was {}", hex(&found[..8]), hex(&expected[..8]))]
     OtherMap { expected: [u8; 32], found: [u8; 32] },
-    /// No hand-over of a job is open.
+    /// No hand-over of the job is open.
     #[error("no hand-over of job {job} cycle {cycle} is open")]
     NotOpen { job: u32, cycle: u16 },
-    /// A hand-over that is not where it was put.
+    /// The hand-over is not where it was put.
     #[error("{folder}: the hand-over is not there; was it moved or deleted? put it back or stop the job")]
     Missing { folder: PathBuf },
-    /// What read the files has failed.
+    /// The thread that read the files has failed.
     #[error(
         "{folder}: a file there could not be read by a fault of this program; take away what does not belong there, and report it"
     )]
     NotRead { folder: PathBuf },
-    /// A file that says it is of something else.
+    /// The file belongs to something else, by its statements or its points.
     #[error("{path}: {why}; export the measurement that was asked for")]
     Foreign { path: PathBuf, why: String },
-    /// A file that was a measurement of this run already.
+    /// The file was already a measurement of this run.
     #[error("{path}: the same bytes were a measurement of this run before; export the new one")]
     Offered { path: PathBuf },
 }

@@ -1,8 +1,9 @@
-//! The folders of a grinder: map and pass out, a person's word for start and end in.
+//! Folders of a grinder: map and pass go out, operator confirmations for start and end come in.
 //!
-//! `correction.csv` holds a row a node, `x_mm,y_mm,correction_mm`, row by row, x fastest; `correction.json` says grid, sign, frame, units,
-//! the pass, and the hash that a confirmation has to name. `started.json` and `done.json` lie beside them, ready to be copied into the
-//! inbox by the person who begins and ends the job; `regrind confirm` writes the same files.
+//! `correction.csv` has one row per node, `x_mm,y_mm,correction_mm`, row by row with x fastest. `correction.json` gives
+//! grid, sign, frame, units, the pass, and the hash that a confirmation has to name. `started.json` and `done.json` are
+//! in the same folder. The person who begins and ends the job copies them into the inbox; `regrind confirm` writes the
+//! same files.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -18,31 +19,31 @@ use crate::{CorrectionMap, Job, Outcome, PassRecord, hex};
 use regrind_formats::result::read_bytes;
 use regrind_formats::write_atomic;
 
-/// The two files of a person's word, in the inbox.
+/// Names of the two confirmation files in the inbox.
 const STARTED: &str = "started.json";
 const DONE: &str = "done.json";
 
-/// How a grinder exchanges files.
+/// Settings of the file exchange with a grinder.
 #[derive(Clone, Debug)]
 pub struct GrinderExchange {
-    /// The part, as it stands in names of files.
+    /// Name of the part in file names.
     pub part: String,
-    /// Where maps are put.
+    /// Folder for the maps.
     pub outbox: PathBuf,
-    /// Where confirmations appear.
+    /// Folder in which confirmations appear.
     pub inbox: PathBuf,
-    /// A file that has not changed for so long is complete.
+    /// Time without a change after which a file is complete.
     pub stable_for: Duration,
 }
 
-/// The folders of a grinder.
+/// Folders of a grinder.
 #[derive(Debug)]
 pub struct GrinderFolders {
     settings: GrinderExchange,
     outbox: Outbox,
     watch: Watch,
     expected: Option<StoredHandover>,
-    /// When the start was seen, by the driver's clock.
+    /// Time at which the start was seen, by the clock of the driver.
     started: Option<Duration>,
 }
 
@@ -66,7 +67,7 @@ impl Confirmation {
         Self { map: ticket.identity.clone(), job: Some(ticket.job), cycle: Some(ticket.cycle), ..Self::default() }
     }
 
-    /// Returns what is wrong with it for a hand-over.
+    /// Returns an error if the confirmation does not match a hand-over.
     fn check(&self, path: &Path, ticket: &Ticket) -> Result<(), ExchangeError> {
         let wrong = |found: String, expected: String, remedy| {
             Err(ExchangeError::Confirmation { path: path.to_owned(), found, expected, remedy })
@@ -95,7 +96,7 @@ impl Confirmation {
 }
 
 impl GrinderFolders {
-    /// Takes the settings; nothing is looked at before the driver opens the folders.
+    /// Creates the folders from their settings. Reads nothing before the driver opens them.
     pub fn new(settings: GrinderExchange) -> Self {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
@@ -111,7 +112,8 @@ impl GrinderFolders {
         Ok(stored)
     }
 
-    /// Returns the confirmation in a file of this name, if it is there, settled and for this hand-over; says why not.
+    /// Returns the confirmation in a file of this name with the SHA-256 of the file, if the file is there, settled and
+    /// for this hand-over. Otherwise returns `None`, and adds the reason to the notes if there is a file.
     fn confirmation(
         &self,
         name: &str,

@@ -1,4 +1,4 @@
-//! The states of a machine that is two folders and a person.
+//! State machine of a machine that consists of two folders and a person.
 
 use std::sync::{Arc, Mutex, PoisonError, TryLockError};
 use std::time::Duration;
@@ -12,9 +12,9 @@ use crate::{
     digest,
 };
 
-/// A machine behind two folders.
+/// Machine that is reached through two folders.
 ///
-/// Every method does its work on a thread for blocking work and to its end, even if its future is dropped.
+/// Every method does its work on a thread for blocking work and completes it, even if its future is dropped.
 #[derive(Debug)]
 pub struct ExchangeMachine<M: Exchange> {
     name: Arc<str>,
@@ -23,7 +23,7 @@ pub struct ExchangeMachine<M: Exchange> {
     machine: Arc<Mutex<FolderMachine<M>>>,
 }
 
-/// Where the machine stands, by what is in the folders.
+/// State of the machine, according to the content of the folders.
 #[derive(Debug)]
 struct FolderMachine<M: Exchange> {
     name: Arc<str>,
@@ -31,11 +31,11 @@ struct FolderMachine<M: Exchange> {
     exchange: M,
     connected: bool,
     state: State,
-    /// What would be handed over, and its digest.
+    /// Request that would be handed over, and its digest.
     loaded: Option<(M::Request, u32)>,
-    /// The job prepared, running or finished, and the number of its start.
+    /// Job that is prepared, running or finished, and its start number.
     job: Option<(Job, u32)>,
-    /// Every hand-over ever made, the oldest first.
+    /// All hand-overs that were ever made, the oldest first.
     handed: Vec<HandOver>,
     outcome: Outcome,
     done: u32,
@@ -43,15 +43,16 @@ struct FolderMachine<M: Exchange> {
     begun: bool,
     notes: Vec<String>,
     owned: bool,
-    /// Whether the machine cannot reach the part where the other one works.
+    /// True if the machine cannot reach the part at the place where the other machine works.
     apart: bool,
-    /// Whether it is clear of the part: a person who confirms the end of a pass says so, a file that arrives does not.
+    /// True if it is clear of the part. A person who confirms the end of a pass confirms this; a file that arrives does
+    /// not.
     clear: Option<bool>,
 }
 
 impl<M: Exchange> ExchangeMachine<M> {
-    /// Takes the folders of a machine; `name` is what messages call it. Folders that do not answer in time, such as those of a lost
-    /// network drive, are a lost machine.
+    /// Creates the machine from its folders; `name` is its name in messages. If the folders do not answer in time, for
+    /// example on a lost network drive, the machine counts as lost.
     pub fn new(name: impl Into<Arc<str>>, kind: MachineKind, exchange: M, answers_within: Duration) -> Self {
         let name = name.into();
         let machine = FolderMachine {
@@ -75,14 +76,14 @@ impl<M: Exchange> ExchangeMachine<M> {
         Self { name, answers_within, made: Instant::now(), machine: Arc::new(Mutex::new(machine)) }
     }
 
-    /// Says whether the machine stands apart, so that it is always clear of the part.
+    /// Sets if the machine is apart from the other one, so that it is always clear of the part.
     #[must_use]
     pub fn apart(self, apart: bool) -> Self {
         self.machine.lock().unwrap_or_else(PoisonError::into_inner).apart = apart;
         self
     }
 
-    /// Runs a piece of work on the folders, off the threads that must not wait.
+    /// Runs work on the folders on a thread that may block.
     async fn at_work<T: Send + 'static>(
         &self,
         what: &'static str,
@@ -180,7 +181,8 @@ impl<M: Exchange> FolderMachine<M> {
         }
     }
 
-    /// Reads the folders' memory; what stands open there is what this machine is doing.
+    /// Reads the hand-overs in the folder. At the first call, an open or held hand-over gives the job and the state of
+    /// this machine.
     fn open(&mut self) -> Answered<()> {
         self.handed = self.exchange.open().map_err(|error| self.failed(Command::Claim, error))?;
         if !self.connected
@@ -193,7 +195,7 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(())
     }
 
-    /// Looks for the answer while one is waited for.
+    /// Looks for the answer, if one is awaited.
     fn look(&mut self, now: Duration) -> Answered<()> {
         let Some((job, sequence)) = self.job.filter(|_| self.state == State::Execute) else { return Ok(()) };
         let look = self.exchange.look(now, job).map_err(|error| self.failed(Command::Start, error))?;
@@ -253,8 +255,8 @@ impl<M: Exchange> FolderMachine<M> {
         self.started(armed)
     }
 
-    /// The hand-over has appeared after it was given up: whoever waited for it may have gone on without it, so it must not stand open. That
-    /// it did for a moment is told by its ending to who asks what became of it.
+    /// Takes back a hand-over that appeared after it was given up. Its client may have continued without it, so it must
+    /// not stay open. Its ending shows later that it was open for a moment.
     fn take_back_late(&mut self, armed: &Armed) -> Answered<Started> {
         self.mark(Command::Start, Standing::Stopped)?;
         self.notes = self.taken_back();
@@ -268,7 +270,7 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(Started { job: armed.job, start_sequence: armed.start_sequence, status: self.status() })
     }
 
-    /// Something went wrong while the hand-over was published: whether it is there is read from the folder.
+    /// Handles an error while the hand-over was published: reads from the folder if the hand-over is there.
     fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError, permit: &Permit) -> Answered<Started> {
         let why = self.failed(Command::Start, error);
         match self.exchange.open() {
@@ -340,7 +342,8 @@ impl<M: Exchange> FolderMachine<M> {
         }
         self.notes = self.taken_back();
         (self.outcome, self.answer) = (Outcome::Aborted, None);
-        // ABORTED is entered even if the folder cannot be reached; the error says that the hand-over may still lie there.
+        // The state becomes ABORTED even if the folder cannot be reached. The error says that the hand-over may still
+        // be there.
         self.mark(Command::Abort, Standing::Aborted)
     }
 
@@ -375,7 +378,8 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(())
     }
 
-    /// Takes a person's word that the job whose map has this identity has begun, or has ended and the part is clear.
+    /// Accepts the operator confirmation that the job with this map identity has begun, or has ended with the part
+    /// clear.
     fn confirm(&mut self, what: Confirmed, map_identity: [u8; 32]) -> Answered<Vec<String>> {
         self.check_connected("a confirmation")?;
         if self.kind == MachineKind::Cmm {
@@ -392,7 +396,7 @@ impl<M: Exchange> FolderMachine<M> {
         self.open()?;
         let Job { job, cycle, .. } = intended.job;
         let Some(handed) = self.handed.iter().find(|h| (h.job.job, h.job.cycle) == (job, cycle)).copied() else {
-            // Nor will it be: what was prepared for it is forgotten.
+            // It will not be handed over later either: the prepared job is discarded.
             if self.state == State::Prepared {
                 (self.state, self.job) = (State::Idle, None);
             }
@@ -433,7 +437,7 @@ impl<M: Exchange> FolderMachine<M> {
     }
 }
 
-/// Withdraws a permit when nobody waits any more for what it was given for.
+/// Guard that withdraws a permit when nobody waits for its hand-over any more.
 struct GivenUp(Permit);
 
 impl Drop for GivenUp {
@@ -447,7 +451,7 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
         &self.name
     }
 
-    /// Nothing while the folders are being looked at.
+    /// Returns the notes; empty while another thread works on the folders.
     fn notes(&self) -> Vec<String> {
         match self.machine.try_lock() {
             Ok(machine) => machine.notes.clone(),
@@ -496,7 +500,7 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
         let (job, sequence) = (armed.job, armed.start_sequence);
         let permit = Permit::new();
         let kept = permit.clone();
-        // Who drops this future waits no longer either.
+        // A client that drops this future no longer waits.
         let _until_here = GivenUp(permit.clone());
         let told = self
             .at_work("START", move |machine, _| {
@@ -505,11 +509,11 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
             })
             .await;
         match told {
-            // The work goes on behind the time-out; but nothing appears any more.
+            // The work continues after the timeout, but no hand-over appears any more.
             Err(why @ (DeviceError::TimedOut { .. } | DeviceError::Disconnected { .. })) if permit.withdraw() => {
                 Err(why)
             }
-            // It may have appeared in this moment, and is taken back if it has.
+            // The hand-over may have appeared in this moment; then it is taken back.
             Err(why @ (DeviceError::TimedOut { .. } | DeviceError::Disconnected { .. })) => {
                 let machine = Arc::clone(&self.name);
                 Err(DeviceError::StartUnknown { machine, job, sequence, why: Box::new(why) })

@@ -1,4 +1,4 @@
-//! A file as the measurement by a plan: what it must fit, whoever brings it.
+//! Requirements for a file that is the measurement of a plan, whoever brings it.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -9,24 +9,24 @@ use regrind_core::geometry::Point;
 use regrind_formats::FormatError;
 use regrind_formats::result::{Content, Coordinates, ResultFile, Statements, check_ended, parse_result};
 
-/// What a measurement is held against.
+/// Requirements for a measurement.
 #[derive(Clone, Copy, Debug)]
 pub struct Wanted<'a> {
-    /// The numbers of the plan's targets, in its order; `None` where any number of points will do.
+    /// Numbers of the targets of the plan, in its order; `None` if any number of points is allowed.
     pub targets: Option<&'a [u32]>,
-    /// What is known of the files.
+    /// Known properties of the files.
     pub content: &'a Content,
-    /// The radius of the probe in the plan, and by how much that of a file may differ.
+    /// Radius of the probe in the plan, in mm.
     pub probe_radius_mm: f64,
-    /// By how much that of a file may differ.
+    /// Maximum difference in mm between this radius and that of a file.
     pub probe_tolerance_mm: f64,
 }
 
 impl Wanted<'_> {
-    /// Reads the bytes of a file of points and holds it against plan and cell; `path` is what messages call it.
+    /// Reads the bytes of a file of points and checks them against plan and cell; `path` is its name in messages.
     ///
     /// # Errors
-    /// A file that was cut short, that does not say what its coordinates are, or that was measured with another probe.
+    /// The file is incomplete, does not say what its coordinates are, or was measured with another probe.
     pub fn read(&self, path: &Path, bytes: &[u8]) -> Result<ResultFile, ExchangeError> {
         check_ended(path, bytes)?;
         let file = parse_result(path, bytes, self.content)?;
@@ -42,14 +42,15 @@ impl Wanted<'_> {
         }
     }
 
-    /// Gives every point its target.
+    /// Assigns the points to the targets, by the index of each row or by their order.
     ///
     /// # Errors
-    /// Another number of points than the plan has targets, and numbers of targets that the plan does not have.
+    /// The number of points without indices differs from the number of targets, or an index is not a target of the plan
+    /// or occurs twice.
     pub fn matched(&self, path: &Path, result: &ResultFile) -> Result<Vec<MeasuredPoint>, ExchangeError> {
         let Some(targets) = self.targets else { return Ok(numbered(&result.points)) };
         let Some(indices) = &result.indices else { return self.in_order(path, &result.points) };
-        // In the order of the plan; a target without a row was not found.
+        // In the order of the plan; a target without a row counts as not found.
         let mut all: Vec<MeasuredPoint> = targets.iter().map(|&index| not_found(index)).collect();
         let place: HashMap<u32, usize> = targets.iter().enumerate().map(|(k, &t)| (t, k)).collect();
         for (row, (index, point)) in indices.iter().zip(&result.points).enumerate() {
@@ -66,10 +67,10 @@ impl Wanted<'_> {
         Ok(all)
     }
 
-    /// Gives points their targets in the order of the plan.
+    /// Assigns points to the targets in the order of the plan.
     ///
     /// # Errors
-    /// Another number of points than the plan has targets.
+    /// The number of points differs from the number of targets of the plan.
     pub fn in_order(&self, path: &Path, points: &[Point]) -> Result<Vec<MeasuredPoint>, ExchangeError> {
         match self.targets {
             None => Ok(numbered(points)),
@@ -82,10 +83,12 @@ impl Wanted<'_> {
     }
 }
 
-/// Holds a whole measurement against its plan, before it is taken for the answer: one that is not can still be exchanged for another.
+/// Checks a complete measurement against its plan, before it is accepted as the answer: a rejected one can still be
+/// replaced.
 ///
 /// # Errors
-/// Points of fewer targets than this share of them, the plan itself unless it is a rehearsal, and points that are not where their targets are.
+/// Too few targets have a point (see `least_found`), the points equal the plan and this is no rehearsal, or points are
+/// not at their targets.
 pub fn check_measurement(
     path: &Path,
     plan: &Plan,
@@ -95,7 +98,8 @@ pub fn check_measurement(
 ) -> Result<(), ExchangeError> {
     let found = measurement.points.iter().filter(|point| point.status == PointStatus::Touched).count();
     let expected = plan.targets.len();
-    // A further batch is a few places, of which one may well be out of reach: all are counted together once they are there.
+    // A further batch has only a few targets, of which one may be out of reach. All batches together are checked once
+    // they are there.
     let is_first = Job { job: measurement.job, cycle: measurement.cycle, digest: 0 }.number().batch == 0;
     let least = if is_first { (least_found * expected as f64).ceil() as usize } else { expected.div_ceil(2) };
     if found < least {
@@ -108,7 +112,7 @@ pub fn check_measurement(
     }
 }
 
-/// Puts a measurement together from its files; what none of them tells stays unknown.
+/// Assembles a measurement from its files. A value that no file gives stays unknown.
 pub fn measurement(
     points: Vec<MeasuredPoint>,
     results: &[ResultFile],
@@ -118,7 +122,7 @@ pub fn measurement(
 ) -> Measurement {
     Measurement {
         points,
-        // Files that say nothing of it were refused.
+        // Files without this statement were rejected.
         coordinates: results.iter().find_map(|r| r.coordinates).unwrap_or(Coordinates::Centres),
         probe_radius_mm: results.iter().find_map(|r| r.probe_radius_mm),
         temperature_c: results.iter().find_map(|r| r.statements.temperature_c),
@@ -130,7 +134,7 @@ pub fn measurement(
     }
 }
 
-/// Returns why a file that says something of itself does not belong to a plan; nothing if it does not say otherwise.
+/// Returns the reason why the statements in a file contradict a plan; `None` if there is no contradiction.
 pub fn foreign(says: &Statements, part: &str, cycle: u16, plan: &str) -> Option<String> {
     if let Some(other) = says.part.as_ref().filter(|other| *other != part) {
         return Some(format!("is of part {other}, not {part}"));

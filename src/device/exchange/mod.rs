@@ -1,6 +1,6 @@
-//! Machines without a wire: a folder that takes hand-overs, a folder that gives answers, and a person between.
+//! Machines without a wire: a folder for hand-overs, a folder for answers, and a person between them.
 //!
-//! The states are those of a wire, so that whoever drives a cell sees no difference:
+//! The states are those of a machine with a wire, so that the code of a cell sees no difference:
 //!
 //! ```text
 //!  PREPARE  the payload is checked; nothing is in the folder yet
@@ -11,13 +11,13 @@
 //!  COMPLETE a result was accepted; ACKNOWLEDGE closes the hand-over                               -> IDLE
 //! ```
 //!
-//! What was handed over stays in the folder under a name that tells what became of it. That is the memory by which a restarted client
-//! learns whether a start was taken, and by which a job and cycle is never handed over twice. **Taking a hand-over back stops no
-//! machine**: once a person has begun the job, only that person can stop it, and the notes say so.
+//! A hand-over stays in the folder under a name that shows its standing. From this memory a restarted client learns if
+//! a start was accepted, and it prevents a second hand-over of the same job and cycle. **Taking a hand-over back stops
+//! no machine**: once a person has begun the job, only that person can stop it, and the notes say so.
 //!
-//! A hand-over is a folder that appears whole; a result is taken when it has stopped growing, has an end, and says, by its name or in
-//! itself, that it belongs to this part and this cycle; what does not belong is left where it is, and said. The files themselves are read
-//! and written behind [`Exchange`].
+//! A hand-over is a folder that appears as a whole. A result is accepted when it no longer grows, has an end, and
+//! states, by its name or in its content, that it belongs to this part and this cycle. Any other file is left in place
+//! and reported in the notes. The trait [`Exchange`] reads and writes the files themselves.
 
 mod cmm;
 mod dmis;
@@ -46,22 +46,22 @@ pub use watch::Watch;
 
 use crate::{CorrectionMap, Pass, Plan};
 
-/// What a grinder is handed.
+/// Request to a grinder.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GrindOrder {
-    /// The map.
+    /// Correction map.
     pub map: CorrectionMap,
-    /// How to grind.
+    /// Parameters of the pass.
     pub pass: Pass,
-    /// The identity of the map.
+    /// Identity of the map.
     pub map_identity: [u8; 32],
 }
 
-/// What a measuring machine is handed.
+/// Request to a measuring machine.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MeasureOrder {
-    /// The plan.
+    /// Measuring plan.
     pub plan: Plan,
-    /// Its identity.
+    /// Identity of the plan.
     pub plan_identity: [u8; 32],
 }

@@ -1,11 +1,15 @@
-//! The folder that hand-overs are put into, and the memory of all that ever were.
+//! Folder of the hand-overs, which also keeps the memory of all hand-overs that were ever made.
 //!
-//! A hand-over is a folder of its own: written under a hidden name, brought to the disk, and renamed, so that who sees it sees all of it.
-//! Its name tells the part, the job and the cycle, and by an ending what became of it:
+//! A hand-over is a folder of its own. It is written under a hidden name, synced to the disk and then renamed, so that
+//! it is always visible as a whole. Its name contains the part, the job and the cycle. The ending of the name shows its
+//! standing:
 //!
 //! ```text
-//! SN-7_j3_c2           open        SN-7_j3_c2.held      taken back for a while      SN-7_j3_c2.done     its answer was acknowledged
-//! SN-7_j3_c2.stopped   taken back  SN-7_j3_c2.aborted   taken back at once
+//! SN-7_j3_c2           open
+//! SN-7_j3_c2.held      taken back for a while
+//! SN-7_j3_c2.stopped   taken back for good, in order
+//! SN-7_j3_c2.aborted   taken back for good, at once
+//! SN-7_j3_c2.done      its answer was acknowledged
 //! ```
 
 use std::fs;
@@ -21,11 +25,11 @@ use super::{ExchangeError, HandOver, Permit, Standing, file_word};
 use crate::{Job, hex};
 use regrind_formats::{FormatError, read_whole, sync_folder, try_writing, write_atomic, write_json_atomic};
 
-/// What every folder of a hand-over holds.
+/// File in every folder of a hand-over.
 const TICKET: &str = "handover.json";
-/// What is written there when an answer was accepted.
+/// File that is written there when an answer was accepted.
 const TAKEN: &str = "taken.json";
-/// Largest of these files.
+/// Maximum size of these files, in bytes.
 const MOST_BYTES: u64 = 16 << 20;
 
 const ENDINGS: [(Standing, &str); 5] = [
@@ -55,7 +59,7 @@ pub(super) struct Ticket {
 }
 
 impl Ticket {
-    /// Says what is handed over for a job now, with what lies in the inbox already.
+    /// Creates the ticket of a job, with the list of files that are in the inbox now.
     pub(super) fn new(
         part: &str,
         job: Job,
@@ -82,13 +86,13 @@ impl Ticket {
         Job { job: self.job, cycle: self.cycle, digest: self.digest }
     }
 
-    /// Returns whether a file lay in the inbox before the hand-over, and has not been changed since.
+    /// Returns true if a file was in the inbox before the hand-over and has not changed since.
     pub(super) fn is_earlier(&self, name: &str, look: &FileLook) -> bool {
         self.earlier.iter().any(|(n, bytes, at)| n == name && *bytes == look.bytes && *at == nanoseconds(look.modified))
     }
 }
 
-/// Time of change since 1970, in nanoseconds.
+/// Returns the time of change since 1970, in ns.
 fn nanoseconds(at: SystemTime) -> u128 {
     at.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |d| d.as_nanos())
 }
@@ -102,7 +106,7 @@ pub(super) struct Taken {
     pub files: Vec<(String, String)>,
 }
 
-/// A hand-over as it lies in the folder.
+/// Hand-over as it is in the folder.
 #[derive(Clone, Debug)]
 pub(super) struct StoredHandover {
     pub path: PathBuf,
@@ -111,14 +115,14 @@ pub(super) struct StoredHandover {
     pub taken: Option<Taken>,
 }
 
-/// The folder that hand-overs are put into.
+/// Folder of the hand-overs.
 #[derive(Clone, Debug)]
 pub(super) struct Outbox {
     pub folder: PathBuf,
 }
 
 impl Outbox {
-    /// Tries this folder and the one that answers come out of, and returns every hand-over, the oldest first.
+    /// Checks access to this folder and to the inbox, and returns every hand-over, the oldest first.
     pub(super) fn open(&self, inbox: &mut Watch) -> Result<Vec<HandOver>, ExchangeError> {
         try_writing(&self.folder)?;
         inbox.look(Duration::ZERO)?;
@@ -161,17 +165,17 @@ impl Outbox {
         Ok(found)
     }
 
-    /// Returns the hand-over of a job and cycle.
+    /// Returns the hand-over of a job and cycle, if there is one.
     fn find(&self, job: Job) -> Result<Option<StoredHandover>, ExchangeError> {
         Ok(self.list()?.into_iter().find(|l| (l.ticket.job, l.ticket.cycle) == (job.job, job.cycle)))
     }
 
-    /// Returns the hand-over of a job and cycle that was put here.
+    /// Returns the hand-over of a job and cycle; an error if it is missing.
     pub(super) fn handed_over(&self, job: Job) -> Result<StoredHandover, ExchangeError> {
         self.find(job)?.ok_or_else(|| ExchangeError::Missing { folder: self.folder.clone() })
     }
 
-    /// Puts a hand-over into the folder: its ticket, and files by name. Where the permit was withdrawn nothing appears.
+    /// Publishes a hand-over in the folder: its ticket, and files by name. Nothing appears if the permit was withdrawn.
     pub(super) fn publish(
         &self,
         ticket: &Ticket,
@@ -196,7 +200,7 @@ impl Outbox {
         Ok(())
     }
 
-    /// Gives a hand-over the name that tells where it stands.
+    /// Renames a hand-over so that its name shows its standing.
     pub(super) fn mark(&self, job: Job, standing: Standing) -> Result<(), ExchangeError> {
         let stored = self.handed_over(job)?;
         let ending = ENDINGS.iter().find(|(s, _)| *s == standing).map_or("", |(_, e)| *e);
@@ -204,7 +208,7 @@ impl Outbox {
         if target != stored.path { Ok(rename(&stored.path, &target)?) } else { Ok(()) }
     }
 
-    /// Writes down what was accepted as an answer.
+    /// Records which files were accepted as the answer.
     pub(super) fn note_taken(&self, stored: &StoredHandover, taken: &Taken) -> Result<(), ExchangeError> {
         if stored.taken.as_ref() == Some(taken) {
             return Ok(());
@@ -217,7 +221,7 @@ fn base_name(part: &str, job: Job) -> String {
     format!("{}_j{}_c{}", file_word(part), job.job, job.cycle)
 }
 
-/// A folder that goes away unless it is renamed.
+/// Draft of a folder, which is deleted unless it is renamed.
 struct DraftFolder(PathBuf);
 
 impl DraftFolder {
@@ -230,7 +234,7 @@ impl DraftFolder {
 
 impl Drop for DraftFolder {
     fn drop(&mut self) {
-        // Gone already if it was renamed; else the error that brought us here is the one to report.
+        // After the rename there is nothing to delete. Otherwise the error that led here is the one to report.
         let _ = fs::remove_dir_all(&self.0);
     }
 }
@@ -255,12 +259,13 @@ pub(super) fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> Result<T, 
     })
 }
 
-/// Returns a small document of JSON as it stands in a file.
+/// Returns a JSON document as it is written to a file.
 pub(super) fn json_lines(value: &serde_json::Value) -> Vec<u8> {
     format!("{value:#}\n").into_bytes()
 }
 
-/// Returns the identity that 64 hexadecimal digits spell; what is no digit counts 0, and then it is nobody's identity.
+/// Decodes an identity of 64 hexadecimal digits. An invalid digit pair gives a zero byte, so that the result matches no
+/// identity.
 pub(super) fn unhex(digits: &str) -> [u8; 32] {
     let mut identity = [0; 32];
     for (byte, pair) in identity.iter_mut().zip(digits.as_bytes().chunks_exact(2)) {

@@ -1,22 +1,22 @@
-//! Names of files with `*` for any characters, and with the part, the job and the cycle filled in.
+//! Patterns for file names: `*` for any characters, and placeholders for the part, the job and the cycle.
 
-/// A pattern for the names of files in one folder.
+/// Pattern for the names of files in one folder.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Pattern(String);
 
 impl Pattern {
-    /// Takes a pattern as it is written: `*` stands for any characters, `{part}`, `{job}` and `{cycle}` for what they say.
+    /// Creates a pattern from its text: `*` matches any characters, `{part}`, `{job}` and `{cycle}` are placeholders.
     pub fn new(text: impl Into<String>) -> Self {
         Self(text.into())
     }
 
-    /// Fills in part, job and cycle.
+    /// Returns the pattern with part, job and cycle filled in.
     pub fn filled(&self, part: &str, job: u32, cycle: u16) -> Self {
         let filled = self.0.replace("{part}", &file_word(part)).replace("{job}", &job.to_string());
         Self(filled.replace("{cycle}", &cycle.to_string()))
     }
 
-    /// Returns whether a name fits; case matters.
+    /// Returns true if a name matches; case matters.
     pub fn fits(&self, name: &str) -> bool {
         let mut pieces = self.0.split('*');
         let first = pieces.next().unwrap_or_default();
@@ -32,24 +32,26 @@ impl Pattern {
         rest.ends_with(last)
     }
 
-    /// Returns what the one star of a pattern stands for in a name; nothing if the name does not fit or there is not one star.
+    /// Returns the characters that the one star of a pattern matches in a name. Returns `None` if the name does not
+    /// match, or if there is not exactly one star.
     pub fn star<'n>(&self, name: &'n str) -> Option<&'n str> {
         let (before, after) = self.0.split_once('*').filter(|(_, after)| !after.contains('*'))?;
         name.strip_prefix(before)?.strip_suffix(after)
     }
 
-    /// Puts a text in the place of the star.
+    /// Returns the pattern with a text in place of the star.
     pub fn with_star(&self, text: &str) -> Self {
         Self(self.0.replacen('*', text, 1))
     }
 
-    /// The pattern as text.
+    /// Returns the pattern as text.
     pub fn as_str(&self) -> &str {
         &self.0
     }
 }
 
-/// Returns a text as a word that every file system takes.
+/// Returns a text as a word that every file system accepts in a file name: any character other than letters, digits,
+/// `-`, `_` and `.` becomes `_`.
 pub fn file_word(text: &str) -> String {
     let word: String =
         text.chars().map(|c| if c.is_alphanumeric() || matches!(c, '-' | '_' | '.') { c } else { '_' }).collect();
@@ -67,7 +69,7 @@ mod tests {
         assert!(fits("M1_1.txt", "M1_1.txt") && !fits("M1_1.txt", "M1_1.txt~") && !fits("M1_1.txt", "xM1_1.txt"));
         assert!(fits("M1_*.txt", "M1_.txt") && fits("M1_*.txt", "M1_12.txt") && !fits("M1_*.txt", "ref_1.txt"));
         assert!(fits("*a*b*", "xaxbx") && !fits("*a*b*", "xbxax") && fits("*", ""));
-        // One character cannot serve two pieces.
+        // One character cannot match two pieces.
         assert!(!fits("ab*ba", "aba") && fits("ab*ba", "abba"));
     }
 

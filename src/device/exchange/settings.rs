@@ -1,4 +1,4 @@
-//! What a cell file says of a machine that is reached by files, and the machines that are made of it.
+//! Settings in a cell file of a machine that is reached by files, and the machines that are made from it.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -18,7 +18,7 @@ use regrind_formats::references::read_references;
 use regrind_formats::result::{Content, Coordinates, DecimalMark};
 use regrind_formats::{Columns, Unit};
 
-/// A folder, perhaps on another computer, answers within this, a large file read included.
+/// Timeout for a folder, which may be on another computer, including the read of a large file.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(30);
 
 /// Files in two folders, and a person.
@@ -173,7 +173,8 @@ impl ExchangeWire {
         ExchangeMachine::new(name, kind, folders, ANSWERS_WITHIN).apart(self.apart)
     }
 
-    /// A folder that Regrind made itself would be one that nobody looks into: both must be there.
+    /// Returns the two folders. Both must exist: Regrind does not create them, because nobody would look into a folder
+    /// that it created itself.
     fn folders(&self, making: &Making<'_>, machine: MachineKind) -> Result<[PathBuf; 2], MakingError> {
         let table = machine.name();
         let folder = |name: &str, path: &String| {
@@ -186,7 +187,8 @@ impl ExchangeWire {
         Ok([folder("outbox", &self.outbox)?, folder("inbox", &self.inbox)?])
     }
 
-    /// The reference points are read at once: an error in them must not come to light when a day's measuring is done.
+    /// Returns the settings of the stations. Reads the reference points at once, so that an error in them does not
+    /// appear only after a day of measuring.
     fn stations(&self, making: &Making<'_>) -> Result<Option<Stations>, MakingError> {
         let Some(nominal) = self.reference_points.as_ref().map(|file| making.cell_folder.join(file)) else {
             return Ok(None);
@@ -247,7 +249,7 @@ impl ExchangeWire {
         }
         for (k, StationTable { points, reference }) in self.stations.iter().enumerate() {
             if points.is_empty() || reference.is_empty() {
-                continue; // told by the schema
+                continue; // reported by the schema
             }
             let stars = [points, reference].map(|name| name.matches('*').count());
             for (name, key) in [(points, "points"), (reference, "reference")] {

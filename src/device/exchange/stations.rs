@@ -1,35 +1,35 @@
-//! Several stations in one frame, each by the reference points that it sees.
+//! Registration of several stations in one frame, each by the reference points that it sees.
 //!
-//! A station is laid on the nominal reference points by a rigid best fit. Every reference point's residual is reported; one that is
-//! off by more than a limit is named, and where two seem exchanged or one seems moved that is said, because that is what a person
-//! then has to look for.
+//! A rigid best fit registers a station to the nominal reference points. The residual of every reference point is
+//! reported. A point with a residual above a limit is named. If two points seem exchanged, or one seems moved, the
+//! message says so, because a person must look for that.
 
 use super::ExchangeError;
 use regrind_core::geometry::{Point, Pose, RigidFit, Vector, fit_rigid};
 use regrind_formats::references::{Reference, References};
 
-/// With more nominal points than this no subsets are tried for a station that names none.
+/// Maximum number of nominal points for which subsets are tried, if a station names none.
 const MOST_NOMINAL: usize = 12;
 
-/// Where a station stands.
+/// Pose of a station.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PlacedStation {
-    /// What messages call it.
+    /// Name in messages.
     pub station: String,
-    /// Takes what the station sees to the frame of the nominal reference points.
+    /// Pose that transforms the frame of the station to the frame of the nominal reference points.
     pub cmm_from_station: Pose,
-    /// The reference points that took part, and what is left of each: nominal less seen.
+    /// Names of the fitted reference points with their residuals in mm: nominal minus seen.
     pub residuals: Vec<(String, Vector)>,
-    /// Root mean square of the lengths of these.
+    /// Root mean square of the lengths of the residuals, in mm.
     pub rms_mm: f64,
     /// Nominal points that the station does not see.
     pub missing: Vec<String>,
-    /// Points of the station that are not nominal ones; they took no part.
+    /// Points of the station that are not nominal; they are not fitted.
     pub extra: Vec<String>,
 }
 
 impl PlacedStation {
-    /// Returns what a person should know of this station: the fit, and what is missing.
+    /// Returns in words the fit of this station and its missing points.
     pub fn words(&self) -> String {
         let each: Vec<String> = self.residuals.iter().map(|(name, r)| format!("{name} {:.3}", r.norm())).collect();
         let mut words = format!(
@@ -47,13 +47,14 @@ impl PlacedStation {
     }
 }
 
-/// Lays a station on the nominal reference points.
+/// Registers a station to the nominal reference points.
 ///
-/// Points are matched by name if the station names at least one nominal point, else by their order; a station that sees fewer than
-/// there are and names none is matched in order by its distances, if these leave one way only.
+/// Points are matched by name if the station names at least one nominal point (three are required), otherwise by their
+/// order. A station that names none and sees fewer points than there are is matched in order by its distances, if these
+/// allow only one match.
 ///
 /// # Errors
-/// Points that cannot be matched, that fix no pose, or of which one is off by more than `limit_mm`.
+/// The points cannot be matched, they determine no pose, or a residual exceeds `limit_mm`.
 pub fn place_station(
     station: &str,
     seen: &References,
@@ -86,9 +87,9 @@ pub fn place_station(
     })
 }
 
-/// Which seen point is which nominal one.
+/// Assignment of seen points to nominal points.
 struct Matching {
-    /// Indices into the seen and the nominal points.
+    /// Pairs of indices into the seen and the nominal points.
     pairs: Vec<(usize, usize)>,
 }
 
@@ -136,7 +137,7 @@ fn match_points(
     }
 }
 
-/// Finds the one subset of the nominal points, in order, that the seen ones fit.
+/// Finds the unique subset of the nominal points, in order, that fits the seen points.
 fn match_subset(seen: &References, nominal: &References, limit_mm: f64) -> Result<Matching, &'static str> {
     let (have, want) = (seen.points.len(), nominal.points.len());
     let chosen = |mask: u32| (0..want).filter(|n| mask >> n & 1 == 1).enumerate().collect::<Vec<_>>();
@@ -153,7 +154,7 @@ fn match_subset(seen: &References, nominal: &References, limit_mm: f64) -> Resul
     }
 }
 
-/// Tells what may be wrong with reference points that do not fit, and which one to name.
+/// Returns the index of the reference point to name, if there is one, and the probable cause of the misfit in words.
 fn diagnose(from: &[Point], to: &[Point], names: &[String], limit_mm: f64) -> (Option<usize>, String) {
     let fits = |fit: Option<RigidFit>| fit.is_some_and(|fit| fit.worst().1 <= limit_mm);
     for a in 0..from.len() {
@@ -166,7 +167,8 @@ fn diagnose(from: &[Point], to: &[Point], names: &[String], limit_mm: f64) -> (O
             }
         }
     }
-    // Without one of four points the other three always leave something; of more than one candidate none is named.
+    // At least four points are needed: the three that remain still have residuals to judge. If several points qualify,
+    // none is named.
     let alone: Vec<usize> = (0..from.len())
         .filter(|&k| from.len() > 3 && fits(fit_rigid(&without(from, k), &without(to, k)).ok()))
         .collect();
@@ -180,7 +182,7 @@ fn without(points: &[Point], index: usize) -> Vec<Point> {
     points.iter().enumerate().filter(|(k, _)| *k != index).map(|(_, p)| *p).collect()
 }
 
-/// Returns how far a point is off when the others alone are fitted.
+/// Returns the distance in mm of a point from its nominal position when only the other points are fitted.
 fn off_without(from: &[Point], to: &[Point], index: usize) -> Option<f64> {
     let fit = fit_rigid(&without(from, index), &without(to, index)).ok()?;
     Some((to[index] - fit.pose.point(&from[index])).norm())
@@ -209,7 +211,7 @@ mod tests {
         Pose::exp(&Twist::new(20.0, -3000.0, 5.0, 0.1, -0.4, 2.0))
     }
 
-    /// What a station at the planted pose sees, in the order given, with or without names.
+    /// Returns the points that a station at the simulated pose sees, in the given order, with or without names.
     fn seen(order: &[usize], named: bool) -> References {
         let point = |&k: &usize| Reference {
             name: named.then(|| AT[k].0.into()),

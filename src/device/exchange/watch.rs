@@ -1,8 +1,8 @@
-//! Looking at a folder until a file has stopped growing.
+//! Watch on a folder until a file has stopped growing.
 //!
-//! A file that somebody is copying has no end one can see. It is taken for complete when its size and its time of change have stayed
-//! the same for a while, and what is in it has an end: that is for the reader to say. Time comes in as an argument, so that a test
-//! steps it.
+//! The end of a file that is being copied cannot be seen. The file counts as complete when its size and its time of
+//! change have stayed the same for a time, and its content has an end, which the reader checks. Time is an argument, so
+//! that a test can step it.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -10,23 +10,23 @@ use std::time::{Duration, SystemTime};
 
 use regrind_formats::FormatError;
 
-/// How a file looked at one moment.
+/// Size and time of change of a file at one moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FileLook {
-    /// Its length.
+    /// Length, in bytes.
     pub bytes: u64,
-    /// When it was changed last, by the clock of its file system.
+    /// Time of the last change, by the clock of its file system.
     pub modified: SystemTime,
 }
 
-/// A file in the folder, and since when it has looked as it does.
+/// File in the folder, and the time since which it has not changed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Known {
     look: FileLook,
     since: Duration,
 }
 
-/// A folder that is looked at again and again.
+/// Folder that is read repeatedly.
 #[derive(Clone, Debug)]
 pub struct Watch {
     folder: PathBuf,
@@ -34,43 +34,43 @@ pub struct Watch {
     known: BTreeMap<String, Known>,
 }
 
-/// A file as the last look found it.
+/// File as found by the last look.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WatchedFile {
-    /// Its name in the folder.
+    /// Name in the folder.
     pub name: String,
-    /// Where it is.
+    /// Path of the file.
     pub path: PathBuf,
-    /// How it looks.
+    /// Size and time of change.
     pub look: FileLook,
-    /// Whether it has looked so for long enough.
+    /// True if it has not changed for long enough.
     pub settled: bool,
 }
 
 impl Watch {
-    /// Watches a folder; a file that has not changed for `stable_for` has settled.
+    /// Creates a watch on a folder. A file that has not changed for `stable_for` has settled.
     pub fn new(folder: impl Into<PathBuf>, stable_for: Duration) -> Self {
         Self { folder: folder.into(), stable_for, known: BTreeMap::new() }
     }
 
-    /// The folder.
+    /// Returns the folder.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Looks at the folder and returns its files by name, those that begin with a dot left out.
+    /// Reads the folder and returns its files sorted by name, without those that begin with a dot.
     ///
-    /// `now` is the time since any fixed moment; it must not go back.
+    /// `now` is the time since any fixed moment; it must not decrease.
     ///
     /// # Errors
-    /// A folder that cannot be read.
+    /// The folder cannot be read.
     pub fn look(&mut self, now: Duration) -> Result<Vec<WatchedFile>, FormatError> {
         let unreadable = |source| FormatError::Unreadable { path: self.folder.clone(), source };
         let mut known = BTreeMap::new();
         for entry in std::fs::read_dir(&self.folder).map_err(unreadable)? {
             let entry = entry.map_err(unreadable)?;
             let Ok(name) = entry.file_name().into_string() else { continue };
-            // A file that goes away while it is looked at was not there.
+            // A file that disappears while it is read counts as absent.
             let Ok(metadata) = std::fs::metadata(entry.path()) else { continue };
             if name.starts_with('.') || !metadata.is_file() {
                 continue;
@@ -107,7 +107,7 @@ mod tests {
         let settled = |watch: &mut Watch, s| watch.look(at(s)).unwrap().iter().map(|f| f.settled).collect::<Vec<_>>();
         assert_eq!(settled(&mut watch, 1), [false]);
         assert_eq!(settled(&mut watch, 2), [false]);
-        // It grows: the time begins anew.
+        // It grows, so the time starts again.
         fs::write(home.path().join("a.csv"), "1,2,3\n4,5,6\n").unwrap();
         assert_eq!(settled(&mut watch, 3), [false]);
         assert_eq!(settled(&mut watch, 4), [false]);

@@ -1,20 +1,21 @@
-//! What a line of a hit says: three coordinates, and the angle of a rotary table where there is one.
+//! Content of a line of a hit: three coordinates, and the angle of a rotary table if there is one.
 //!
-//! The eight formats are those by which generic machines are read ("Support for Generic CMM" of PC-DMIS): numbers with a decimal mark, or
-//! whole ones in micrometres and tenths of a degree; with the letters of the axes before them, or without. Nothing in a line proves that it is
-//! whole, so everything in it is required: the number of values, the letters, and the number of decimals.
+//! The eight formats are those of generic machines ("Support for Generic CMM" of PC-DMIS): numbers with a decimal mark,
+//! or whole numbers in micrometres and tenths of a degree; with or without the letters of the axes before them. Nothing
+//! in a line proves that it is complete, so everything in it is required: the number of values, the letters, and the
+//! number of decimals.
 
 use std::fmt;
 
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-/// The letters of the axes in their order.
+/// Letters of the axes, in order.
 const LETTERS: [char; 4] = ['X', 'Y', 'Z', 'W'];
-/// Largest coordinate and angle that are believed.
+/// Maximum coordinate and angle that are accepted.
 const LARGEST_MM: f64 = 1e5;
 const LARGEST_DEG: f64 = 36_000.0;
-/// Most digits before the mark, and most behind it.
+/// Maximum number of digits before the decimal mark, and after it.
 const MOST_DIGITS: usize = 9;
 
 /// How a machine writes a hit.
@@ -40,7 +41,7 @@ pub enum LineFormat {
 }
 
 impl LineFormat {
-    /// All of them, with the words of a cell file.
+    /// All formats, with their names in a cell file.
     pub const ALL: [(Self, &'static str); 8] = [
         (Self::Decimal, "decimal"),
         (Self::Integer, "integer"),
@@ -52,19 +53,19 @@ impl LineFormat {
         (Self::LetteredIntegerRotary, "lettered-integer-rotary"),
     ];
 
-    /// Whether the numbers are whole: micrometres and tenths of a degree.
+    /// Returns true if the numbers are whole: micrometres and tenths of a degree.
     pub fn is_integer(self) -> bool {
         use LineFormat::*;
         matches!(self, Integer | LetteredInteger | IntegerRotary | LetteredIntegerRotary)
     }
 
-    /// Whether the letters of the axes stand before the numbers.
+    /// Returns true if the letters of the axes precede the numbers.
     pub fn is_lettered(self) -> bool {
         use LineFormat::*;
         matches!(self, LetteredDecimal | LetteredInteger | LetteredDecimalRotary | LetteredIntegerRotary)
     }
 
-    /// Whether a fourth value tells the angle of a rotary table.
+    /// Returns true if a fourth value is the angle of a rotary table.
     pub fn has_rotary(self) -> bool {
         use LineFormat::*;
         matches!(self, DecimalRotary | IntegerRotary | LetteredDecimalRotary | LetteredIntegerRotary)
@@ -88,20 +89,20 @@ pub enum Separator {
     Blank,
 }
 
-/// How lines are read.
+/// Parameters of the parsing of lines.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reading {
-    /// The format.
+    /// Format of a line.
     pub format: LineFormat,
-    /// What stands between two values.
+    /// Separator between two values.
     pub separator: Separator,
-    /// The decimal mark.
+    /// Decimal mark.
     pub mark: char,
-    /// How many digits stand behind it in a coordinate.
+    /// Number of digits after the decimal mark of a coordinate.
     pub decimals: usize,
-    /// Millimetres of the unit of a coordinate with a mark.
+    /// Unit of a coordinate with a decimal mark, in mm.
     pub unit_mm: f64,
-    /// Which axis each value is: 0 for x.
+    /// Axis of each value: 0 for x.
     pub axes: [usize; 3],
 }
 
@@ -118,21 +119,21 @@ impl Default for Reading {
     }
 }
 
-/// What a line says.
+/// Content of a line.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
-    /// Where the touch was, in the machine's frame, in millimetres.
+    /// Position of the touch in the machine's frame, in mm.
     pub at_mm: [f64; 3],
-    /// Where the rotary table stood.
+    /// Angle of the rotary table, in degrees.
     pub rotary_deg: Option<f64>,
 }
 
-/// Why a line is refused.
+/// Reason why a line is refused.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LineFlaw {
-    /// The value, from 1; 0 for the whole line.
+    /// Number of the value, from 1; 0 for the whole line.
     pub value: usize,
-    /// In words.
+    /// Explanation in words.
     pub why: String,
 }
 
@@ -152,10 +153,10 @@ impl fmt::Display for LineFlaw {
 }
 
 impl Reading {
-    /// Reads a line without its end.
+    /// Parses a line without its line end.
     ///
     /// # Errors
-    /// What is not exactly a line of the format.
+    /// Returns an error if the line is not exactly of the format.
     pub fn read(&self, line: &str) -> Result<Hit, LineFlaw> {
         if let Some((at, c)) = line.chars().enumerate().find(|(_, c)| !matches!(c, '\t' | ' '..='~')) {
             let why = format!("its character {} is {c:?}, which is no plain text", at + 1);
@@ -187,7 +188,7 @@ impl Reading {
         Err(LineFlaw::of_line(format!("it has {} values where {expected} belong: {why}", fields.len())))
     }
 
-    /// Takes the letter off a value, where there has to be one.
+    /// Removes the letter from a value, if the format requires one.
     fn number<'f>(&self, k: usize, field: &'f str) -> Result<&'f str, LineFlaw> {
         let field = field.trim_matches(' ');
         if !self.format.is_lettered() {
@@ -230,14 +231,15 @@ impl Reading {
         Ok(angle)
     }
 
-    /// Returns which of the eight formats a line is in, and with how many decimals: what a person needs who writes a cell file.
+    /// Returns the readings (format, separator, decimal mark, number of decimals) that fit a line: a help for the
+    /// author of a cell file.
     pub fn fitting(line: &str) -> Vec<Self> {
         let marks = [('.', Separator::Comma), ('.', Separator::Semicolon), ('.', Separator::Tab)];
         let commas = [(',', Separator::Semicolon), (',', Separator::Tab), (',', Separator::Blank)];
         let marks = marks.into_iter().chain([('.', Separator::Blank)]).chain(commas);
         let all = marks.flat_map(|(mark, separator)| {
             LineFormat::ALL.into_iter().flat_map(move |(format, _)| {
-                // Of whole numbers the mark says nothing.
+                // Whole numbers have no decimal mark, so only one mark is tried.
                 let decimals = if format.is_integer() { 0..=if mark == '.' { 0 } else { -1 } } else { 1..=9 };
                 decimals.map(move |decimals: i32| Self {
                     format,
@@ -270,7 +272,8 @@ impl fmt::Display for Reading {
     }
 }
 
-/// Reads a sign, digits, and from so many to so many digits behind a mark; none of them, no mark.
+/// Parses a sign, digits, and `least` to `most` digits after the decimal mark. Without a mark, `least` must be 0; with
+/// `most` = 0 no mark is allowed.
 fn exact(text: &str, mark: char, least: usize, most: usize) -> Option<f64> {
     let digits = text.strip_prefix(['+', '-']).unwrap_or(text);
     let (whole, behind) = match digits.split_once(mark) {
@@ -291,7 +294,7 @@ fn exact(text: &str, mark: char, least: usize, most: usize) -> Option<f64> {
 mod tests {
     use super::*;
 
-    /// The examples of the page that the formats come from.
+    /// Examples of the page that the formats come from.
     const EXAMPLES: [(LineFormat, &str); 8] = [
         (LineFormat::Decimal, "100.000,200.000,300.000"),
         (LineFormat::Integer, "100000,200000,300000"),
@@ -360,7 +363,7 @@ mod tests {
         for lost in 0..line.len() {
             let short: String = line.chars().enumerate().filter(|(k, _)| *k != lost).map(|(_, c)| c).collect();
             if let Ok(hit) = reading.read(&short) {
-                // A sign, or a digit before a mark: then the point is somewhere else by millimetres.
+                // A sign, or a digit before the mark, is missing: the error is then millimetres.
                 let away = (0..3).map(|k| (hit.at_mm[k] - whole[k]).abs()).fold(0.0, f64::max);
                 assert!(away >= 1.0, "{short}: {away}");
             }

@@ -1,7 +1,8 @@
-//! A measurement as far as lines have brought it: what each line, and what each word of a person, does to it.
+//! State of a measurement, and its change by each line and each confirmation of a person.
 //!
-//! A line that is refused leads to HOLDING, for the touch that it told of may be lost: a person stops the machine, says that it stands, and
-//! goes on with the targets that are left. Good lines count until it stands: whoever leads the probe hears of a hold late.
+//! A refused line leads to HOLDING, because its touch may be lost. A person stops the machine, confirms that it does
+//! not move, and continues with the remaining targets. Valid lines count until then, because the person or program that
+//! leads the probe learns of a hold late.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -17,53 +18,54 @@ use crate::error::DeviceError;
 use crate::words::{Job, Outcome, State, hex};
 use regrind_formats::AddedLines;
 
-/// Refused lines are for a person: the last ones.
+/// Number of refused lines kept for a person: the last ones.
 const SHOWN: usize = 4;
 
-/// How lines are judged.
+/// Parameters by which lines are judged.
 #[derive(Clone, Debug)]
 pub(super) struct Judging {
     pub(super) reading: Reading,
-    /// Where the rotary table has to stand, and within what.
+    /// Required angle of the rotary table and its tolerance, in degrees.
     pub(super) rotary_deg: [f64; 2],
-    /// Beginnings of lines that mean nothing.
+    /// Beginnings of lines that are ignored.
     pub(super) passed_over: Vec<String>,
 }
 
-/// A measurement that is asked for, or was.
+/// Requested measurement, current or finished.
 #[derive(Debug)]
 pub(super) struct Asked {
     pub(super) job: Job,
     pub(super) sequence: u32,
     pub(super) plan_identity: [u8; 32],
     pub(super) list: List,
-    /// Where each line is kept as it came.
+    /// File that stores each line as it came.
     pub(super) kept: Option<AddedLines>,
     pub(super) begun: Instant,
     pub(super) last_line: Instant,
-    /// Lines since it began.
+    /// Number of lines since it began.
     lines: u32,
     doubles: u32,
     refused: VecDeque<String>,
 }
 
-/// What the driver and the thread that listens share.
+/// State that the driver and the listening thread share.
 #[derive(Debug)]
 pub(super) struct Hearing {
     judging: Judging,
     pub(super) state: State,
     pub(super) outcome: Outcome,
     pub(super) asked: Option<Asked>,
-    /// Whether the probe is clear of the part, by a person's word or by what the cell file says.
+    /// True if the probe is clear of the part, as a person confirmed or by the time in the cell file; `None` if
+    /// unknown.
     pub(super) clear: Option<bool>,
     pub(super) worked: Duration,
-    /// Why nothing is heard any more.
+    /// Reason why the line is lost.
     pub(super) lost: Option<DeviceError>,
-    /// Lines that came when nothing was asked, and the last of them.
+    /// Number of lines that came without a request, and the last of them.
     unasked: (u32, String),
 }
 
-/// A line as it is kept.
+/// Line as it is stored.
 #[derive(Serialize)]
 struct Kept<'a> {
     /// Seconds since the measurement began.
@@ -77,7 +79,7 @@ struct Kept<'a> {
     refused: Option<&'a str>,
 }
 
-/// A panic elsewhere leaves what still holds.
+/// Locks the shared state. A panic in another thread does not make it invalid, so a poisoned lock is ignored.
 pub(super) fn locked(hearing: &Mutex<Hearing>) -> MutexGuard<'_, Hearing> {
     hearing.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -124,7 +126,7 @@ impl Hearing {
         }
     }
 
-    /// Takes what came over the line.
+    /// Processes what came over the line.
     pub(super) fn take(&mut self, gathered: Gathered) {
         match gathered {
             Gathered::Line(line) => self.line(&line),
@@ -132,7 +134,7 @@ impl Hearing {
         }
     }
 
-    /// A line has begun, and its rest does not come.
+    /// Processes a line that has begun and whose rest does not come.
     pub(super) fn cut_short(&mut self, text: &str) {
         self.flawed(text, "its end did not come: it is cut short; touch that point again");
     }
@@ -175,7 +177,7 @@ impl Hearing {
         }
     }
 
-    /// A line that is no touch; where nothing is asked it is only told of.
+    /// Processes a line that is not a valid touch; without a request it is only noted.
     fn flawed(&mut self, line: &str, why: &str) {
         match (&mut self.asked, self.state) {
             (Some(asked), state) if state.moves() => {
@@ -201,7 +203,7 @@ impl Hearing {
         }
     }
 
-    /// The line is lost, and what is touched from now on is not heard.
+    /// Records that the line is lost: later touches are not received.
     pub(super) fn is_lost(&mut self, error: DeviceError, begun: Option<String>) {
         if let Some(text) = begun {
             self.cut_short(&text);
@@ -216,7 +218,8 @@ impl Hearing {
         self.lost = Some(error);
     }
 
-    /// Ends a measurement to which nothing is missing, so long after its last line as the cell file says that the probe needs to come clear.
+    /// Ends a complete measurement when `clear_after` has passed since its last line: the time that the probe needs to
+    /// move clear.
     pub(super) fn let_time_pass(&mut self, clear_after: Option<Duration>) {
         let (Some(asked), Some(clear_after), State::Execute) = (&self.asked, clear_after, self.state) else { return };
         if asked.list.is_whole() && asked.last_line.elapsed() >= clear_after {
@@ -236,7 +239,7 @@ impl Hearing {
 
     // ---- words ------------------------------------------------------------------------------------------------------------------------
 
-    /// The last lines that were refused, and what else should be known of lines.
+    /// Returns the last refused lines and other notes on lines.
     pub(super) fn refusals(&self) -> Vec<String> {
         let asked = self.asked.as_ref();
         let refused = asked.into_iter().flat_map(|asked| asked.refused.iter().cloned());
@@ -257,7 +260,7 @@ impl Hearing {
         refused.chain(doubles).chain(unasked).collect()
     }
 
-    /// The targets that are left, in short.
+    /// Returns a short text of the remaining targets.
     pub(super) fn left(&self) -> String {
         const SOME: usize = 12;
         let Some(asked) = &self.asked else { return String::new() };
@@ -310,11 +313,11 @@ mod tests {
         assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
         let refusals = heard.refusals();
         assert!(refusals[0].starts_with("REFUSED line 3 of the measurement") && refusals[0].contains("run together"));
-        // Whoever leads the probe has not heard of it yet.
+        // The person who leads the probe does not know of the hold yet.
         hear(&mut heard, "15.000,0.000,1.500");
         assert_eq!((heard.state, touched(&heard)), (State::Holding, 2));
         assert_eq!(heard.left(), "2 targets are left: 101, 102");
-        // What stands touches nothing.
+        // A machine at rest touches nothing.
         heard.state = State::Held;
         hear(&mut heard, "5.000,0.000,1.500");
         assert_eq!((heard.state, touched(&heard)), (State::Held, 2));

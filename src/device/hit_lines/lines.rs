@@ -1,27 +1,27 @@
-//! Bytes put together to lines. A line ends with CR, LF or both; one without anything in it is none.
+//! Splitter of bytes into lines. CR, LF or both end a line; an empty line is ignored.
 
-/// Longest line.
+/// Maximum length of a line, in bytes.
 const LONGEST: usize = 200;
 
-/// What bytes came to.
+/// Result of the received bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Gathered {
-    /// A line without its end.
+    /// Line without its line end.
     Line(String),
-    /// Something that goes on for longer than any line; its beginning.
+    /// Beginning of data that are longer than any line.
     Endless(String),
 }
 
-/// Bytes on their way to lines.
+/// Bytes of incomplete lines.
 #[derive(Clone, Debug, Default)]
 pub struct Lines {
     begun: Vec<u8>,
-    /// The rest of what has been given up, up to the next end of a line.
+    /// True while the rest of an overlong line is skipped, up to the next line end.
     overlong: bool,
 }
 
 impl Lines {
-    /// Takes bytes as they come, and returns what they bring to an end.
+    /// Adds bytes and returns the lines completed by them.
     pub fn take(&mut self, bytes: &[u8]) -> Vec<Gathered> {
         let mut gathered = Vec::new();
         for &byte in bytes {
@@ -29,7 +29,7 @@ impl Lines {
                 b'\r' | b'\n' if self.overlong => self.overlong = false,
                 b'\r' | b'\n' => {
                     let line = std::mem::take(&mut self.begun);
-                    // Blanks alone are no line either.
+                    // A line of blanks is ignored too.
                     if !line.trim_ascii().is_empty() {
                         gathered.push(Gathered::Line(text(&line)));
                     }
@@ -45,12 +45,12 @@ impl Lines {
         gathered
     }
 
-    /// Whether a line has begun and not ended.
+    /// Returns true if a line has begun and not ended.
     pub fn has_begun(&self) -> bool {
         !self.begun.is_empty()
     }
 
-    /// Gives up a line that has begun, and returns what there is of it.
+    /// Discards an incomplete line and returns its text so far.
     pub fn give_up(&mut self) -> Option<String> {
         self.overlong = false;
         let line = std::mem::take(&mut self.begun);
@@ -58,7 +58,7 @@ impl Lines {
     }
 }
 
-/// Bytes that are no text become a mark that no format has.
+/// Converts bytes to text; invalid bytes become a character that no format contains.
 fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }

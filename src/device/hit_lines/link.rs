@@ -1,7 +1,7 @@
 //! The port, and the thread that listens to it.
 //!
-//! A serial port can block where it should not, so it has a thread of its own, with a little runtime of its own. What had gathered before it
-//! was opened is read away: it was sent before anybody asked.
+//! A serial port can block unexpectedly, so it has its own thread with its own small runtime. Data received before the
+//! port was opened are discarded: nobody had requested them.
 
 use std::io;
 use std::sync::{Arc, Mutex};
@@ -18,16 +18,16 @@ use super::lines::Lines;
 use crate::error::DeviceError;
 use crate::modbus::Parity;
 
-/// A line that is not silent for so long is not going to be.
+/// Maximum time of waiting for silence; a line that sends for longer is an error.
 const LONGEST_DRAIN: Duration = Duration::from_secs(2);
 
-/// Where lines are heard.
+/// Source of the lines.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the fields are told above them")]
 pub enum HitLine {
-    /// A serial port: its name, bits a second, 7 or 8 data bits, parity, 1 or 2 stop bits.
+    /// Serial port: its name, bits a second, 7 or 8 data bits, parity, 1 or 2 stop bits.
     Serial { device: String, baud: u32, data_bits: u8, parity: Parity, stop_bits: u8 },
-    /// A terminal server.
+    /// Terminal server.
     Tcp { host: String, port: u16 },
 }
 
@@ -43,25 +43,25 @@ impl std::fmt::Display for HitLine {
 trait Source: AsyncRead + Send + Unpin {}
 impl<S: AsyncRead + Send + Unpin> Source for S {}
 
-/// How long to wait for what.
+/// Timeouts of the line.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Waits {
-    /// For the connection.
+    /// Timeout of the connection.
     pub(super) connect: Duration,
-    /// Of silence, after which what had gathered is read away.
+    /// Duration of silence that ends the discarding of data sent before the connection was used.
     pub(super) silence: Duration,
-    /// For the rest of a line.
+    /// Timeout of the rest of a line.
     pub(super) rest: Duration,
 }
 
-/// A thread that listens until this is dropped or the line is lost.
+/// Handle of a thread that listens until this is dropped or the line is lost.
 #[derive(Debug)]
 pub(super) struct Listener {
     _until: oneshot::Sender<()>,
 }
 
 impl Listener {
-    /// Opens the line, reads away what has gathered, and listens from then on.
+    /// Opens the line, discards the data that have gathered, and then listens.
     pub(super) async fn open(
         machine: &Arc<str>,
         line: HitLine,
@@ -152,7 +152,7 @@ async fn dial(line: &HitLine) -> io::Result<Box<dyn Source>> {
     }
 }
 
-/// Reads a line empty until it has been silent for a while.
+/// Discards incoming data until the line has been silent for `silence`.
 async fn drain(source: &mut dyn Source, silence: Duration) -> io::Result<()> {
     let until = Instant::now() + LONGEST_DRAIN;
     let mut bytes = [0; 512];

@@ -1,4 +1,4 @@
-//! What is to be touched, what was, and which touch a point is: that of the target to which it is nearest.
+//! List of targets and of touches. A point belongs to the nearest target.
 
 use std::time::Duration;
 
@@ -19,42 +19,42 @@ pub enum Repeated {
     Replace,
 }
 
-/// How touches are told from one another.
+/// Rules that distinguish touches.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Telling {
-    /// A point farther than this from every target is no touch of any.
+    /// Maximum distance of a point from its target, in mm; a point farther from every target belongs to none.
     pub(super) limit_mm: f64,
-    /// The same line within this is the same touch.
+    /// Time within which an identical line is the same touch.
     pub(super) double_within: Duration,
     pub(super) repeated: Repeated,
 }
 
-/// What is to be touched, and what was.
+/// List of targets and of their touches.
 #[derive(Clone, Debug)]
 pub(super) struct List {
-    /// Where a line is expected for each target; none where any points will do.
+    /// Expected position of each target; empty if any points are accepted.
     expected_mm: Vec<[f64; 3]>,
-    /// The numbers of the targets.
+    /// Indices of the targets.
     indices: Vec<u32>,
     points: Vec<Option<MeasuredPoint>>,
     telling: Telling,
-    /// The line before and when it came.
+    /// Previous line and its time.
     last: Option<(String, Duration)>,
 }
 
-/// What a good line is.
+/// Meaning of a valid line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Touch {
-    /// The first of this target.
+    /// First touch of this target.
     Of(u32),
-    /// Another of this target, in the place of the one before.
+    /// Repeated touch of this target, which replaces the earlier one.
     Again(u32),
-    /// The line before, sent twice.
+    /// Repetition of the previous line.
     Double,
 }
 
 impl List {
-    /// A list of the targets of a plan; of none where any points will do.
+    /// Creates a list of the targets of a plan; without targets if any points are accepted.
     pub(super) fn new(plan: &Plan, what: Coordinates, is_free: bool, telling: Telling) -> Self {
         let reach_mm = if what == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
         let targets = if is_free { &[][..] } else { &plan.targets[..] };
@@ -72,10 +72,10 @@ impl List {
         self.expected_mm.is_empty()
     }
 
-    /// Takes a point whose line came so long after the measurement began.
+    /// Assigns a point to its target. `came` is the time of its line since the measurement began.
     ///
     /// # Errors
-    /// What it is not, in words.
+    /// Returns the reason, as text, why the point is not a touch of a target.
     pub(super) fn take(&mut self, line: &str, at_mm: [f64; 3], came: Duration) -> Result<Touch, String> {
         let before = self.last.replace((line.to_owned(), came));
         let within = |at: Duration| came.saturating_sub(at) < self.telling.double_within;
@@ -115,22 +115,22 @@ impl List {
         away.min_by(|(_, a), (_, b)| a.total_cmp(b)).unwrap_or((0, f64::INFINITY))
     }
 
-    /// How many there are, and of how many; none of how many where any will do.
+    /// Returns the number of points and the number of targets; `None` for the latter if any points are accepted.
     pub(super) fn progress(&self) -> (usize, Option<usize>) {
         (self.points.iter().flatten().count(), (!self.is_free()).then_some(self.points.len()))
     }
 
-    /// Whether every target was touched.
+    /// Returns true if every target was touched.
     pub(super) fn is_whole(&self) -> bool {
         !self.is_free() && self.points.iter().all(Option::is_some)
     }
 
-    /// The numbers of the targets that are left.
+    /// Returns the indices of the remaining targets.
     pub(super) fn left(&self) -> impl Iterator<Item = u32> + '_ {
         self.indices.iter().zip(&self.points).filter(|(_, point)| point.is_none()).map(|(index, _)| *index)
     }
 
-    /// The points in the order of the plan; what was not touched was not found.
+    /// Returns the points in the order of the plan; a target that was not touched has the status not found.
     pub(super) fn points(&self) -> Vec<MeasuredPoint> {
         let missed = |k: usize| MeasuredPoint {
             index: self.indices.get(k).copied().unwrap_or_default(),
@@ -141,7 +141,7 @@ impl List {
         self.points.iter().enumerate().map(|(k, point)| point.unwrap_or_else(|| missed(k))).collect()
     }
 
-    /// The points from one on, up to the first that is missing.
+    /// Returns the points from `from` on, up to the first missing one.
     pub(super) fn ready(&self, from: usize) -> Vec<MeasuredPoint> {
         self.points.iter().skip(from).map_while(|point| *point).collect()
     }
@@ -156,7 +156,7 @@ pub(super) mod tests {
     use super::*;
     use crate::payload::{Target, TargetKind};
 
-    /// Targets on a line along x, 5 mm apart, on a plane that looks up.
+    /// Plan of targets on a line along x, 5 mm apart, on a plane that faces up.
     pub(in super::super) fn plan(targets: u32) -> Plan {
         let target = |k: u32| Target {
             index: 100 + k,
@@ -185,7 +185,7 @@ pub(super) mod tests {
     #[test]
     fn a_point_belongs_to_the_nearest_target_and_to_none_beyond_the_limit() {
         let mut list = List::new(&plan(3), Coordinates::Centres, false, TELLING);
-        // The centre of a ball of 1.5 mm.
+        // Centre of a ball of 1.5 mm radius.
         assert_eq!(list.take("a", [5.2, 0.1, 1.6], at(0)), Ok(Touch::Of(101)));
         assert!(list.take("b", [5.2, 0.1, 0.0], at(10)).unwrap_err().contains("target 101"));
         assert!(list.take("c", [12.5, 0.0, 1.5], at(20)).unwrap_err().contains("2.500 mm from target"));
@@ -197,7 +197,7 @@ pub(super) mod tests {
         assert_eq!((points[0].status, points[1].at_mm), (PointStatus::NotFound, [5.2, 0.1, 1.6]));
         assert_eq!(list.take("e", [0.0, 0.0, 1.5], at(40)), Ok(Touch::Of(100)));
         assert!(list.is_whole());
-        // Of contacts the radius is no part.
+        // Contact coordinates do not include the radius.
         let mut contacts = List::new(&plan(3), Coordinates::Contacts, false, TELLING);
         assert_eq!(contacts.take("a", [5.0, 0.0, 0.1], at(0)), Ok(Touch::Of(101)));
         assert!(contacts.take("b", [10.0, 0.0, 1.5], at(10)).is_err());
@@ -209,7 +209,7 @@ pub(super) mod tests {
         let centre = [0.0, 0.0, 1.5];
         assert_eq!(list.take("a", centre, at(0)), Ok(Touch::Of(100)));
         assert_eq!(list.take("a", centre, at(150)), Ok(Touch::Double));
-        // A line that comes again and again does not become a touch by its age.
+        // A line that is repeated again and again does not become a new touch by its age.
         assert_eq!(list.take("a", centre, at(300)), Ok(Touch::Double));
         let repeated = list.take("a", centre, at(600)).unwrap_err();
         assert!(repeated.contains("target 100 was touched before, 0.0000 mm"), "{repeated}");

@@ -1,11 +1,11 @@
-//! The measuring machine that prints hits, as the cell sees it: a person, or the machine's own part program, leads the probe by the list that
-//! this writes, and what comes is heard.
+//! The measuring machine that prints hits, as the cell sees it. This driver writes a list of targets; a person, or the
+//! machine's own part program, leads the probe by it; the driver receives the lines.
 //!
 //! ```text
-//!  START    the list is there, and lines are taken                                                    -> EXECUTE
-//!  EXECUTE  every target touched, and `done` said (or the time that the cell file gives for it)       -> COMPLETE
-//!           a line that is refused, HOLD, a lost line -> HOLDING;  `still` -> HELD;  RESUME -> EXECUTE
-//!  STOP and ABORT are asked of the person too
+//!  START    the list exists, and lines are accepted                                                   -> EXECUTE
+//!  EXECUTE  every target touched, and `done` confirmed (or the time in the cell file is over)         -> COMPLETE
+//!           a refused line, HOLD, a lost line -> HOLDING;  `still` -> HELD;  RESUME -> EXECUTE
+//!  STOP and ABORT: the person is asked too
 //! ```
 
 use std::path::{Path, PathBuf};
@@ -25,7 +25,7 @@ use crate::words::{
 };
 use regrind_formats::{AddedLines, FormatError, ResultFolder, write_atomic};
 
-/// A measuring machine that prints a line for each hit.
+/// Measuring machine that prints a line for each hit.
 #[derive(Debug)]
 pub struct HitLinesCmm {
     name: Arc<str>,
@@ -36,7 +36,7 @@ pub struct HitLinesCmm {
 }
 
 impl HitLinesCmm {
-    /// A machine; nothing is listened to yet.
+    /// Creates a machine; does not listen yet.
     pub fn new(settings: HitLinesSettings) -> Self {
         let hearing = Arc::new(Mutex::new(Hearing::new(settings.judging())));
         let name = format!("cmm by hit lines, {}", settings.line).into();
@@ -64,7 +64,10 @@ impl HitLinesCmm {
         DeviceError::NotTaken { machine: Arc::clone(&self.name), why: why.to_string() }
     }
 
-    /// Goes where a command leads from one of these states.
+    /// Changes the state to `to` and returns the status.
+    ///
+    /// # Errors
+    /// Refuses with [`Answer::WrongState`] if the current state is not in `from`.
     fn go(&self, command: Command, from: &[State], to: State) -> Answered<Status> {
         let mut hearing = locked(&self.hearing);
         if !from.contains(&hearing.state) {
@@ -75,7 +78,7 @@ impl HitLinesCmm {
         Ok(status_of(&hearing))
     }
 
-    /// What to do now, and what to type then.
+    /// Returns what to do now, and what to type then.
     fn prompt(&self, hearing: &Hearing) -> Vec<String> {
         let Some(asked) = &hearing.asked else { return Vec::new() };
         let folder = &self.settings.run_folder;
@@ -117,7 +120,7 @@ impl HitLinesCmm {
         }
     }
 
-    /// Ends the measurement by a person's word, and says what of it is kept.
+    /// Ends the measurement on a person's confirmation. Returns the files that are kept.
     fn take_done(&self, hearing: &mut Hearing) -> Result<Vec<String>, String> {
         let Some(asked) = &hearing.asked else { return Err("no measurement is asked for".to_owned()) };
         let (there, _) = asked.list.progress();
@@ -170,7 +173,7 @@ fn status_of(hearing: &Hearing) -> Status {
     }
 }
 
-/// The list and the lines of a job, in the folder of its run.
+/// Returns the path of the list of a job, relative to the folder of its run.
 fn plan_file(job: Job) -> String {
     format!("cycle-{}/plan{}.csv", job.number().cycle, of_batch(job))
 }
@@ -186,7 +189,7 @@ fn of_batch(job: Job) -> String {
     }
 }
 
-/// Writes the list into the folder of the run, and opens what lines are kept in.
+/// Writes the list into the folder of the run, and opens the file that stores the lines.
 fn write_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<AddedLines, FormatError> {
     let path = settings.run_folder.join(plan_file(job));
     ResultFolder::prepare(path.parent().unwrap_or(&settings.run_folder))?.keep();
@@ -195,7 +198,7 @@ fn write_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<Adde
     AddedLines::open(&settings.run_folder.join(hits_file(job)))
 }
 
-/// Writes the list where the machine's part program looks for it.
+/// Writes the list where the machine's part program reads it.
 fn show_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<(), FormatError> {
     let Some(folder) = &settings.plan_folder else { return Ok(()) };
     let text = plan_csv(&settings.part, job, &hex(&plan.identity()), plan);
@@ -215,13 +218,13 @@ impl Machine for HitLinesCmm {
     async fn connect(&mut self) -> Answered<Identity> {
         let lost = locked(&self.hearing).lost.is_some();
         if self.listener.is_none() || lost {
-            // A port that is open is nobody else's.
+            // Close the port first: an open port cannot be opened again.
             self.listener = None;
             let (line, waits) = (self.settings.line.clone(), self.settings.waits());
             let opened = Listener::open(&self.name, line, waits, Arc::clone(&self.hearing)).await?;
             self.listener = Some(opened);
         }
-        // A line that only prints does not tell who prints: what it is stands in the cell file alone.
+        // Printed lines do not identify the machine: only the cell file says what it is.
         let simulation = self.settings.simulated;
         Ok(Identity { simulation, ..Identity::by_person(MachineKind::Cmm, &self.name) })
     }
@@ -272,7 +275,7 @@ impl Machine for HitLinesCmm {
             };
             let now = tokio::time::Instant::now();
             (asked.begun, asked.last_line) = (now, now);
-            // Lines are taken before anybody can see the list.
+            // Lines are accepted before anybody can see the list.
             (hearing.state, hearing.clear) = (State::Execute, None);
             status_of(&hearing)
         };
@@ -283,7 +286,7 @@ impl Machine for HitLinesCmm {
             let shown =
                 shown.await.map_err(|e| self.not_taken(e)).and_then(|shown| shown.map_err(|e| self.not_taken(e)));
             if let Err(error) = shown {
-                // Nobody was shown anything.
+                // The list was shown to nobody.
                 locked(&self.hearing).state = State::Prepared;
                 return Err(error);
             }
@@ -316,7 +319,7 @@ impl Machine for HitLinesCmm {
                 locked(&self.hearing).forget();
                 self.go(Command::Stop, &[State::Prepared], State::Idle)
             }
-            // A person has confirmed that it stands.
+            // A person has confirmed that it does not move.
             State::Held => {
                 let mut hearing = locked(&self.hearing);
                 hearing.finish(Outcome::Stopped);
@@ -354,7 +357,7 @@ impl Machine for HitLinesCmm {
 
     async fn release(&mut self) -> Answered<Status> {
         let status = self.told()?;
-        // The thread ends, and the port is free for others.
+        // The thread ends and frees the port for other programs.
         self.listener = None;
         Ok(status)
     }
@@ -376,7 +379,7 @@ impl Machine for HitLinesCmm {
     }
 }
 
-/// Of the measurement of an interrupted run there is nothing here but its number.
+/// Returns an empty plan: of the measurement of an interrupted run only the number is known.
 fn no_plan() -> Plan {
     Plan {
         targets: Vec::new(),

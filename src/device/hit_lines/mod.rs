@@ -1,15 +1,17 @@
-//! Hit lines: a measuring machine or an arm that prints a line for each touch, on a serial port or through a terminal server, and hears nothing.
+//! Hit lines: driver of a measuring machine or an arm that prints a line for each touch, on a serial port or through a
+//! terminal server, and receives nothing.
 //!
 //! ```text
-//!  format    what a line says, in eight formats, without any wire
-//!  lines     bytes put together to lines
-//!  list      what is to be touched, what was, and which touch a line is
-//!  hearing   a measurement as far as lines have brought it: what each line does to it
+//!  format    content of a line, in eight formats, without any I/O
+//!  lines     splitting of bytes into lines
+//!  list      targets, touches, and the assignment of lines to targets
+//!  hearing   state of a measurement, and its change by each line
 //!  link      the port and the thread that listens to it
-//!  machine, settings   what the cell sees of it, and what its file says
+//!  machine, settings   the machine as the cell sees it, and its settings
 //! ```
 //!
-//! A person, or the machine's own part program, leads the probe; nothing is ever sent. docs/hit-lines.md is the page for the shop.
+//! A person, or the machine's own part program, leads the probe; nothing is ever sent. Page for the shop:
+//! docs/hit-lines.md.
 
 mod format;
 mod hearing;

@@ -1,4 +1,4 @@
-//! What a cell file says of a machine that prints hits, and the machine that is made of it.
+//! Settings of a machine that prints hits in a cell file, and the machine created from them.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -19,7 +19,7 @@ use regrind_document::Document;
 use regrind_formats::Unit;
 use regrind_formats::result::Coordinates;
 
-/// The device of a simulated cell that stands for a pseudo-terminal, which is made at the start.
+/// Device name in a simulated cell for a pseudo-terminal that is created at the start.
 const AUTO: &str = "auto";
 
 /// A line for each hit, from a measuring machine or an arm that hears nothing.
@@ -168,42 +168,42 @@ impl Default for HitLinesWire {
     }
 }
 
-/// Everything that has to be known to hear a machine that prints hits.
+/// Settings for a machine that prints hits.
 #[derive(Clone, Debug)]
 pub struct HitLinesSettings {
-    /// The part, as prompts call it.
+    /// Name of the part in prompts.
     pub part: String,
-    /// The folder of the run.
+    /// Folder of the run.
     pub run_folder: PathBuf,
-    /// Where a part program looks for the list.
+    /// Folder in which a part program reads the list.
     pub plan_folder: Option<PathBuf>,
-    /// Where lines are heard.
+    /// Source of the lines.
     pub line: HitLine,
-    /// How lines are read.
+    /// Parameters of the parsing of lines.
     pub reading: Reading,
-    /// What the coordinates are.
+    /// Meaning of the coordinates: centres of the probe, or contacts.
     pub what: Coordinates,
-    /// Where the rotary table has to stand, and within what.
+    /// Required angle of the rotary table and its tolerance, in degrees.
     pub rotary_deg: [f64; 2],
-    /// A point farther than this from every target is none.
+    /// Maximum distance of a point from its target, in mm.
     pub limit_mm: f64,
-    /// The same line within this is the same touch.
+    /// Time within which an identical line is the same touch.
     pub double_within: Duration,
-    /// What becomes of a second touch of a target.
+    /// Handling of a second touch of a target.
     pub repeated: Repeated,
-    /// For the rest of a line.
+    /// Timeout of the rest of a line.
     pub line_within: Duration,
-    /// Beginnings of lines that mean nothing.
+    /// Beginnings of lines that are ignored.
     pub passed_over: Vec<String>,
-    /// So long after the last point the probe is clear of the part; none where a person says so.
+    /// Time after the last point at which the probe is clear of the part; `None` if a person confirms it.
     pub clear_after: Option<Duration>,
-    /// Where any number of points will do: the least of them.
+    /// Minimum number of points, if any points are accepted.
     pub free_points: Option<usize>,
-    /// For the connection.
+    /// Timeout of the connection.
     pub connect_within: Duration,
-    /// Of silence, after which what had gathered is read away.
+    /// Duration of silence that ends the discarding of data sent before the connection was used.
     pub silence: Duration,
-    /// Whether the cell is a simulation.
+    /// True if the cell is a simulation.
     pub simulated: bool,
 }
 
@@ -262,7 +262,7 @@ impl Wired for HitLinesWire {
             plan_folder,
             line: self.line(),
             reading: self.reading(),
-            // A cell file that does not say it is refused.
+            // A cell file without this key is refused.
             what: self.what.unwrap_or(Coordinates::Centres),
             rotary_deg: [self.rotary_deg, self.rotary_tolerance_deg],
             limit_mm: self.limit_mm,
@@ -288,7 +288,7 @@ impl Wired for HitLinesWire {
 }
 
 impl HitLinesWire {
-    /// Where lines are heard.
+    /// Returns the source of the lines.
     pub fn line(&self) -> HitLine {
         let Self { device, host, port, .. } = self.clone();
         match (device, host) {
@@ -303,7 +303,7 @@ impl HitLinesWire {
         }
     }
 
-    /// Whether its far end has no name before it is simulated in this process.
+    /// Returns true if the name of the other end is only known once it is simulated in this process.
     pub fn is_open(&self) -> bool {
         match self.line() {
             HitLine::Serial { device, .. } => device == AUTO,
@@ -311,10 +311,10 @@ impl HitLinesWire {
         }
     }
 
-    /// How lines are read.
+    /// Returns the parameters of the parsing of lines.
     pub fn reading(&self) -> Reading {
         Reading {
-            // A cell file that does not say it is refused.
+            // A cell file without this key is refused.
             format: self.format.unwrap_or(LineFormat::Decimal),
             separator: self.separator,
             mark: if self.decimal == Mark::Comma { ',' } else { '.' },

@@ -1,37 +1,38 @@
-//! Commands: written by the client strictly, and read as a server reads them.
+//! Commands of I++ DME: the client writes them strictly and reads them as a server does.
 
 use std::fmt;
 
 use super::grammar;
 use super::text::{Flaw, Item, Reader, Strictness, Tag, arguments, has_stray_blank, list};
 
-/// The most characters of a line, its end left out.
+/// Maximum number of characters in a line, without the line end.
 pub const LONGEST_LINE: usize = 65_536;
 
-/// A command without its tag.
+/// Command without its tag.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Command {
-    /// Its name, such as `PtMeas`.
+    /// Name of the command, for example `PtMeas`.
     pub name: String,
-    /// What stands in its parentheses.
+    /// Arguments in its parentheses.
     pub arguments: Vec<Item>,
 }
 
 impl Command {
-    /// A command.
+    /// Creates a command from its name and arguments.
     pub fn new(name: &str, arguments: Vec<Item>) -> Self {
         Self { name: name.to_owned(), arguments }
     }
 
-    /// Whether it is carried out while others run: its name ends in a capital E.
+    /// Returns true if the server carries it out while other commands run: the name of an event command ends in a
+    /// capital E.
     pub fn is_event(&self) -> bool {
         self.name.ends_with('E')
     }
 
-    /// Reads a line without its end, as strictly as a server must.
+    /// Parses a line without its line end, as strictly as a server must. Returns the tag and the command.
     ///
     /// # Errors
-    /// The number with which a server refuses it.
+    /// Returns the error number of the standard with which a server refuses the line.
     pub fn read(line: &str) -> Result<(Tag, Self), Flaw> {
         if line.len() > LONGEST_LINE {
             return Err(Flaw { number: 8, why: "a line of more than 65536 characters" });
@@ -70,7 +71,7 @@ impl Command {
         Ok(Self::new(name, reader.in_parentheses()?))
     }
 
-    /// Writes the line, its end too.
+    /// Returns the line with its tag and its line end.
     pub fn line(&self, tag: Tag) -> String {
         format!("{tag} {self}\r\n")
     }
@@ -82,7 +83,7 @@ impl fmt::Display for Command {
     }
 }
 
-/// Parts the tag from what it is the tag of.
+/// Splits a line into its tag and the rest after the blank.
 fn tagged(line: &str) -> Result<(Tag, &str), Flaw> {
     let illegal = Flaw { number: 1, why: "a tag that is none" };
     let tag = line.get(..5).and_then(Tag::read).ok_or(illegal)?;

@@ -1,4 +1,5 @@
-//! What each command may be asked with. A server refuses the rest by number; a client that keeps to it is refused by none.
+//! Grammar of the arguments of each command. A server refuses other arguments by error number; a client that follows
+//! the grammar is not refused for its arguments.
 
 use super::command::Command;
 use super::text::{Flaw, Item, Tag, arguments, bad};
@@ -8,38 +9,38 @@ const CSYS: &[&str] = &["JogDisplayCsy", "JogMoveCsy", "MoveableMachineCsy", "Mu
 const COORDINATES: &[&str] = &["MachineCsy", "MoveableMachineCsy", "MultipleArmCsy", "PartCsy"];
 const PARAMETERS: &[&str] = &["Accel", "Speed", "Approach", "Search", "Retract"];
 
-/// What the parentheses of a command hold.
+/// Shape of the arguments of a command.
 enum Shape {
     Nothing,
-    /// So many numbers, or one of two counts, and which of them must be positive or whole besides.
+    /// Numbers: the allowed counts, and which of the numbers must be positive or also whole.
     Numbers(&'static [usize], &'static [Wanted]),
-    /// One string.
+    /// String.
     Text,
-    /// One positive number.
+    /// Positive number.
     Positive,
-    /// One whole number.
+    /// Whole number.
     Whole,
-    /// The tag of an event command.
+    /// Tag of an event command.
     Daemon,
     /// One of these names.
     OneOf(&'static [&'static str]),
     /// The frame and six numbers.
     Transformation,
-    /// Properties asked for, each once.
+    /// Requested properties, each once.
     Asked(&'static [&'static str]),
-    /// The same, with a time and a distance.
+    /// Requested properties, with a time and a distance.
     Daemonised,
     /// Axes with values.
     Axes,
-    /// A point to be touched.
+    /// Point to touch.
     Touch,
-    /// Properties of tools: one to be told of its parts, several to be told or set.
+    /// Properties of tools: enumerate the parts of one, read several, set several.
     Enumerated,
     Told,
     Set,
 }
 
-/// What one of the numbers must be.
+/// Condition on one of the numbers, by index: `Positive`, or `Through` (positive and whole).
 enum Wanted {
     Positive(usize),
     Through(usize),
@@ -82,7 +83,7 @@ const COMMANDS: &[(&str, Shape)] = &[
     ("IsUserEnabled", Nothing),
     ("LockAxis", Asked(&["X", "Y", "Z", "R", "C", "Phi", "A", "B"])),
     ("OnMoveReportE", Daemonised),
-    // A quality came with a later version than this grammar's, 1.4.
+    // The quality came with a later version than 1.4, the version of this grammar.
     ("OnPtMeasReport", Asked(&["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C", "ER", "IJK"])),
     ("OnScanReport", Asked(&["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C", "ER", "IJK", "Q"])),
     ("PtMeas", Touch),
@@ -108,17 +109,20 @@ const COMMANDS: &[(&str, Shape)] = &[
     ("TiltPart", Numbers(&[4], &[])),
 ];
 
-/// The names of all commands.
+/// Returns the names of all commands.
 pub(super) fn names() -> impl Iterator<Item = &'static str> {
     COMMANDS.iter().map(|(name, _)| *name)
 }
 
-/// Whether there is such a command.
+/// Returns true if a command of this name exists.
 pub(super) fn is_known(name: &str) -> bool {
     names().any(|known| known == name)
 }
 
-/// Refuses what a command may not be asked with.
+/// Checks the arguments of a command.
+///
+/// # Errors
+/// Returns the error with which a server refuses the arguments.
 pub(super) fn check(command: &Command) -> Result<(), Flaw> {
     let Some((_, shape)) = COMMANDS.iter().find(|(name, _)| *name == command.name) else {
         return Err(Flaw { number: 507, why: "a command that nobody knows" });
@@ -192,7 +196,7 @@ fn transformation(items: &[Item]) -> Result<(), Flaw> {
     }
 }
 
-/// Holds properties to be of the right kind, and each to stand there once.
+/// Checks that every property is of the right kind and occurs once.
 fn properties(items: &[Item], fits: &dyn Fn(&str, &[Item]) -> bool) -> Result<(), Flaw> {
     if items.is_empty() {
         return Err(arguments("it has at least one argument"));
@@ -243,7 +247,8 @@ fn touch(items: &[Item]) -> Result<(), Flaw> {
 
 // ---- properties of tools --------------------------------------------------------------------------------------------------------
 
-/// A name with a comma and nothing behind it is refused as a property without its parentheses.
+/// Returns the error for a trailing comma: a name, then a comma with nothing after it, is refused as a property without
+/// parentheses. Otherwise returns `otherwise`.
 fn trailing(items: &[Item], otherwise: Flaw) -> Result<(), Flaw> {
     match items {
         [.., Item::Name(_), Item::Nothing] => Err(bad("a property ends with its parentheses")),

@@ -1,7 +1,8 @@
-//! The measuring machine behind a server of I++ DME, as the cell sees it.
+//! The measuring machine of an I++ DME server, as the cell sees it.
 //!
-//! The server keeps no job. What a job has brought is in this driver, and outlives the connection: met again, the machine stands, and the job is
-//! held until it is resumed, which touches what is left. It does not outlive this program.
+//! The server stores no job. This driver stores the results of a job, and they outlive the connection: after a
+//! reconnect the machine is stopped, and the job is held until it is resumed. The resumed job measures the remaining
+//! targets. The results do not outlive this program.
 
 use std::sync::{Arc, Mutex};
 
@@ -25,10 +26,10 @@ use crate::words::{
 use crate::{Dial, Line};
 use regrind_formats::result::Coordinates;
 
-/// What a server calls its class that is simulated.
+/// Word in the machine class of a simulated server.
 const SIMULATED: &str = "Simulated";
 
-/// A measuring machine behind a server of I++ DME.
+/// Measuring machine of an I++ DME server.
 #[derive(Debug)]
 pub struct IppdmeCmm {
     name: Arc<str>,
@@ -36,25 +37,25 @@ pub struct IppdmeCmm {
     shared: Arc<Mutex<Shared>>,
     aborts: watch::Sender<u64>,
     wish: watch::Sender<Wish>,
-    /// The task that owns the session; none where there is no session.
+    /// Order channel of the task that owns the session; `None` without a session.
     orders: Option<mpsc::Sender<Order>>,
     identity: Option<Identity>,
     kept: Kept<Work>,
-    /// What the running or prepared job is about.
+    /// Work and plan identity of the running or prepared job.
     work: Option<(Arc<Work>, [u8; 32])>,
     dial: Box<dyn Dial>,
-    /// Whether what takes its while to compute is done in turn with everything else.
+    /// True if long computations run in turn with everything else, not on a thread of their own.
     in_turn: bool,
 }
 
 impl IppdmeCmm {
-    /// A machine; nothing is asked of it yet.
+    /// Creates a machine; sends nothing to it yet.
     pub fn new(settings: IppdmeSettings) -> Self {
         Self::by(settings, Box::new(OfThisComputer), false)
     }
 
-    /// A machine whose connections somebody else opens, and beside which no thread computes: for servers that stand in the same process, and
-    /// for time that does not pass by itself.
+    /// Creates a machine that opens its connections with `dial` and computes on no other thread: for servers in the
+    /// same process, and for simulated time.
     pub fn over(settings: IppdmeSettings, dial: Box<dyn Dial>) -> Self {
         Self::by(settings, dial, true)
     }
@@ -75,12 +76,13 @@ impl IppdmeCmm {
         }
     }
 
-    /// Opens a session and proves whose it is. When it is open nothing moves: a server ends what it is at first, or aborts it where an abort
-    /// was ordered that no session has taken. What a job of ours has left may move for as long as one that nobody looks at.
+    /// Opens a session and checks the identity of the machine. When the session is open, nothing moves: the server
+    /// first finishes its current command, or aborts it if an abort was ordered that no session has sent. A motion left
+    /// from our own job may last at most `silence_limit`.
     async fn open(&mut self) -> Answered<Identity> {
         let state = locked(&self.shared).state;
         let moved = state.moves() || self.kept.untold.is_some();
-        // One that nobody has confirmed is given anew.
+        // An abort that nobody has confirmed is sent again.
         let aborted = self.aborts.borrow().saturating_sub(u64::from(state == State::Aborting));
         let line = Line::Tcp { host: self.settings.host.clone(), port: self.settings.port };
         let (machine, aborts) = (Arc::clone(&self.name), self.aborts.subscribe());
@@ -145,7 +147,7 @@ impl IppdmeCmm {
         })
     }
 
-    /// Holds what the machine calls itself against the cell file.
+    /// Checks the machine class against the cell file: simulated or real, and the expected name.
     fn is_meant(&self, class: &str) -> Answered<()> {
         let machine = || Arc::clone(&self.name);
         let simulation = class.contains(SIMULATED);
@@ -169,7 +171,7 @@ impl IppdmeCmm {
         }
     }
 
-    /// What is known of the machine; what went wrong with its wire, where there is none.
+    /// Returns the status known so far, or the error of the connection if there is none.
     fn told(&self) -> Answered<Status> {
         let shared = locked(&self.shared);
         if let Some(error) = &shared.lost {
@@ -199,7 +201,10 @@ impl IppdmeCmm {
         DeviceError::Refused { machine: Arc::clone(&self.name), command, answer, state }
     }
 
-    /// Goes where a command leads from one of these states.
+    /// Changes the state to `to` and returns the status.
+    ///
+    /// # Errors
+    /// Refuses with [`Answer::WrongState`] if the current state is not in `from`.
     fn go(&self, command: Command, from: &[State], to: State) -> Answered<Status> {
         self.told()?;
         let mut shared = locked(&self.shared);
@@ -218,7 +223,7 @@ impl IppdmeCmm {
         orders.send(order).await.map_err(|_| locked(&self.shared).lost.clone().unwrap_or(gone))
     }
 
-    /// Proves that the server answers. While something moves the task that moves it sees to that.
+    /// Checks that the server answers. While something moves, the task that owns the session does this check.
     async fn look(&self) -> Answered<()> {
         self.told()?;
         if locked(&self.shared).state.moves() {
@@ -226,7 +231,7 @@ impl IppdmeCmm {
         }
         let (answer, looked) = oneshot::channel();
         self.order(Order::Look(answer)).await?;
-        // An answer that does not come has made the session lost.
+        // A missing answer has already marked the session as lost.
         let _ = looked.await;
         self.told().map(drop)
     }
@@ -256,7 +261,7 @@ impl Machine for IppdmeCmm {
     }
 
     async fn connect(&mut self) -> Answered<Identity> {
-        // A server has one client: a session that is whole stays.
+        // A server has one client: an intact session is kept.
         let whole = self.identity.clone().filter(|_| self.orders.is_some());
         if let Some(identity) = whole
             && self.look().await.is_ok()
@@ -316,7 +321,7 @@ impl Machine for IppdmeCmm {
         let status = self.go(Command::Start, &[State::Prepared], State::Execute)?;
         self.kept.begun = start_sequence;
         if let Err(error) = self.order(Order::Run(work)).await {
-            // Nobody took it: nothing was sent.
+            // The task did not take the order: nothing was sent.
             locked(&self.shared).state = State::Prepared;
             return Err(error);
         }
@@ -343,7 +348,7 @@ impl Machine for IppdmeCmm {
 
     async fn stop(&mut self) -> Answered<Status> {
         if let Some(untold) = self.kept.untold.take() {
-            // The session is open, so it stands.
+            // The session is open, so the machine is stopped.
             self.told()?;
             let mut shared = locked(&self.shared);
             (shared.job, shared.state, shared.outcome) = (Some(untold), State::Complete, Outcome::Stopped);
@@ -374,11 +379,11 @@ impl Machine for IppdmeCmm {
             shared.job = shared.job.or(untold);
             (shared.state, shared.outcome) = (State::Aborting, Outcome::Aborted);
         }
-        // Whoever owns the session sends it at once, within whatever it waits for.
+        // The owner of the session sends it at once, whatever it waits for.
         self.aborts.send_modify(|ordered| *ordered += 1);
         let lost = locked(&self.shared).lost.is_some();
         if lost || self.orders.is_none() {
-            // A session begins when what the server was at is over.
+            // A new session begins only after the server has finished its current command.
             self.connect().await?;
         }
         self.told()
@@ -408,7 +413,7 @@ impl Machine for IppdmeCmm {
 
     async fn release(&mut self) -> Answered<Status> {
         let status = self.told()?;
-        // The task ends the session when nobody is left to give it orders.
+        // The task ends the session when no sender of orders is left.
         self.orders = None;
         Ok(status)
     }
@@ -442,7 +447,7 @@ impl Cmm for IppdmeCmm {
         let (owned, volume_mm, machine) = (plan.clone(), self.settings.volume_mm, Arc::clone(&self.name));
         let scan = self.settings.scan;
         let find = move || Route::over(&owned, scan, &volume_mm, &machine).map(|route| Work { plan: owned, route });
-        // The order of many targets takes its while.
+        // Ordering many targets takes time.
         let work = match self.in_turn {
             true => find(),
             false => {

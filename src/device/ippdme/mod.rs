@@ -1,14 +1,15 @@
-//! I++ DME over TCP: a measuring machine whose server keeps no job, so that this program carries out the plan, touch by touch.
+//! I++ DME over TCP: driver of a measuring machine whose server stores no job. This program carries out the plan, touch
+//! by touch.
 //!
 //! ```text
 //!  text, command, grammar, response   the lines, without any wire
-//!  session                            one command after another, and the abort that waits for none
-//!  route                              the way over the targets, held against the volume before the first motion
-//!  work, scan                         a job, carried out by the task that owns the session: touches, and rows that are scanned
-//!  machine, settings                  what the cell sees of it, and what its file says
+//!  session                            commands one after another, and the abort, which waits for none
+//!  route                              the route over the targets, checked against the volume before the first motion
+//!  work, scan                         execution of a job by the task that owns the session: touches and scanned rows
+//!  machine, settings                  the machine as the cell sees it, and its settings
 //! ```
 //!
-//! docs/ippdme.md is the page for the shop.
+//! Page for the shop: docs/ippdme.md.
 
 mod command;
 mod grammar;
@@ -28,7 +29,7 @@ pub use session::Limits;
 pub use settings::{IppdmeSettings, IppdmeWire, Scanning};
 pub use text::{Flaw, Item, Tag, number};
 
-/// The name of a command, for messages that keep no strings.
+/// Returns the static name of a command, for messages that hold no owned strings; `"a command"` for an unknown name.
 fn known(name: &str) -> &'static str {
     grammar::names().find(|known| *known == name).unwrap_or("a command")
 }

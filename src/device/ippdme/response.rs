@@ -1,46 +1,48 @@
-//! Answers: read by their meaning, for servers differ in everything that the standard shows by example only.
+//! Answers of a server, parsed leniently by their meaning: servers differ in everything that the standard shows by
+//! example only.
 
 use std::fmt;
 
 use super::text::{Flaw, Item, Reader, Strictness, Tag};
 
-/// A line of a server.
+/// Line from a server.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Response {
-    /// Whose answer it is.
+    /// Tag of the command that it answers.
     pub tag: Tag,
-    /// What it says.
+    /// Content of the line.
     pub said: Said,
 }
 
-/// What a line of a server says.
+/// Content of a line from a server.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Said {
-    /// The command is in the queue.
+    /// Acknowledgement: the command is in the queue.
     Acknowledged,
     /// Data of the command.
     Data(Vec<Item>),
-    /// Something went wrong.
+    /// Error or warning.
     Error(ServerError),
-    /// The command is over.
+    /// End of the command.
     Complete,
 }
 
-/// An error as the server gives it. Its number is what counts; severity and text differ between servers.
+/// Error as the server reports it. Only its number is reliable; severity and text differ between servers.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServerError {
-    /// 0 information, 1 warning, 2 the client can go on, 3 an operator is needed, 9 the server is done.
+    /// Severity: 0 information, 1 warning, 2 the client can continue, 3 an operator is needed, 9 the server cannot
+    /// continue.
     pub severity: u8,
-    /// Its number.
+    /// Error number of the standard.
     pub number: u16,
-    /// What caused it.
+    /// Cause.
     pub cause: String,
-    /// In the server's words.
+    /// Text in the server's words.
     pub text: String,
 }
 
 impl ServerError {
-    /// Whether it stops nothing.
+    /// Returns true if the severity is below 2: it stops nothing.
     pub fn is_warning(&self) -> bool {
         self.severity < 2
     }
@@ -54,10 +56,10 @@ impl fmt::Display for ServerError {
 }
 
 impl Response {
-    /// Reads a line without its end.
+    /// Parses a line without its line end.
     ///
     /// # Errors
-    /// A line that means nothing.
+    /// Returns an error if the line is not a valid answer.
     pub fn read(line: &str) -> Result<Self, Flaw> {
         let none = |why| Flaw { number: 8, why };
         let tag = line.get(..5).and_then(Tag::read).ok_or(none("no tag"))?;
@@ -76,7 +78,7 @@ impl Response {
 
 fn data(text: &str) -> Result<Vec<Item>, Flaw> {
     let mut reader = Reader::new(text, Strictness::Lenient);
-    // A list in parentheses without a name is a list.
+    // A list in parentheses may come without a name.
     if reader.eat('(') {
         let items = reader.in_parentheses()?;
         return ended(reader, items);
@@ -90,7 +92,7 @@ fn ended(mut reader: Reader<'_>, items: Vec<Item>) -> Result<Vec<Item>, Flaw> {
     if whole { Ok(items) } else { Err(Flaw { number: 8, why: "something stands between the data" }) }
 }
 
-/// Reads `Error(severity, number, cause, text)`; cause and text with their quotes or without, and with anything in them.
+/// Parses `Error(severity, number, cause, text)`. Cause and text may lack their quotes and may contain any characters.
 fn error(text: &str) -> Option<ServerError> {
     let inside = text.trim().strip_prefix("Error")?.trim_start().strip_prefix('(')?;
     let inside = inside.trim_end().strip_suffix(')').unwrap_or(inside);
@@ -98,7 +100,7 @@ fn error(text: &str) -> Option<ServerError> {
     let severity = parts.next()?.parse().ok().filter(|severity| *severity < 10)?;
     let number = parts.next()?.parse().ok().filter(|number| *number < 10_000)?;
     let rest = parts.next().unwrap_or_default();
-    // The text is the last string, or what stands behind the last comma.
+    // The text is the last quoted string, or everything after the last comma.
     let (cause, text) = match rest.strip_suffix('"').and_then(|rest| rest.rsplit_once('"')) {
         Some((cause, text)) => (cause.trim_end().trim_end_matches(','), text),
         None => rest.rsplit_once(',').unwrap_or(("", rest)),
@@ -107,7 +109,7 @@ fn error(text: &str) -> Option<ServerError> {
     Some(ServerError { severity, number, cause: bare(cause), text: bare(text) })
 }
 
-/// The number of a property among data, whatever its place; none where it is not there, or there twice.
+/// Returns the number of a property in the data, at any position; `None` if the property is missing or occurs twice.
 pub fn value(data: &[Item], name: &str) -> Option<f64> {
     match &values(data, name)?[..] {
         [Item::Number(value)] => Some(*value),
@@ -115,7 +117,7 @@ pub fn value(data: &[Item], name: &str) -> Option<f64> {
     }
 }
 
-/// What stands in the parentheses of a property among data.
+/// Returns the items in the parentheses of a property in the data; `None` if it is missing or occurs twice.
 pub fn values(data: &[Item], name: &str) -> Option<Vec<Item>> {
     let mut found = data.iter().filter_map(|item| match item {
         Item::Call(called, values) if called == name => Some(values),
@@ -165,7 +167,8 @@ mod tests {
     }
 
     proptest::proptest! {
-        /// Whatever a server sends, no reader falls over it, and what is read as a command is written as one.
+        /// No line from a server makes a parser panic. A line that parses as a command is written back as the same
+        /// command.
         #[test]
         fn any_line_is_read_or_refused(line in "([0-9E]{5} [&#!%]? ?)?[A-Za-z0-9().,+\\-\" E]{0,60}|\\PC{0,40}") {
             let _ = Response::read(&line);

@@ -1,5 +1,5 @@
-//! The way over the targets: from touch to touch over a plane above them all, in an order that makes the way short, and every position
-//! held against the volume of the machine before the first motion.
+//! Route over the targets. The probe travels from touch to touch in a plane above all targets, in an order that makes
+//! the way short. Every position is checked against the machine's volume before the first motion.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -8,43 +8,44 @@ use super::settings::Scanning;
 use crate::error::DeviceError;
 use crate::payload::{Plan, Target, TargetKind};
 
-/// More targets than this are touched in the order of the plan: their order would take longer to find than it saves.
+/// Maximum number of targets that are reordered. More targets are touched in the plan's order: the search for a better
+/// order would take longer than it saves.
 const MOST_ORDERED: usize = 6000;
-/// A normal that points further down than this cannot be come at from above.
+/// Minimum z component of a normal. A target whose normal points further down is not reachable from above.
 const LEAST_UP: f64 = -0.2;
-/// Targets of one scan: its line stays within what servers read.
+/// Maximum number of targets in one scan, so that its line is not too long for servers.
 const MOST_SCANNED: usize = 400;
-/// A scan is carried out whole, so a hold waits for it.
+/// Maximum duration of a scan, in s. A scan cannot be interrupted, so a hold waits for its end.
 const LONGEST_SCAN_S: f64 = 30.0;
-/// Fewer targets than this in a row are touched.
+/// Minimum number of targets in a scan; a shorter row is touched.
 const LEAST_SCANNED: usize = 4;
-/// A curve that turns by more than this from step to step is two; the cosine of 45 degrees.
+/// Minimum cosine between two successive steps of a scan (45 degrees). A row that turns by more is split.
 const LEAST_AHEAD: f64 = 0.707;
 
-/// What is done between two rises to the clearance: places in the plan.
+/// Part of the route between two rises to the clearance height, with indices into the plan.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Leg {
     Touch(usize),
     Scan(Range<usize>),
 }
 
-/// The way over the targets of a plan.
+/// Route over the targets of a plan.
 #[derive(Clone, Debug)]
 pub(super) struct Route {
-    /// What is touched and scanned, one after another.
+    /// Touches and scans, in order.
     pub(super) legs: Vec<Leg>,
-    /// The height at which the probe's centre travels.
+    /// Height at which the probe's centre travels, in mm.
     pub(super) clearance_mm: f64,
-    /// How long the way is across, in this order and in that of the plan.
+    /// Length of the horizontal way in this order and in the plan's order, in m.
     pub(super) travel_m: f64,
     pub(super) plain_m: f64,
 }
 
 impl Route {
-    /// Finds the way; with a step, rows of targets that lie no farther apart are scanned.
+    /// Finds the route. With `scan`, rows of targets no farther apart than its step are scanned.
     ///
     /// # Errors
-    /// A target that cannot be come at from above, or a position outside of the volume.
+    /// Returns an error for a target that is not reachable from above, or for a position outside of the volume.
     pub(super) fn over(
         plan: &Plan,
         scan: Option<Scanning>,
@@ -67,7 +68,7 @@ impl Route {
 }
 
 impl Leg {
-    /// The targets that it brings.
+    /// Returns the range of targets that this part measures.
     pub(super) fn targets(&self) -> Range<usize> {
         match self {
             Self::Touch(k) => *k..k + 1,
@@ -76,8 +77,8 @@ impl Leg {
     }
 }
 
-/// Parts a plan, in its own order, into rows that are scanned and targets that are touched: a careful beginning, the reference sphere, and what
-/// lies in no row.
+/// Splits a plan, in its own order, into rows that are scanned and targets that are touched. Touched are the slow first
+/// targets of a careful plan, the reference sphere, and targets in no row.
 fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
     let careful = plan.careful.map_or(0, |careful| careful.targets as usize).min(plan.targets.len());
     let mut legs: Vec<Leg> = (0..careful).map(Leg::Touch).collect();
@@ -94,7 +95,7 @@ fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
     legs
 }
 
-/// Where the row ends that begins here.
+/// Returns the end of the row that begins at `from`, exclusive.
 fn row_end(plan: &Plan, from: usize, scan: Scanning) -> usize {
     let targets = &plan.targets[from..plan.targets.len().min(from + MOST_SCANNED)];
     let step = |k: usize| -> [f64; 3] {
@@ -113,12 +114,12 @@ fn row_end(plan: &Plan, from: usize, scan: Scanning) -> usize {
     from + 1 + (1..targets.len()).take_while(|k| goes_on(k)).count()
 }
 
-/// Where the probe's centre turns into the normal.
+/// Returns the position of the probe's centre at which it turns into the normal of the target.
 pub(super) fn approach(target: &Target, plan: &Plan) -> [f64; 3] {
     along(target, plan.approach_mm + plan.probe_radius_mm)
 }
 
-/// A place on the normal of a target.
+/// Returns the point on the normal of a target at a distance of `mm` from the surface.
 pub(super) fn along(target: &Target, mm: f64) -> [f64; 3] {
     std::array::from_fn(|k| target.point_mm[k] + mm * target.normal[k])
 }
@@ -161,7 +162,8 @@ fn check(
     Ok(())
 }
 
-/// The order of the touches. A careful beginning stays one, and the reference sphere is not mixed with the part.
+/// Returns the order of the touches. The slow first targets of a careful plan stay first, and the reference sphere is
+/// not mixed with the part.
 fn order(plan: &Plan) -> Vec<usize> {
     let mut order: Vec<usize> = (0..plan.targets.len()).collect();
     if plan.targets.len() > MOST_ORDERED {
@@ -178,8 +180,8 @@ fn order(plan: &Plan) -> Vec<usize> {
     order
 }
 
-/// Orders a stretch of the way: to the nearest neighbour, then improved by turning stretches round and by moving short ones. The plan's own
-/// order stays where that is the shorter way.
+/// Orders a stretch of the way by nearest neighbour, then improves it by 2-opt and Or-opt. The plan's own order,
+/// improved or not, is kept if it gives the shorter way.
 fn shorten(plan: &Plan, order: &mut [usize], stretch: Range<usize>) {
     let begin = stretch.start.checked_sub(1).map(|k| place(plan, order[k]));
     let targets = &mut order[stretch];
@@ -214,7 +216,7 @@ fn nearest(places: &[[f64; 2]], begin: Option<[f64; 2]>) -> Vec<usize> {
     order
 }
 
-/// Two-opt and Or-opt over the near neighbours of each stop, until neither shortens the way.
+/// Improves an order by 2-opt and Or-opt over the nearest neighbours of each stop, until neither shortens the way.
 fn improve(places: &[[f64; 2]], order: &mut [usize]) {
     const PASSES: usize = 30;
     if order.len() < 4 {
@@ -232,13 +234,13 @@ fn improve(places: &[[f64; 2]], order: &mut [usize]) {
     }
 }
 
-/// A way that is being made shorter. Its first stop stays, for the way to it is not known here.
+/// Way that is being shortened. Its first stop stays first, because the way to it is not known here.
 struct Tour<'a> {
     places: &'a [[f64; 2]],
     order: &'a mut [usize],
-    /// Where in the order each stop is.
+    /// Position of each stop in the order.
     at: Vec<usize>,
-    /// The nearest other stops of each, the nearest first.
+    /// Nearest other stops of each stop, nearest first.
     near: Vec<Vec<usize>>,
 }
 
@@ -260,7 +262,7 @@ impl<'a> Tour<'a> {
         apart(self.places[a], self.places[b])
     }
 
-    /// The way between two stops; none where there is no second one.
+    /// Returns the distance between two stops; 0 without a second stop.
     fn to(&self, a: usize, b: Option<&usize>) -> f64 {
         b.map_or(0.0, |b| self.apart(a, *b))
     }
@@ -270,7 +272,7 @@ impl<'a> Tour<'a> {
         self.note(stretch);
     }
 
-    /// Turns round what lies behind a stop so that one of its neighbours comes next.
+    /// Reverses a stretch after a stop so that one of its neighbours comes next, if that shortens the way.
     fn turn_behind(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         let Some(&next) = self.order.get(i + 1) else { return false };
@@ -290,7 +292,8 @@ impl<'a> Tour<'a> {
         false
     }
 
-    /// Turns round what lies before a stop so that one of its neighbours comes just before.
+    /// Reverses a stretch before a stop so that one of its neighbours comes directly before it, if that shortens the
+    /// way.
     fn turn_before(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         if i < 2 {
@@ -315,7 +318,8 @@ impl<'a> Tour<'a> {
         false
     }
 
-    /// Carries a stretch of one to three stops, which begins with this one, behind a neighbour of it.
+    /// Moves a stretch of one to three stops that begins with this stop to directly after one of its neighbours, if
+    /// that shortens the way (Or-opt).
     fn carry(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         for size in 1..=3 {
@@ -350,7 +354,7 @@ impl<'a> Tour<'a> {
     }
 }
 
-/// The nearest other places, the nearest first.
+/// Returns the nearest other places, nearest first.
 fn neighbours(places: &[[f64; 2]], of: usize) -> Vec<usize> {
     const NEAR: usize = 10;
     let mut others: Vec<usize> = (0..places.len()).filter(|k| *k != of).collect();
@@ -413,7 +417,7 @@ mod tests {
         Arc::from("cmm")
     }
 
-    /// A grid whose points come shuffled.
+    /// Plan of a grid with its points in shuffled order.
     fn shuffled() -> Plan {
         plan((0..100).map(|k| (k * 37) % 100).map(|k| [f64::from(k % 10), f64::from(k / 10), 0.0]))
     }
@@ -447,7 +451,7 @@ mod tests {
 
     #[test]
     fn rows_are_scanned_and_the_rest_is_touched() {
-        // Two careful ones, a row of eight there and one back, a lonely target, and three of a sphere.
+        // Two careful targets, a row of eight and a row of eight back, a single target, and three of a sphere.
         let row = |y: f64, there: bool| (0..8).map(move |k| [f64::from(if there { k } else { 7 - k }), y, 0.0]);
         let spread = [[30.0, 0.0, 0.0], [40.0, 9.0, 0.0]].into_iter();
         let points = spread.chain(row(0.0, true)).chain(row(2.0, false)).chain([[60.0, 0.0, 0.0]]);
@@ -458,7 +462,7 @@ mod tests {
         let touched = |targets: Range<usize>| targets.map(Leg::Touch);
         let rows = [Leg::Scan(2..10), Leg::Scan(10..18)];
         assert_eq!(route.legs, touched(0..2).chain(rows).chain(touched(18..22)).collect::<Vec<_>>());
-        // A step that is shorter than that of the rows scans nothing, and the way is as short as without.
+        // A scan step shorter than that of the rows scans nothing, and the way is as short as without scanning.
         let [none, short] = [None, scanning(0.4)].map(|scan| Route::over(&plan, scan, &VOLUME, &machine()).unwrap());
         assert_eq!(short.legs, none.legs);
     }
@@ -468,7 +472,7 @@ mod tests {
         let plan = plan((0..1000).map(|k| [0.01 * f64::from(k), 0.0, 0.0]));
         let route = Route::over(&plan, scanning(1.0), &VOLUME, &machine()).unwrap();
         assert_eq!(route.legs, [Leg::Scan(0..400), Leg::Scan(400..800), Leg::Scan(800..1000)]);
-        // At 1 mm/s none may be longer than 30 mm.
+        // At 1 mm/s no scan may be longer than 30 mm.
         let plan = super::tests::plan((0..80).map(|k| [f64::from(k), 0.0, 0.0]));
         let route = Route::over(&plan, scanning(1.0), &VOLUME, &machine()).unwrap();
         assert_eq!(route.legs, [Leg::Scan(0..31), Leg::Scan(31..62), Leg::Scan(62..80)]);

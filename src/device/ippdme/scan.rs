@@ -1,8 +1,10 @@
-//! Rows of targets that are passed over in contact: one command a row, and a point at each target.
+//! Scanning of rows of targets: the probe passes over them in contact. One command for each row, one point at each
+//! target.
 //!
-//! A server says the points of a scan as bare numbers, in lines of any length, while the probe goes on. They are taken when it has said that the
-//! scan is over, all or none: as many as there are targets, each at its own target. Some servers say a quality that nobody asked for; where
-//! it stands is found by where the points lie.
+//! A server reports the points of a scan as bare numbers, in lines of any length, while the probe moves. They are
+//! evaluated after the server has reported the end of the scan, all or none: as many points as targets, each at its own
+//! target. Some servers add a quality that was not requested; its position among the numbers is found from the
+//! positions of the points.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -15,15 +17,16 @@ use super::work::{MISSES, Work, Worker, distance, locked};
 use crate::error::DeviceError;
 use crate::payload::{MeasuredPoint, Plan, PointStatus, Target};
 
-/// A curve that is straight is told as one of this radius.
+/// Radius of curvature sent for a straight curve, in mm.
 const STRAIGHT_MM: f64 = 1e4;
 
 impl Worker {
-    /// Has the server scan as the plan needs it: speed, retract, and points at the targets.
+    /// Configures the server for scanning: speed, retract, and points at the targets. Does nothing if the cell does not
+    /// scan, or if the tool radius is unknown: then rows are touched.
     pub(super) async fn set_up_scans(&mut self, work: &Work) -> Result<(), Failure> {
         let Some(scan) = self.settings.scan else { return Ok(()) };
         if locked(&self.shared).radius_mm.is_none() {
-            // A point of a scan does not tell it either.
+            // A point of a scan does not report the radius either.
             self.session
                 .note("it does not tell the radius of its tool, so rows are touched and not scanned".to_owned());
             return Ok(());
@@ -32,14 +35,14 @@ impl Worker {
         self.speeds_mm_s[2] = self.set(&wanted).await?[0];
         self.session.ask("OnScanReport", ["X", "Y", "Z"].map(Item::asked).to_vec()).await?;
         let hint = [work.plan.search_mm, smallest_radius_mm(work)].map(Item::Number).to_vec();
-        // What only makes it faster is not in every server.
+        // The hint only makes the scan faster, and not every server supports it.
         self.ask_if_there("ScanOnCurveHint", hint).await?;
         self.session.ask("ScanOnCurveDensity", vec![Item::with("AtNominals", 1.0)]).await?;
         Ok(())
     }
 
-    /// Scans a row; false where the probe lost the surface or met it elsewhere, or nobody knows its radius: the targets have to be touched one by
-    /// one.
+    /// Scans a row. Returns false if the tool radius is unknown, or if the probe lost the surface or met it elsewhere:
+    /// then the targets must be touched one by one.
     pub(super) async fn scan(&mut self, work: &Work, row: Range<usize>) -> Result<bool, Failure> {
         if locked(&self.shared).radius_mm.is_none() {
             return Ok(false);
@@ -70,10 +73,10 @@ impl Worker {
         Ok(is_there)
     }
 
-    /// Takes the numbers of a scan as its points, if they can be that.
+    /// Returns the numbers of a scan as measured points, one for each target, if they are plausible.
     fn scanned(&self, work: &Work, targets: &[Target], data: &[Vec<Item>]) -> Result<Vec<MeasuredPoint>, Failure> {
         let mut lines: Vec<&Vec<Item>> = data.iter().collect();
-        // A line that comes twice is one: the probe is nowhere twice.
+        // A repeated line counts once: the probe is never at one place twice.
         lines.dedup();
         let numbers: Option<Vec<f64>> = lines.iter().flat_map(|line| line.iter()).map(Item::number).collect();
         let width = numbers.as_ref().map_or(0, |numbers| numbers.len() / targets.len());
@@ -99,7 +102,8 @@ impl Worker {
             .collect())
     }
 
-    /// Holds every point of a row against its target: no farther than the probe may search, and aside by no more than half of the way to the next.
+    /// Checks every point of a row against its target: no farther away than the probe may search, and sideways no
+    /// farther than half of the distance to the nearest neighbour in the row.
     fn hold_row(&self, work: &Work, targets: &[Target], places: &[[f64; 3]]) -> Result<(), Failure> {
         for (k, (target, at_mm)) in targets.iter().zip(places).enumerate() {
             self.hold_place(work, target, *at_mm)?;
@@ -122,7 +126,8 @@ fn is_missed(error: &ServerError) -> bool {
     MISSES.contains(&error.number)
 }
 
-/// The curve through these targets: open, with the normal of each, all of them on the surface.
+/// Returns the arguments for a scan of the curve through these targets: open, with the normal of each target, all on
+/// the surface.
 fn curve(targets: &[Target]) -> Vec<Item> {
     let call = |name: &str, items: Vec<Item>| Item::Call(name.to_owned(), items);
     let mut format = ["X", "Y", "Z", "IJK"].map(Item::asked).to_vec();
@@ -132,7 +137,7 @@ fn curve(targets: &[Target]) -> Vec<Item> {
     vec![Item::with("Closed", 0.0), call("Format", format), call("Data", data)]
 }
 
-/// How far a place lies from the normal of a target.
+/// Returns the distance of a place from the normal of a target, in mm.
 fn aside(target: &Target, plan: &Plan, at_mm: [f64; 3]) -> f64 {
     let centre = along(target, plan.probe_radius_mm);
     let off: [f64; 3] = std::array::from_fn(|k| at_mm[k] - centre[k]);
@@ -140,7 +145,8 @@ fn aside(target: &Target, plan: &Plan, at_mm: [f64; 3]) -> f64 {
     (0..3).map(|k| (off[k] - along_mm * target.normal[k]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// The smallest radius of curvature along the rows, by how much the normal turns from target to target.
+/// Returns the smallest radius of curvature along the rows, in mm, estimated from the change of the normal between
+/// neighbouring targets; at most `STRAIGHT_MM`.
 fn smallest_radius_mm(work: &Work) -> f64 {
     let rows = work.route.legs.iter().filter_map(|leg| if let Leg::Scan(row) = leg { Some(row.clone()) } else { None });
     let pairs = rows.flat_map(|row| work.plan.targets[row].windows(2));

@@ -1,7 +1,8 @@
-//! A session with a server: one command after another, each to its end, and an abort that waits for none.
+//! Session with a server: one command after another, each to its end, and an abort that waits for no command.
 //!
-//! The next command goes out when the last one is over. Lines are held to their tags: what belongs to a command that is over, or to none
-//! that was given, becomes no value. The standard has no time-outs and no sign of life, so both are made here.
+//! The next command is sent when the last one is over. Tags link answers to commands: a line of a finished command, or
+//! of one that was never sent, is not used as a value. The standard has no timeouts and no keep-alive, so this module
+//! adds both.
 
 use std::collections::VecDeque;
 use std::fmt::Debug;
@@ -18,44 +19,45 @@ use super::text::{Item, Tag};
 use crate::error::DeviceError;
 use crate::{Dial, Line};
 
-/// How long to wait for what.
+/// Timeouts and intervals of a session.
 #[derive(Clone, Copy, Debug)]
 pub struct Limits {
-    /// For the connection, and for the acknowledgement of a command.
+    /// Timeout of the connection, and of the acknowledgement of a command.
     pub answer: Duration,
-    /// For the end of a command, over the time that its motion takes.
+    /// Timeout of the end of a command, in addition to the time that its motion takes.
     pub completion: Duration,
-    /// For the end of an abort.
+    /// Timeout of the end of an abort.
     pub abort: Duration,
-    /// Between two tries to go on after an abort that the server has acknowledged and not digested.
+    /// Delay between two retries to clear the errors after an abort that the server has acknowledged but not yet
+    /// processed.
     pub after_abort: Duration,
-    /// Of silence while something moves, after which the server is asked whether it is alive.
+    /// Duration of silence during a command after which the client checks whether the server is alive.
     pub alive: Duration,
 }
 
-/// So often is a server asked to forget its errors after an abort.
+/// Number of attempts to clear the server's errors after an abort.
 const CLEARING_TRIES: u32 = 20;
-/// Messages are for a person: the last ones.
+/// Number of notes kept for a person: the last ones.
 const NOTES: usize = 8;
 
-/// Why a command came to nothing.
+/// Reason why a command failed.
 #[derive(Debug)]
 pub(super) enum Failure {
-    /// The wire failed, or what came over it; the session is not to be used any more.
+    /// The connection failed, or the data on it are invalid; the session must not be used any more.
     Link(DeviceError),
-    /// The server said no.
+    /// The server refused the command or reported an error.
     No(ServerError),
-    /// It was aborted, and the server has forgotten its errors.
+    /// The command was aborted, and the server has cleared its errors.
     Aborted,
-    /// What it said cannot be.
+    /// The answer is not plausible.
     Wrong(DeviceError),
 }
 
-/// A wire to a server.
+/// Byte stream to a server.
 pub(super) trait Stream: AsyncRead + AsyncWrite + Debug + Send + Unpin {}
 impl<S: AsyncRead + AsyncWrite + Debug + Send + Unpin> Stream for S {}
 
-/// A session with a server.
+/// Session with a server.
 #[derive(Debug)]
 pub(super) struct Session {
     pub(super) machine: Arc<str>,
@@ -64,35 +66,36 @@ pub(super) struct Session {
     limits: Limits,
     last: u32,
     last_event: u16,
-    /// Aborts that were ordered and those that were carried out.
+    /// Number of aborts ordered, and (`aborted`) number of aborts sent.
     aborts: watch::Receiver<u64>,
     aborted: u64,
     notes: VecDeque<String>,
 }
 
-/// What came of a command.
+/// Answer to a command.
 #[derive(Debug, Default)]
 pub(super) struct Answer {
-    /// The data, a list for each line.
+    /// Data, one list for each line.
     pub(super) data: Vec<Vec<Item>>,
-    /// What the server had to say besides.
+    /// Warnings of the server.
     pub(super) warnings: Vec<ServerError>,
 }
 
 impl Answer {
-    /// The number of a property in the one line of data there is.
+    /// Returns the number of a property in the only line of data.
     pub(super) fn value(&self, name: &str) -> Option<f64> {
         value(self.line()?, name)
     }
 
-    /// The one line of data there is; one that came twice alike is one.
+    /// Returns the only line of data; identical repeated lines count as one. `None` if there is no line, or if lines
+    /// differ.
     pub(super) fn line(&self) -> Option<&[Item]> {
         let (first, rest) = self.data.split_first()?;
         rest.iter().all(|other| other == first).then_some(first)
     }
 }
 
-/// How far a command is.
+/// Progress of a command.
 struct Pending<'a> {
     tag: Tag,
     command: &'a Command,
@@ -102,7 +105,7 @@ struct Pending<'a> {
 }
 
 impl Session {
-    /// Opens the connection; nothing is said yet.
+    /// Opens the connection; sends nothing yet.
     pub(super) async fn dial(
         machine: Arc<str>,
         (line, dial): (&Line, &mut dyn Dial),
@@ -115,7 +118,7 @@ impl Session {
         Ok(Self::on(aborted, Arc::clone(&machine), Box::new(stream), limits, aborts))
     }
 
-    /// A session that has so many aborts behind it; one that was ordered since goes out first.
+    /// Creates a session after `aborted` aborts; an abort ordered since then is sent first.
     fn on(
         aborted: u64,
         machine: Arc<str>,
@@ -127,10 +130,12 @@ impl Session {
         Self { machine, stream, unread, limits, last: 0, last_event: 0, aborts, aborted, notes }
     }
 
-    /// Begins a session anew, whatever the server was at: it ends the one that may be left over, and that waits for its motion. A server in
-    /// an error, or in a session that it did not end for one, is tried again when it has forgotten that.
+    /// Starts a new session, whatever the server is doing. It first ends a session that may be left over, and waits for
+    /// its motion. If the server refuses because it is in an error state or a session, its errors are cleared and the
+    /// start is retried once.
     ///
-    /// What a job of ours has left that moves comes to its end, unless an abort was ordered or it moves for longer than `ours_within`.
+    /// A motion left from our own job runs to its end, unless an abort was ordered or the motion lasts longer than
+    /// `ours_within`.
     pub(super) async fn open(&mut self, ours_within: Option<Duration>) -> Result<(), Failure> {
         const LEFT_OVER: [u16; 4] = [8, 507, 508, 514];
         if self.is_abort_ordered() {
@@ -161,12 +166,12 @@ impl Session {
         Ok(())
     }
 
-    /// Asks without any motion.
+    /// Sends a command without motion and waits for its end.
     pub(super) async fn ask(&mut self, name: &str, arguments: Vec<Item>) -> Result<Answer, Failure> {
         self.move_by(name, arguments, Duration::ZERO).await
     }
 
-    /// Asks for what takes so long by its motion, and waits for its end.
+    /// Sends a command whose motion takes at most `motion`, and waits for its end.
     pub(super) async fn move_by(
         &mut self,
         name: &str,
@@ -200,7 +205,7 @@ impl Session {
                 if Instant::now() >= due || asked_alive.is_some_and(|(_, limit)| Instant::now() >= limit) {
                     return Err(Failure::Link(self.timed_out(pending.command, began.elapsed())));
                 }
-                // Its answer is awaited beside that of the command.
+                // This answer is awaited in parallel with the answer to the command.
                 let (tag, limit) = (self.next_event(), Instant::now() + self.limits.answer);
                 self.write(&Command::new("GetErrStatusE", Vec::new()), tag).await.map_err(Failure::Link)?;
                 (asked_alive, alive_at) = (Some((tag, limit)), limit);
@@ -213,7 +218,7 @@ impl Session {
                     return Ok(answer);
                 }
                 due = match (&pending.error, pending.acknowledged) {
-                    // A command that failed moves no more.
+                    // A command that failed does not move any more.
                     (Some(_), _) | (None, false) => Instant::now() + self.limits.answer,
                     (None, true) => began + self.limits.answer + motion + self.limits.completion,
                 };
@@ -225,7 +230,7 @@ impl Session {
         }
     }
 
-    /// Takes a line of the command itself; an answer where it is over.
+    /// Processes a line of the command itself. Returns the answer if the command is over.
     fn take(&mut self, pending: &mut Pending<'_>, said: Said) -> Result<Option<Answer>, Failure> {
         match said {
             Said::Acknowledged => pending.acknowledged = true,
@@ -247,7 +252,7 @@ impl Session {
         Ok(None)
     }
 
-    /// Takes a line that is not of the command: the server's own, or late ones of commands that are over.
+    /// Processes a line of another tag: a message of the server itself, or a late line of a finished command.
     fn beside(&mut self, response: Response) -> Result<(), Failure> {
         match (response.tag, response.said) {
             (Tag::UNASKED, Said::Error(error)) if !is_passing(&error) => Err(Failure::No(error)),
@@ -267,7 +272,7 @@ impl Session {
     }
 
     fn was_given(&self, number: u32) -> bool {
-        // Tags begin anew after 99999; those before are long over.
+        // Tags restart after 99999; commands with earlier tags are long over.
         number != 0 && (number <= self.last || number > 99_999 - 1_000 && self.last < 1_000)
     }
 
@@ -303,7 +308,7 @@ impl Session {
         *self.aborts.borrow() > self.aborted
     }
 
-    /// Waits until an abort is ordered, or nobody is left to order one.
+    /// Waits until an abort is ordered; waits forever if nobody is left to order one.
     pub(super) fn abort_ordered(&self) -> impl Future<Output = ()> + Send + use<> {
         let (mut aborts, aborted) = (self.aborts.clone(), self.aborted);
         async move {
@@ -313,7 +318,8 @@ impl Session {
         }
     }
 
-    /// Aborts what runs and waits, and makes the server ready again. [`Failure::Aborted`] where it did so.
+    /// Aborts the running and waiting commands and makes the server ready again. Returns [`Failure::Aborted`] on
+    /// success.
     pub(super) async fn abort(&mut self) -> Failure {
         self.aborted = *self.aborts.borrow();
         match self.aborts_now().await {
@@ -327,12 +333,13 @@ impl Session {
         self.clear_errors(CLEARING_TRIES).await
     }
 
-    /// Sends the abort and waits for its end. A server without a session may have nothing to abort.
+    /// Sends the abort and waits for its end. With `may_refuse`, an error answer is accepted: a server without a
+    /// session may have nothing to abort.
     async fn send_abort(&mut self, may_refuse: bool) -> Result<(), Failure> {
         let (command, tag) = (Command::new("AbortE", Vec::new()), self.next_event());
         self.write(&command, tag).await.map_err(Failure::Link)?;
         let over = Instant::now() + self.limits.abort;
-        // Nothing else may be said before it is over; what its victims still say is theirs.
+        // Nothing else is sent before the abort is over. Lines of the aborted commands are ignored.
         loop {
             let line = tokio::select! {
                 biased;
@@ -352,7 +359,8 @@ impl Session {
         }
     }
 
-    /// Has the server forget its errors. One that has acknowledged an abort may need a while until it does.
+    /// Clears the errors of the server, with up to `tries` attempts. A server that has acknowledged an abort may need
+    /// some time until it accepts this.
     pub(super) async fn clear_errors(&mut self, tries: u32) -> Result<(), Failure> {
         for left in (0..tries).rev() {
             match Box::pin(self.ask("ClearAllErrors", Vec::new())).await {
@@ -394,19 +402,20 @@ impl Session {
     }
 }
 
-/// Whether an error stops nothing. Servers may change the severity of an error; those that stop a machine are known by their numbers.
+/// Returns true if an error stops nothing. Servers may change the severity of an error, so errors that stop a machine
+/// are recognised by their numbers.
 fn is_passing(error: &ServerError) -> bool {
     error.is_warning() && !matches!(error.number, 6 | 500 | 503 | 1000..=1009 | 1500..=1503 | 2500..=2506)
 }
 
-/// Reads a line; what was read of it is kept where this is given up.
+/// Reads a line. If the future is dropped, the bytes already read stay in `unread`.
 async fn read_line(stream: &mut Box<dyn Stream>, unread: &mut Vec<u8>) -> std::io::Result<String> {
     loop {
         if let Some(end) = unread.iter().position(|b| *b == b'\n') {
             let line: Vec<u8> = unread.drain(..=end).collect();
             let text = line.strip_suffix(b"\n").unwrap_or(&line);
             let text = text.strip_suffix(b"\r").unwrap_or(text);
-            // Texts of errors come in the server's own language.
+            // Texts of errors can be in the server's own language, with other characters.
             let text: String = text.iter().map(|b| if (32..=126).contains(b) { char::from(*b) } else { '?' }).collect();
             if text.is_empty() {
                 continue;

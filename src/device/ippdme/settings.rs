@@ -1,4 +1,4 @@
-//! What a cell file says of a server of I++ DME, and the machine that is made of it.
+//! Settings of an I++ DME server in a cell file, and the machine created from them.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -83,43 +83,43 @@ impl Default for IppdmeWire {
     }
 }
 
-/// Everything that has to be known to drive a server of I++ DME.
+/// Settings that drive an I++ DME server.
 #[derive(Clone, Debug)]
 pub struct IppdmeSettings {
     /// Name or address of the server.
     pub host: String,
-    /// Its port.
+    /// Port of the server.
     pub port: u16,
-    /// The tool, as the server calls it.
+    /// Name of the tool, as the server calls it.
     pub tool: String,
-    /// By how much its radius may differ from the plan's.
+    /// Maximum difference between the tool radius and the plan's, in mm.
     pub probe_tolerance_mm: f64,
-    /// Speed of travel between targets.
+    /// Speed of travel between targets, in mm/s.
     pub travel_speed_mm_s: f64,
-    /// Speed of scanning, and the farthest from target to target within a scan; none where every target is touched.
+    /// Speed and maximum step of scans; `None` if every target is touched.
     pub scan: Option<Scanning>,
-    /// The part's frame; none for the machine's own.
+    /// Frame of the part; `None` for the machine's own.
     pub part_frame: Option<[f64; 6]>,
     /// How often a target is tried again that was missed.
     pub retries: u8,
-    /// The least and the largest corner of the box that the probe's centre must not leave.
+    /// Minimum and maximum corner of the box that the probe's centre must not leave, in mm.
     pub volume_mm: [[f64; 3]; 2],
-    /// How long to wait for what.
+    /// Timeouts of the session.
     pub limits: Limits,
-    /// Without a look at the status, after which a job holds by itself.
+    /// Time without a status request after which a job holds by itself.
     pub silence_limit: Duration,
-    /// What the machine must call itself.
+    /// Expected name of the machine.
     pub expected_name: Option<String>,
-    /// Whether it has to be a simulation, or must not be one.
+    /// True if the machine must be a simulation, false if it must be real.
     pub simulated: bool,
 }
 
-/// How rows of targets are scanned.
+/// Parameters of the scanning of rows of targets.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Scanning {
-    /// Speed along the surface.
+    /// Speed along the surface, in mm/s.
     pub speed_mm_s: f64,
-    /// The farthest from one target to the next.
+    /// Maximum distance from one target to the next, in mm.
     pub step_mm: f64,
 }
 
@@ -198,7 +198,7 @@ impl IppdmeWire {
         let host = &self.host;
         let is_here = host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
         if host.is_empty() {
-            // Told by the schema.
+            // The schema reports this.
         } else if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
             let allowed = "it must be a name or an address alone, such as \"192.168.0.20\"";
             document.report(&place.key("wire.host"), format!("is {host:?}"), allowed, "the port has a key of its own");
@@ -218,7 +218,7 @@ impl IppdmeWire {
     }
 }
 
-/// The name by which messages call a machine.
+/// Returns the name of a machine in messages.
 pub(super) fn name(settings: &IppdmeSettings) -> Arc<str> {
     format!("cmm at {}:{} (I++ DME)", settings.host, settings.port).into()
 }

@@ -1,26 +1,26 @@
-//! What lines of I++ DME are made of: tags, numbers, strings, names, and what stands in parentheses.
+//! Elements of the lines of I++ DME: tags, numbers, strings, names, and lists in parentheses.
 
 use std::fmt::{self, Write as _};
 
-/// The most digits that a number may have.
+/// Maximum number of digits of a number.
 const MOST_DIGITS: usize = 16;
-/// Parentheses in parentheses: the standard has two.
+/// Maximum depth of nested parentheses; the standard uses two.
 const DEEPEST: u32 = 8;
 
-/// What holds an answer to its question.
+/// Tag that links an answer to its command.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Tag {
-    /// Of a command that waits its turn: 1 to 99999.
+    /// Tag of a command that waits in the queue: 1 to 99999.
     Command(u32),
-    /// Of a command that is carried out while others run: 1 to 9999; 0 is the server's own.
+    /// Tag of a command that runs while others run: 1 to 9999. 0 is for the server's own messages.
     Event(u16),
 }
 
 impl Tag {
-    /// What the server says without being asked.
+    /// Tag of messages that the server sends unasked.
     pub const UNASKED: Self = Self::Event(0);
 
-    /// Reads the five characters of a tag.
+    /// Parses the five characters of a tag; `None` if they are not a tag.
     pub fn read(text: &str) -> Option<Self> {
         let digits = |text: &str| text.bytes().all(|b| b.is_ascii_digit()).then(|| text.parse().ok()).flatten();
         match text.strip_prefix('E') {
@@ -40,54 +40,54 @@ impl fmt::Display for Tag {
     }
 }
 
-/// Why a line is refused: the number of the standard that a server answers, and what is wrong.
+/// Reason why a line is refused: the error number of the standard that a server answers, and a text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Flaw {
-    /// The number.
+    /// Error number of the standard.
     pub number: u16,
-    /// In words.
+    /// Explanation in words.
     pub why: &'static str,
 }
 
-/// Incorrect arguments.
+/// Returns the error "incorrect arguments" (502).
 pub(super) const fn arguments(why: &'static str) -> Flaw {
     Flaw { number: 502, why }
 }
 
-/// A bad argument.
+/// Returns the error "bad argument" (509).
 pub(super) const fn bad(why: &'static str) -> Flaw {
     Flaw { number: 509, why }
 }
 
-/// What stands between two commas.
+/// Argument or data item, between two commas.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Item {
-    /// A finite number.
+    /// Finite number.
     Number(f64),
-    /// A string, without its quotes.
+    /// String, without its quotes.
     Text(String),
-    /// The tag of an event command, which names a daemon.
+    /// Tag of an event command, which identifies a daemon.
     Tag(Tag),
-    /// A name alone, such as `PartCsy`.
+    /// Name alone, for example `PartCsy`.
     Name(String),
-    /// A name, dots in it or not, and what stands in its parentheses: `Tool.PtMeasPar.Speed(4)`.
+    /// Name, with or without dots, and the items in its parentheses: `Tool.PtMeasPar.Speed(4)`.
     Call(String, Vec<Item>),
-    /// Nothing: a comma with nothing behind it.
+    /// Empty item: nothing follows a comma.
     Nothing,
 }
 
 impl Item {
-    /// A property with one number, such as `X(1.5)`.
+    /// Creates a property with one number, for example `X(1.5)`.
     pub fn with(name: &str, value: f64) -> Self {
         Self::Call(name.to_owned(), vec![Self::Number(value)])
     }
 
-    /// A property that is asked for, such as `X()`.
+    /// Creates a request for a property, for example `X()`.
     pub fn asked(name: &str) -> Self {
         Self::Call(name.to_owned(), Vec::new())
     }
 
-    /// The number that it is.
+    /// Returns the number, or `None` if the item is not a number.
     pub fn number(&self) -> Option<f64> {
         if let Self::Number(value) = self { Some(*value) } else { None }
     }
@@ -106,7 +106,7 @@ impl fmt::Display for Item {
     }
 }
 
-/// Items as they stand in parentheses.
+/// Formats items as they appear in parentheses, separated by a comma and a blank.
 pub(super) fn list(items: &[Item]) -> String {
     let mut text = String::new();
     for (k, item) in items.iter().enumerate() {
@@ -116,29 +116,29 @@ pub(super) fn list(items: &[Item]) -> String {
     text
 }
 
-/// Writes a number with 16 digits at most, leading zeros counted: a strict server counts them.
+/// Formats a number with at most 16 digits, leading zeros included, because a strict server counts them too.
 pub fn number(value: f64) -> String {
     let value = if value == 0.0 { 0.0 } else { value };
     let digits = |text: &str| text.bytes().filter(u8::is_ascii_digit).count();
     let short = format!("{value:e}");
     let mantissa = |text: &str| digits(text.split('e').next().unwrap_or(text));
     let short = if mantissa(&short) > MOST_DIGITS { format!("{value:.15e}") } else { short };
-    // What was rounded to sixteen digits is written out from these.
+    // The plain form is written from the value rounded to 16 digits.
     let plain = short.parse::<f64>().map_or(String::new(), |rounded| rounded.to_string());
     let is_plain = !plain.is_empty() && digits(&plain) <= MOST_DIGITS;
     if is_plain { plain } else { short.replace('e', "E") }
 }
 
-/// How exactly a line is held to the grammar.
+/// Strictness with which a line is checked against the grammar.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Strictness {
-    /// As a server must.
+    /// Strict, as a server must be.
     Strict,
-    /// Where only the meaning counts: blanks anywhere between two things, numbers of any length.
+    /// Lenient: allows blanks between any two elements, and numbers of any length.
     Lenient,
 }
 
-/// Reads items, one character after another.
+/// Parser of items, character by character.
 pub(super) struct Reader<'a> {
     rest: &'a str,
     strictness: Strictness,
@@ -170,7 +170,7 @@ impl<'a> Reader<'a> {
         after.is_some()
     }
 
-    /// Reads what stands in parentheses, behind the opening one.
+    /// Parses the items in parentheses and the closing parenthesis; the opening one is already consumed.
     pub(super) fn in_parentheses(&mut self) -> Result<Vec<Item>, Flaw> {
         if self.eat(')') {
             return Ok(Vec::new());
@@ -179,7 +179,7 @@ impl<'a> Reader<'a> {
         if self.eat(')') { Ok(items) } else { Err(arguments("something stands where a comma or ) should")) }
     }
 
-    /// Reads items with commas between them.
+    /// Parses items separated by commas.
     pub(super) fn items(&mut self) -> Result<Vec<Item>, Flaw> {
         let mut items = vec![self.item()?];
         while self.eat(',') {
@@ -266,7 +266,8 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// Tells where a blank stands that the grammar does not have: within a name or a number, or between two things without a comma.
+/// Returns true if a blank is at a position that the grammar does not allow: within a name or a number, or between two
+/// items without a comma.
 pub(super) fn has_stray_blank(text: &str) -> bool {
     let (mut before, mut quoted, mut blank) = ('(', false, false);
     for c in text.chars() {

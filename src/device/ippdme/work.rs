@@ -1,5 +1,5 @@
-//! A job, carried out: this program is what other machines have within. One task owns the session; hold, stop and abort are seen between
-//! two commands, and an abort within one.
+//! Execution of a job. Other machines execute a job in their controller; here this program does. One task owns the
+//! session. It checks for hold, stop and abort between two commands, and for abort also within a command.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -16,24 +16,25 @@ use crate::error::DeviceError;
 use crate::payload::{MeasuredPoint, Plan, PointStatus, Target};
 use crate::words::{Fault, Job, Outcome, State};
 
-/// Errors of a touch after which the next may be well: no touch, an illegal one, no surface.
+/// Server errors of a touch that do not end the job: the next touch can succeed. Unexpected contact, illegal touch, no
+/// surface found.
 pub(super) const MISSES: [u16; 3] = [1001, 1003, 1006];
-/// So many targets that cannot be reached mean that the part lies elsewhere.
+/// Number of targets not reached at which the job fails: the part lies elsewhere.
 const UNREACHED_MOST: u32 = 3;
-/// What a server that lacks a method or a property answers.
+/// Error numbers of a server that lacks a method or a property.
 const LACKING: [u16; 6] = [501, 502, 505, 506, 509, 510];
-/// The farthest that a tool changer and a reference point are away, in time.
+/// Time limits of a tool change and of homing, for their motion.
 const CHANGE: Duration = Duration::from_secs(180);
 const HOMING: Duration = Duration::from_secs(300);
 
-/// What a job is about.
+/// Plan of a job and its route.
 #[derive(Debug)]
 pub(super) struct Work {
     pub(super) plan: Plan,
     pub(super) route: Route,
 }
 
-/// What is to become of the job at the next safe place.
+/// Request to the task, which it obeys at the next safe place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Wish {
     GoOn,
@@ -41,7 +42,7 @@ pub(super) enum Wish {
     Stop,
 }
 
-/// What the task is told to do.
+/// Order to the task that owns the session.
 #[derive(Debug)]
 pub(super) enum Order {
     Run(Arc<Work>),
@@ -49,7 +50,7 @@ pub(super) enum Order {
     Look(oneshot::Sender<()>),
 }
 
-/// What the task and the machine's driver share.
+/// State that the task and the machine's driver share.
 #[derive(Debug)]
 pub(super) struct Shared {
     pub(super) state: State,
@@ -57,15 +58,15 @@ pub(super) struct Shared {
     pub(super) outcome: Outcome,
     pub(super) fault: Fault,
     pub(super) clear: Option<bool>,
-    /// The points that there are, in the order of the plan.
+    /// Points measured so far, in the order of the plan; `None` for a target not measured yet.
     pub(super) points: Vec<Option<MeasuredPoint>>,
     pub(super) radius_mm: Option<f64>,
     pub(super) worked: Duration,
-    /// When somebody looked at it last.
+    /// Time of the last status request.
     pub(super) looked_at: Instant,
-    /// Why the session is over.
+    /// Reason why the session is over.
     pub(super) lost: Option<DeviceError>,
-    /// Why the machine stands, and what the server had to say.
+    /// Reason why the machine is stopped, and the messages of the server.
     pub(super) why: Option<String>,
     pub(super) notes: Vec<String>,
 }
@@ -88,7 +89,8 @@ impl Shared {
         }
     }
 
-    /// The server has carried out what it was at: nothing moves.
+    /// Changes to the resting state that follows the current one: the server has finished its command, so nothing
+    /// moves.
     pub(super) fn stands(&mut self) {
         (self.state, self.outcome) = match self.state {
             State::Aborting => (State::Aborted, Outcome::Aborted),
@@ -99,26 +101,26 @@ impl Shared {
     }
 }
 
-/// A panic elsewhere leaves what still holds.
+/// Locks the shared state. A panic in another thread does not make it invalid, so a poisoned lock is ignored.
 pub(super) fn locked(shared: &Mutex<Shared>) -> MutexGuard<'_, Shared> {
     shared.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The task that owns a session.
+/// Task that owns a session.
 pub(super) struct Worker {
     pub(super) session: Session,
     pub(super) shared: Arc<Mutex<Shared>>,
     pub(super) orders: mpsc::Receiver<Order>,
     pub(super) wish: watch::Receiver<Wish>,
     pub(super) settings: Arc<IppdmeSettings>,
-    /// Where the probe's centre is, as far as that is known.
+    /// Position of the probe's centre, if it is known.
     pub(super) at_mm: Option<[f64; 3]>,
-    /// Speeds in force: of travel, of touching and of scanning.
+    /// Speeds in force, in mm/s: travel, touching, scanning; 0 if not set yet.
     pub(super) speeds_mm_s: [f64; 3],
 }
 
 impl Worker {
-    /// Attends to the session until it is lost or nobody is left to give orders; then ends it.
+    /// Serves the session until it is lost or until no sender of orders is left; then ends the session.
     pub(super) async fn attend(mut self) {
         loop {
             let done = tokio::select! {
@@ -136,13 +138,13 @@ impl Worker {
                 return;
             }
         }
-        // A server that does not hear it ends the session with the connection.
+        // A server that does not receive this ends the session when the connection closes.
         let _ = self.session.ask("EndSession", Vec::new()).await;
     }
 
     async fn carry_out(&mut self, order: Order) -> Result<(), Failure> {
         match order {
-            // One that an abort has overtaken is not begun.
+            // An abort came first, so the job does not begin.
             Order::Run(_) if !locked(&self.shared).state.moves() || self.session.is_abort_ordered() => Ok(()),
             Order::Run(work) => {
                 let began = Instant::now();
@@ -156,7 +158,7 @@ impl Worker {
                     Ok(()) => Ok(()),
                     Err(failure) => Err(self.in_words(failure)),
                 };
-                // Who asked may have gone.
+                // The requester may have dropped its receiver.
                 let _ = answer.send(told);
                 cleared
             }
@@ -168,7 +170,7 @@ impl Worker {
         }
     }
 
-    /// Takes in that something went wrong, and says whether the session is lost by it.
+    /// Records a failure in the shared state. Returns true if the session is lost.
     fn failed(&mut self, failure: Failure) -> bool {
         let why = self.in_words(&failure);
         self.at_mm = None;
@@ -203,7 +205,7 @@ impl Worker {
 
     // ---- a job ------------------------------------------------------------------------------------------------------------------------
 
-    /// Touches what is left of the plan.
+    /// Measures the targets of the plan that have no point yet.
     async fn run(&mut self, work: &Work) -> Result<(), Failure> {
         self.set_up(work).await?;
         let mut unreached = 0;
@@ -244,20 +246,21 @@ impl Worker {
         (shared.state, shared.outcome) = match wish {
             _ if shared.points.iter().all(Option::is_some) => (State::Complete, Outcome::Complete),
             Wish::Stop => (State::Complete, Outcome::Stopped),
-            // Held, or told to go on again at the last moment.
+            // Held, or resumed at the last moment.
             Wish::Hold | Wish::GoOn => (State::Held, Outcome::None),
         };
         Ok(())
     }
 
-    /// Gives a job up whose targets are not where the plan has them.
+    /// Rises to the clearance height and fails the job: too many targets could not be reached.
     async fn lies_elsewhere(&mut self, work: &Work, unreached: u32) -> Result<(), Failure> {
         self.rise(work).await?;
         let text = format!("{unreached} targets could not be reached: see how the part lies");
         Err(Failure::No(ServerError { severity: 3, number: 2504, cause: String::new(), text }))
     }
 
-    /// What is to become of the job. Where nobody has looked for long it holds by itself, as a machine does that misses its client.
+    /// Returns the request in force. If no status request came within `silence_limit`, the job holds by itself, as a
+    /// machine does that loses its client.
     fn wished(&self) -> Wish {
         let mut shared = locked(&self.shared);
         if shared.state == State::Execute && shared.looked_at.elapsed() > self.settings.silence_limit {
@@ -268,7 +271,7 @@ impl Worker {
         *self.wish.borrow()
     }
 
-    /// Sees to it that everything is as the plan needs it, whoever was at the machine before.
+    /// Puts the machine into the state that the plan needs, independent of what other clients did before.
     async fn set_up(&mut self, work: &Work) -> Result<(), Failure> {
         let homed = self.session.ask("IsHomed", Vec::new()).await?;
         if homed.value("IsHomed") != Some(1.0) {
@@ -293,7 +296,7 @@ impl Worker {
             self.set_up_scans(work).await?;
         }
         let report = |names: &[&str]| names.iter().map(|name| Item::asked(name)).collect::<Vec<_>>();
-        // A quality, and the radius of a touch, are not in every version.
+        // Not every version of the standard has a quality and the radius of a touch.
         for names in [&["X", "Y", "Z", "IJK", "ER", "Q"][..], &["X", "Y", "Z", "IJK", "ER"], &["X", "Y", "Z"]] {
             if self.ask_if_there("OnPtMeasReport", report(names)).await?.is_some() {
                 return Ok(());
@@ -321,7 +324,7 @@ impl Worker {
         }
     }
 
-    /// Holds the radius of the tool against that of the plan.
+    /// Compares the radius of the tool with the radius of the plan.
     async fn check_radius(&mut self, work: &Work) -> Result<(), Failure> {
         let told = self.ask_if_there("GetProp", vec![Item::asked("Tool.AvrRadius")]).await?;
         let Some(told) = told else {
@@ -344,7 +347,8 @@ impl Worker {
         Err(Failure::Wrong(DeviceError::ProbeRadius { machine, tool, told_mm, plan_mm, limit_mm }))
     }
 
-    /// Sets parameters of the tool, and takes what is in force from the machine: it may keep them within its own limits.
+    /// Sets parameters of the tool and returns the values in force, in the same order. The machine may limit a value: a
+    /// lower speed is accepted and noted, any other difference is an error.
     pub(super) async fn set(&mut self, parameters: &[(&str, f64)]) -> Result<Vec<f64>, Failure> {
         let named = |name: &str| format!("Tool.{name}");
         let wanted = parameters.iter().map(|(name, value)| Item::with(&named(name), *value)).collect();
@@ -355,7 +359,7 @@ impl Worker {
         for (name, wanted) in parameters {
             let property = named(name);
             let value = told.value(&property).ok_or_else(|| Failure::Wrong(self.untold("GetProp", "what was set")))?;
-            // Slower than asked for costs time; anything else is another measurement.
+            // A lower speed only costs time. Any other difference changes the measurement.
             let slower = name.ends_with("Speed") && value > 0.0 && value < *wanted;
             if slower {
                 self.session.note(format!("{property} is {value}, and not {wanted} as was asked"));
@@ -368,7 +372,7 @@ impl Worker {
         Ok(in_force)
     }
 
-    /// Sets the speeds where they change: the first targets of a careful plan are touched slowly.
+    /// Sets the travel and touch speeds for target `k` if they change: the first targets of a careful plan are slow.
     pub(super) async fn keep_speeds(&mut self, work: &Work, k: usize) -> Result<(), Failure> {
         let careful = work.plan.careful.filter(|careful| k < careful.targets as usize);
         let touching = careful.map_or(work.plan.speed_mm_s, |careful| careful.speed_mm_s);
@@ -383,7 +387,7 @@ impl Worker {
 
     // ---- motion -----------------------------------------------------------------------------------------------------------------------
 
-    /// Touches one target, again where it was missed.
+    /// Touches one target, with up to `retries` retries after a miss.
     async fn touch(&mut self, work: &Work, target: &Target) -> Result<MeasuredPoint, Failure> {
         let mut missed = PointStatus::NotFound;
         for _ in 0..=self.settings.retries {
@@ -412,7 +416,7 @@ impl Worker {
         Ok(MeasuredPoint { index: target.index, status: missed, quality: 100, at_mm: [0.0; 3] })
     }
 
-    /// Takes the answer to a touch as a point, if it can be one of this target.
+    /// Returns the measured point in the answer to a touch, if it is plausible for this target.
     fn point(&mut self, work: &Work, target: &Target, answer: &Answer) -> Result<MeasuredPoint, Failure> {
         let missing = || Failure::Wrong(self.untold("PtMeas", "X, Y and Z, each once"));
         let mut at_mm = [0.0; 3];
@@ -428,7 +432,7 @@ impl Worker {
         Ok(MeasuredPoint { index: target.index, status: PointStatus::Touched, quality, at_mm })
     }
 
-    /// Holds where a point lies against where the probe was sent.
+    /// Checks that a point lies within approach + search + probe tolerance of the position to which the probe was sent.
     pub(super) fn hold_place(&self, work: &Work, target: &Target, at_mm: [f64; 3]) -> Result<(), Failure> {
         let plan = &work.plan;
         let off_mm = distance(along(target, plan.probe_radius_mm), at_mm);
@@ -441,7 +445,7 @@ impl Worker {
         Err(Failure::Wrong(DeviceError::OutOfRange { machine, field, value: off_mm, least: 0.0, most, unit }))
     }
 
-    /// Travels over a target at the height of the clearance, and down to where the probe turns into the normal.
+    /// Travels at the clearance height to above a target, then down to the point where the probe turns into the normal.
     pub(super) async fn go_over(&mut self, work: &Work, target: &Target) -> Result<(), Failure> {
         self.rise(work).await?;
         let [x, y, z] = approach(target, &work.plan);
@@ -449,7 +453,7 @@ impl Worker {
         self.go_to([x, y, z]).await
     }
 
-    /// Goes straight up to the height of the clearance, if it is not there.
+    /// Moves straight up to the clearance height if the probe is below it.
     pub(super) async fn rise(&mut self, work: &Work) -> Result<(), Failure> {
         let Some([x, y, z]) = self.at_mm else { return Ok(()) };
         let clearance_mm = work.route.clearance_mm;
@@ -469,12 +473,13 @@ impl Worker {
         Ok(())
     }
 
-    /// How long a way lasts at most, by a speed in force; one that was not set yet is the machine's own and may be slow.
+    /// Returns the maximum duration of a way, from the speed in force with index `speed`. A speed not set yet is the
+    /// machine's own, which may be slow: 1 mm/s is assumed.
     pub(super) fn lasts(&self, way_mm: f64, speed: usize) -> Duration {
         const SLOWEST_MM_S: f64 = 1.0;
         let speed = self.speeds_mm_s[speed];
         let speed = if speed > 0.0 { speed } else { SLOWEST_MM_S };
-        // Half of the way may be spent on getting to speed and down from it.
+        // Factor 2: half of the time may go into acceleration and deceleration.
         Duration::try_from_secs_f64(2.0 * way_mm / speed).unwrap_or(Duration::from_secs(3600))
     }
 
@@ -488,7 +493,7 @@ impl Worker {
         Ok(())
     }
 
-    /// Asks for what not every server has; none where this one has it not.
+    /// Sends a request that not every server supports. Returns `None` if this server lacks it.
     pub(super) async fn ask_if_there(&mut self, name: &str, arguments: Vec<Item>) -> Result<Option<Answer>, Failure> {
         ask_if_there(&mut self.session, name, arguments).await
     }
@@ -498,7 +503,7 @@ impl Worker {
     }
 }
 
-/// Asks for what not every server has; none where this one has it not.
+/// Sends a request that not every server supports. Returns `None` if this server lacks it.
 pub(super) async fn ask_if_there(
     session: &mut Session,
     name: &str,
@@ -515,7 +520,7 @@ pub(super) async fn ask_if_there(
     }
 }
 
-/// The miss that a server only warned of.
+/// Returns the error number of a miss that the server reported only as a warning, without data.
 fn missed_by(answer: &Answer) -> Option<u16> {
     let numbers = answer.warnings.iter().map(|warning| warning.number);
     numbers.into_iter().find(|number| MISSES.contains(number)).filter(|_| answer.data.is_empty())
@@ -529,7 +534,7 @@ pub(super) fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// What an error is at a machine, whatever its severity and its words.
+/// Returns the machine fault that an error number means, independent of its severity and text.
 fn fault(number: u16) -> Fault {
     match number {
         500 => Fault::StopCircuit,

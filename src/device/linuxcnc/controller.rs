@@ -1,4 +1,4 @@
-//! The conversation with a controller: who it is, how it stands, and orders to it.
+//! Exchange with a controller: identity, state, orders.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,12 +12,12 @@ use crate::error::{Answered, DeviceError};
 use crate::words::{Answer, Command, State};
 use crate::{Dial, Line};
 
-/// Between two questions where something is waited for.
+/// Interval between two queries while waiting for something.
 const ASKED_EVERY: Duration = Duration::from_millis(20);
-/// More errors than that are not told at once.
+/// Maximum number of errors read at once.
 const MOST_ERRORS: usize = 32;
 
-/// What the interpreter does.
+/// State of the interpreter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Interpreter {
     Idle,
@@ -25,39 +25,39 @@ pub(super) enum Interpreter {
     Paused,
 }
 
-/// How a controller stands, within the moment of one exchange.
+/// State of a controller, read in one exchange.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Seen {
-    /// Whether this client has control.
+    /// True if this client has control.
     pub(super) ours: bool,
-    /// Whether its stop circuit is open.
+    /// True if the stop circuit is open.
     pub(super) stopped: bool,
-    /// Whether its drives are on.
+    /// True if the drives are on.
     pub(super) on: bool,
     pub(super) mode: Mode,
     pub(super) homed: bool,
     pub(super) interpreter: Interpreter,
-    /// The program that it has open.
+    /// Program that is open.
     pub(super) program: Option<String>,
     pub(super) line: u32,
-    /// Where it is.
+    /// Position, as the controller reports it.
     pub(super) at: String,
-    /// What it reports that went wrong, each thing once.
+    /// Errors that it reports, each once.
     pub(super) errors: Vec<String>,
 }
 
-/// A controller at the far end of a connection.
+/// Controller at the other end of a connection.
 #[derive(Debug)]
 pub(super) struct Controller {
     pub(super) name: Arc<str>,
     settings: LinuxcncSettings,
     dial: Box<dyn Dial>,
     link: Option<Link>,
-    /// Why there is none, where there was one: who asks then is told that, and not that it was never met.
+    /// Reason why the connection was lost. A later request returns this error, and not "never connected".
     lost: Option<DeviceError>,
-    /// Whether this client has taken control, by this connection.
+    /// True if this client has taken control on this connection.
     pub(super) owned: bool,
-    /// The machine's configuration, which is what it calls itself by.
+    /// Machine configuration, which serves as its name.
     configuration: Option<String>,
 }
 
@@ -67,7 +67,7 @@ impl Controller {
         Self { name, settings, dial, link: None, lost: None, owned: false, configuration: None }
     }
 
-    /// Connects anew and proves who is there; only what concerns this connection is set. Returns what the machine calls itself.
+    /// Reconnects and checks the identity; changes only settings of this connection. Returns the name of the machine.
     pub(super) async fn meet(&mut self) -> Answered<String> {
         (self.link, self.owned) = (None, false);
         let LinuxcncSettings { host, port, answer_within, connect_password, .. } = &self.settings;
@@ -109,7 +109,8 @@ impl Controller {
         }
     }
 
-    /// Looks at everything that counts. What went wrong is read only where it is asked for: it is told to one reader.
+    /// Reads the complete state. Errors are read only if `errors` is true, because the controller reports each error to
+    /// one reader only.
     pub(super) async fn look(&mut self, errors: bool) -> Answered<Seen> {
         const WHAT: [Get; 9] = [
             Get::Enable,
@@ -163,7 +164,7 @@ impl Controller {
         })
     }
 
-    /// Reads out what went wrong since the last time.
+    /// Reads the errors since the last call.
     pub(super) async fn errors(&mut self) -> Answered<Vec<String>> {
         let mut errors = Vec::new();
         while errors.len() < MOST_ERRORS {
@@ -189,7 +190,8 @@ impl Controller {
         }
     }
 
-    /// Gives an order, behind whatever is on its way. A yes says that it was heard, and not where it leads.
+    /// Sends an order after the pending requests. An acknowledgement means that the order was received, not that it
+    /// succeeded.
     pub(super) async fn order(&mut self, set: Set, command: Command) -> Answered<()> {
         let asked = self.link("an order")?.ask(Request::Set(set), self.settings.answer_within);
         let answer = asked.answer().await;
@@ -204,7 +206,7 @@ impl Controller {
         }
     }
 
-    /// Why an order was refused: who has no control is refused everything.
+    /// Returns the reason why an order was refused; without control every order is refused.
     async fn denied(&mut self, command: Command) -> Answered<DeviceError> {
         if self.get(Get::Enable).await? != "ON" {
             return Ok(self.taken());
@@ -213,7 +215,7 @@ impl Controller {
         Ok(DeviceError::Refused { machine, command, answer: Answer::WrongState, state: State::Idle })
     }
 
-    /// Takes control.
+    /// Takes control of the controller.
     pub(super) async fn take(&mut self) -> Answered<()> {
         let enable = Set::Enable { password: self.settings.control_password.clone() };
         let asked = self.link("control")?.ask(Request::Set(enable), self.settings.answer_within);
@@ -225,7 +227,7 @@ impl Controller {
         Ok(())
     }
 
-    /// Ends at once, whoever has control: both lines go out together, and wait for nothing.
+    /// Aborts at once, whichever client has control: the two lines go out together without waiting.
     pub(super) async fn abort(&mut self) -> Answered<()> {
         let enable = Set::Enable { password: self.settings.control_password.clone() };
         let within = self.settings.answer_within;
@@ -239,13 +241,14 @@ impl Controller {
         self.heard(answer, Command::Abort).await
     }
 
-    /// Brings it into a mode; it has to say that it is.
+    /// Switches to a mode and waits until the controller reports that mode and an idle interpreter.
     pub(super) async fn enter(&mut self, mode: Mode, command: Command) -> Answered<()> {
         self.order(Set::Mode(mode), command).await?;
         self.until("the mode", |seen| seen.mode == mode && seen.interpreter == Interpreter::Idle).await.map(drop)
     }
 
-    /// Has it open a program, which has to be the one that it then has. A failed open is acknowledged and leaves the program before.
+    /// Opens a program and checks that it is then the open one. A failed open is acknowledged too, and leaves the
+    /// previous program open.
     pub(super) async fn open(&mut self, path: &str, command: Command) -> Answered<()> {
         self.errors().await?;
         self.order(Set::Open(path.to_owned()), command).await?;
@@ -265,7 +268,7 @@ impl Controller {
         }
     }
 
-    /// Looks until something holds.
+    /// Reads the state until a condition holds.
     pub(super) async fn until(&mut self, what: &'static str, holds: impl Fn(&Seen) -> bool) -> Answered<Seen> {
         let began = Instant::now();
         loop {
@@ -287,7 +290,7 @@ impl Controller {
         }
     }
 
-    /// Gives control up and closes the connection.
+    /// Releases control and closes the connection.
     pub(super) async fn leave(&mut self) {
         if self.owned && self.link.is_some() {
             let _ = self.order(Set::Disable, Command::Release).await;
@@ -316,7 +319,7 @@ impl Controller {
         DeviceError::NotLinuxcnc { machine: self.machine(), asked, told: told.chars().take(80).collect() }
     }
 
-    /// What came of a question that was not answered; a connection that is of no use any more is closed.
+    /// Returns the error of an unanswered request, and closes a connection that cannot be used any more.
     fn broken(&mut self, fault: LinkFault, what: &'static str) -> DeviceError {
         let error = self.fault(fault, what);
         if fault != LinkFault::Unsendable {

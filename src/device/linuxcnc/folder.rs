@@ -1,4 +1,5 @@
-//! The folders: where the program of a pass comes from, and the one that this computer and the controller both see.
+//! Folders: the folder of the run, which holds the program of a pass, and the folder that this computer and the
+//! controller both see.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -8,26 +9,29 @@ use regrind_formats::write_atomic;
 
 use super::program::{Order, PROGRAM, Program, RECORD, Record, name_begins};
 
-/// The program that a run leaves with every correction.
+/// File name of the program that a run writes with every correction.
 const OF_THE_PASS: &str = "toolpath.ngc";
-/// A record of a few lines; one that is longer is none.
+/// Maximum size of a record in bytes; a longer file is not a record.
 const LONGEST_RECORD: u64 = 1 << 16;
 
-/// Where programs come from and go to.
+/// Source and destination folders of programs.
 #[derive(Clone, Debug)]
 pub(super) struct Folders {
-    /// The folder of the run.
+    /// Folder of the run.
     pub(super) run: PathBuf,
-    /// The folder of programs, as this computer sees it.
+    /// Folder of programs, as this computer sees it.
     pub(super) here: PathBuf,
-    /// The same, as the controller sees it.
+    /// Folder of programs, as the controller sees it.
     pub(super) there: String,
-    /// Whether what is done with them is done in turn with everything else.
+    /// True if work in the folders runs in turn with everything else, not on a thread of its own.
     pub(super) in_turn: bool,
 }
 
 impl Folders {
-    /// Puts the newest program of the run into its frame, if it is of this map.
+    /// Returns the newest program of the run in its frame.
+    ///
+    /// # Errors
+    /// Returns a text if there is no program, or if the newest is not of this map or must not be run.
     pub(super) fn newest(&self, map: &[u8; 32], rounds: u32) -> Result<Program, String> {
         let cycles = std::fs::read_dir(&self.run).map_err(|error| at(&self.run, &error))?;
         let cycles = cycles.flatten().filter_map(|entry| Some((cycle(&entry.path())?, entry.path().join(OF_THE_PASS))));
@@ -45,7 +49,7 @@ impl Folders {
         Program::frame(order).map_err(|why| format!("{}: {why}", file.display()))
     }
 
-    /// Puts a program where the controller finds it, and reads it back.
+    /// Writes a program into the folder that the controller sees, and reads it back.
     pub(super) fn put(&self, program: &Program) -> Result<(), String> {
         let file = self.here.join(&program.name).with_extension(PROGRAM);
         let lies_there = |file: &Path| std::fs::read(file).is_ok_and(|text| text == program.text);
@@ -59,7 +63,7 @@ impl Folders {
         }
     }
 
-    /// What a program wrote of itself; none where there is no such file.
+    /// Returns the record that a program wrote; `None` if there is no such file.
     pub(super) fn record(&self, name: &str) -> Result<Option<Record>, String> {
         let file = self.here.join(name).with_extension(RECORD);
         let read = std::fs::metadata(&file).and_then(|about| match about.len() <= LONGEST_RECORD {
@@ -73,7 +77,7 @@ impl Folders {
         }
     }
 
-    /// The program of this run that was prepared by this word, before this program began.
+    /// Returns the program of this run whose record has this token: one prepared before this process started.
     pub(super) fn prepared(&self, cycle: u32, token: u32) -> Result<Option<Program>, String> {
         let run = self.run.file_name().unwrap_or_default().to_string_lossy();
         let begins = name_begins(&run, cycle);
@@ -91,7 +95,7 @@ impl Folders {
     }
 }
 
-/// The cycle of a folder of a run.
+/// Returns the cycle number of a folder of a run.
 fn cycle(folder: &Path) -> Option<u32> {
     folder.file_name()?.to_str()?.strip_prefix("cycle-")?.parse().ok()
 }

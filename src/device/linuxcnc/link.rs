@@ -1,5 +1,5 @@
-//! The connection to linuxcncrsh. A task owns it: it writes every request at once, whoever still waits for an answer, so that an order to
-//! hold or abort waits for nothing; and whoever has stopped waiting for an answer does not disturb the next.
+//! Connection to linuxcncrsh. A task owns it and writes every request at once, even while earlier answers are pending,
+//! so a hold or an abort waits for nothing. A caller that stops waiting for an answer does not disturb the next one.
 
 use std::io;
 use std::time::Duration;
@@ -11,22 +11,22 @@ use tokio::time::{Instant, sleep_until, timeout};
 use super::protocol::{Lines, Place, Reply, Request, Waiting};
 use crate::{Dial, Line, LineStream};
 
-/// Why there is no answer.
+/// Reason why there is no answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum LinkFault {
     /// No connection could be made.
     Unreachable(io::ErrorKind),
-    /// No answer in time; the connection was given up, so that a late one is nobody's.
+    /// No answer in time. The connection was closed, so that a late answer is not assigned to another request.
     TimedOut,
-    /// The other end closed it, or it broke.
+    /// The other end closed the connection, or it broke.
     Disconnected,
-    /// What comes is no conversation.
+    /// The data received are not this protocol.
     Nonsense,
-    /// It would not be one plain line, and was not sent.
+    /// The request is not one plain line, and was not sent.
     Unsendable,
 }
 
-/// A connection. Dropping it closes it, and takes what was not sent yet with it.
+/// Connection. Dropping it closes it and discards requests not sent yet.
 #[derive(Debug)]
 pub(super) struct Link {
     questions: mpsc::UnboundedSender<Question>,
@@ -40,20 +40,20 @@ struct Question {
     reply: oneshot::Sender<Result<Reply, LinkFault>>,
 }
 
-/// An answer that is on its way.
+/// Pending answer.
 #[derive(Debug)]
 pub(super) struct Asked(Result<oneshot::Receiver<Result<Reply, LinkFault>>, LinkFault>);
 
 impl Asked {
-    /// Waits for it.
+    /// Waits for the answer.
     pub(super) async fn answer(self) -> Result<Reply, LinkFault> {
-        // Dropped without a word: the task has ended.
+        // The sender was dropped: the task has ended.
         self.0?.await.unwrap_or(Err(LinkFault::Disconnected))
     }
 }
 
 impl Link {
-    /// Connects; nothing is said yet.
+    /// Connects; sends nothing yet.
     pub(super) async fn open(line: &Line, dial: &mut dyn Dial, within: Duration) -> Result<Self, LinkFault> {
         let stream = match timeout(within, dial.dial(line)).await {
             Ok(Ok(stream)) => stream,
@@ -65,7 +65,7 @@ impl Link {
         Ok(Self { questions })
     }
 
-    /// Sends a request behind those before it, whether or not they have been answered.
+    /// Sends a request after the earlier ones, answered or not.
     pub(super) fn ask(&self, request: Request, within: Duration) -> Asked {
         let Some(line) = request.line() else { return Asked(Err(LinkFault::Unsendable)) };
         let (reply, answer) = oneshot::channel();
@@ -81,7 +81,7 @@ impl Link {
     }
 }
 
-/// Who waits for an answer, and until when.
+/// Receiver of a pending answer, and its deadline.
 type Waiter = (oneshot::Sender<Result<Reply, LinkFault>>, Instant);
 
 struct Conversation {
@@ -95,7 +95,8 @@ impl Conversation {
         Self { stream, lines: Lines::default(), waiting: Waiting::default() }
     }
 
-    /// Ends when nobody can ask any more or the connection is of no use any more, and tells all who wait.
+    /// Serves the connection until no sender of requests is left or the connection fails. Then reports the fault to all
+    /// pending requests.
     async fn run(mut self, mut asked: mpsc::UnboundedReceiver<Question>) {
         let fault = self.converse(&mut asked).await;
         asked.close();

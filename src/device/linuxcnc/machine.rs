@@ -1,12 +1,13 @@
-//! The grinder as the cell sees it: `beginning` has what leads to a start, `looking` how it stands, `reconciling` what became of it.
+//! The grinder, as the cell sees it. `beginning`: preparation and start. `looking`: current state. `reconciling`: fate
+//! of a job after an interruption.
 //!
 //! ```text
-//!  LOAD     the program of the pass goes into the folder, in its frame, under a name of its own; the controller opens it
-//!  PREPARE  the controller opens the record by a word that is read back here; then the program, and says that it has it
-//!  START    `run`, once; the program is seen to run, or to have written that it began                        -> EXECUTE
-//!  EXECUTE  every status looks; the end is what the program wrote when its last motion had ended             -> COMPLETE
-//!  HOLD     `pause` -> HELD, wherever it is in its path;  RESUME -> EXECUTE
-//!  STOP, ABORT  `abort`; the wheel stands where it stood, in the part perhaps                  -> COMPLETE, ABORTED
+//!  LOAD     the pass in its frame is written into the folder under its own name; the controller opens it
+//!  PREPARE  the controller writes a token into the record, which is read back here; then it opens the program
+//!  START    `run`, once; the program is seen to run, or has recorded that it began                -> EXECUTE
+//!  EXECUTE  every status reads the state; the program records the end of its last motion         -> COMPLETE
+//!  HOLD     `pause` -> HELD, anywhere in its path;  RESUME -> EXECUTE
+//!  STOP, ABORT  `abort`; the wheel stops where it is, possibly in the part                     -> COMPLETE, ABORTED
 //! ```
 
 mod beginning;
@@ -38,50 +39,50 @@ use crate::words::{
 use looking::standing_fault;
 use reconciling::unknown;
 
-/// Between two looks where a start or a record is waited for.
+/// Interval between two status queries while waiting for a start or a record.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
-/// The span over which a start has to be seen not taken.
+/// Minimum time over which a start must be seen not to have happened.
 const SEEN_TWICE_OVER: Duration = Duration::from_millis(1050);
-/// A folder, perhaps on another computer, answers within this.
+/// Timeout of work in a folder, which can be on another computer.
 const FOLDER_WITHIN: Duration = Duration::from_secs(30);
 
-/// A grinder behind linuxcncrsh.
+/// Grinder controlled through linuxcncrsh.
 #[derive(Debug)]
 pub struct LinuxcncGrinder {
     controller: Controller,
     settings: LinuxcncSettings,
     folders: Folders,
-    /// Another client has taken control: it is not taken back but by an abort.
+    /// True if another client has taken control. Only an abort takes control back.
     taken: bool,
-    /// The program that lies ready, and the digest of what it is for.
+    /// Loaded program, and the digest of its payload.
     loaded: Option<(Arc<Program>, u32)>,
     work: Option<Work>,
-    /// Ended at once when nothing was begun: needs CLEAR all the same.
+    /// True if aborted when no job had begun: CLEAR is needed all the same.
     aborted: bool,
-    /// Since when the controller has been seen idle.
+    /// Time since which the controller has been seen idle.
     idle_since: Option<Instant>,
     began: Option<Instant>,
     duration_s: Option<f64>,
     fault: Fault,
-    /// Where a program that had ended left the machine, clear of the part.
+    /// Position, clear of the part, at which a finished program left the machine.
     clear_at: Option<String>,
-    /// The line and the place that were seen last, and since when.
+    /// Line and position seen last, and since when.
     moved: Option<(u32, String, Instant)>,
-    /// What the last look showed.
+    /// State at the last status query.
     last: Option<State>,
     notes: Vec<String>,
-    /// Where the words of preparations come from.
+    /// Random generator of the preparation tokens.
     chance: StdRng,
 }
 
 impl LinuxcncGrinder {
-    /// A grinder; nothing is asked of it yet.
+    /// Creates a grinder; sends nothing to it yet.
     pub fn new(settings: LinuxcncSettings) -> Self {
         Self::by(settings, Box::new(OfThisComputer), (false, random()))
     }
 
-    /// A grinder whose connections somebody else opens, beside which no thread works, and whose dice are those of the seed: for controllers
-    /// that stand in the same process, and for time that does not pass by itself.
+    /// Creates a grinder that opens its connections with `dial`, uses no other thread, and draws its random numbers
+    /// from `seed`: for controllers in the same process, and for simulated time.
     pub fn over(settings: LinuxcncSettings, dial: Box<dyn Dial>, seed: u64) -> Self {
         Self::by(settings, dial, (true, seed))
     }
@@ -126,7 +127,7 @@ impl Machine for LinuxcncGrinder {
     async fn connect(&mut self) -> Answered<Identity> {
         let name = self.controller.meet().await?;
         self.find_what_was_restored().await;
-        // It has no number that changes when it is restarted, and does not know whether a machine is behind it.
+        // The controller has no boot number, and does not know if a real machine is connected.
         let simulation = self.settings.simulated;
         Ok(Identity { kind: MachineKind::Grinder, name, boot_id: 0, simulation, silence_limit_s: None })
     }
@@ -168,7 +169,7 @@ impl Machine for LinuxcncGrinder {
             return Err(self.refused(Command::Start, Answer::DeadToken));
         }
         let Armed { job, start_sequence, .. } = armed;
-        // From here on it may have begun, however this ends.
+        // From here on the job may have begun, even if this call fails.
         if let Some(work) = self.work_of(&armed) {
             work.stage = Stage::Begun;
         }
@@ -187,7 +188,8 @@ impl Machine for LinuxcncGrinder {
     }
 
     async fn hold(&mut self) -> Answered<Status> {
-        // A controller that is idle would be paused without a program; one that was seen to run is told at once.
+        // An idle controller would be paused without a program. If the program was seen running, the order is sent at
+        // once.
         if self.last != Some(State::Execute) {
             self.look().await?;
         }
@@ -229,7 +231,7 @@ impl Machine for LinuxcncGrinder {
             self.controller.meet().await?;
         }
         let aborted = match self.controller.abort().await {
-            // The connection was lost and nobody had noticed.
+            // The connection was lost without notice.
             Err(DeviceError::Disconnected { .. }) => {
                 self.controller.meet().await?;
                 self.controller.abort().await
@@ -237,7 +239,7 @@ impl Machine for LinuxcncGrinder {
             answer => answer,
         };
         match aborted {
-            // What is switched off takes no order. Where nothing runs there is nothing to end.
+            // A machine that is switched off accepts no order. If nothing runs, there is nothing to abort.
             Err(refused @ DeviceError::Refused { .. }) => match self.controller.look(false).await?.interpreter {
                 Interpreter::Idle => {}
                 _ => return Err(refused),
@@ -374,7 +376,7 @@ impl LinuxcncGrinder {
         self.work.as_mut().filter(|work| (work.job, work.token) == (armed.job, armed.token))
     }
 
-    /// How the job is to end, if one was begun.
+    /// Stores the requested outcome of the job, if one was begun.
     fn want(&mut self, outcome: Outcome) {
         if let Some(work) = self.work.as_mut().filter(|work| work.stage == Stage::Begun) {
             work.wanted = Some(outcome);
@@ -388,7 +390,7 @@ impl LinuxcncGrinder {
         self.controller.take().await
     }
 
-    /// An order that a job which runs or holds is given.
+    /// Sends an order to a running or held job.
     async fn order(&mut self, set: Set, command: Command) -> Answered<Status> {
         match self.controller.order(set, command).await {
             Ok(()) => {}
@@ -404,7 +406,7 @@ impl LinuxcncGrinder {
         Ok(self.look().await?.1)
     }
 
-    /// A pause that came when the program had just ended is taken back, so that the controller is free.
+    /// Ends a pause that came just after the end of the program, so that the controller is free.
     async fn free_if_over(&mut self, status: Status) -> Answered<Status> {
         if !matches!(self.work.as_ref().map(|work| work.stage), Some(Stage::Ended(..))) {
             return Ok(status);
@@ -412,7 +414,7 @@ impl LinuxcncGrinder {
         self.order(Set::Abort, Command::Hold).await
     }
 
-    /// Does something with the folders, on a thread for blocking work.
+    /// Runs work in the folders on a thread for blocking work.
     async fn in_folders<T: Send + 'static>(
         &self,
         work: impl FnOnce(&Folders) -> Result<T, String> + Send + 'static,
@@ -429,7 +431,7 @@ impl LinuxcncGrinder {
         done.map_err(|why| DeviceError::Folder { machine: self.machine(), why })
     }
 
-    /// What the program of a job wrote of itself.
+    /// Returns the record that the program of a job wrote, if its token is that of this preparation.
     async fn record(&self, work: &Work) -> Answered<Option<Record>> {
         let Some(name) = work.program.as_ref().map(|program| program.name.clone()) else { return Ok(None) };
         Ok(work.owns(self.in_folders(move |folders| folders.record(&name)).await?))

@@ -1,16 +1,16 @@
-//! A grinder by LinuxCNC: linuxcncrsh over TCP, which knows programs and no jobs.
+//! Driver of a grinder under LinuxCNC: linuxcncrsh over TCP, which knows programs but no jobs.
 //!
 //! ```text
 //!  protocol          the lines, without any wire
-//!  program           the program in the frame by which it writes itself down
-//!  link, controller  the connection, and the conversation over it
-//!  folder            the folder that both see
-//!  work              where the job stands, by what is seen and what is written down
-//!  machine, settings           what the cell sees of it, and what its file says
+//!  program           the program in a frame that records its progress
+//!  link, controller  the connection, and the exchange over it
+//!  folder            the folder that this computer and the controller see
+//!  work              state of the job, from the observed state and the record
+//!  machine, settings           the machine as the cell sees it, and its settings
 //! ```
 //!
-//! The driver moves nothing but by a program: it neither homes nor jogs, switches no drive on and takes no stop back. docs/linuxcnc.md is
-//! the page for the shop.
+//! The driver moves the machine only by a program: it does not home, jog, switch a drive on or reset a stop. Page for
+//! the shop: docs/linuxcnc.md.
 
 mod controller;
 mod folder;

@@ -1,58 +1,59 @@
-//! The program as the controller runs it: that of the pass, in a frame by which it writes itself down.
+//! The program as the controller runs it: the program of the pass in a frame that records its progress.
 //!
-//! linuxcncrsh knows no jobs: it tells that a program runs, and whether one ran to its end it does not tell. So the program says so itself. It
-//! appends a line to a file of its own, its record, when it begins and when its last motion has ended, and its name is that of its content.
-//! Before that the driver has the controller open the record with a word of this very preparation. Who reads that word back knows that both
-//! see one folder, and that no line of the record is of another time.
+//! linuxcncrsh knows no jobs. It reports that a program runs, but not if one ran to its end. So the program reports
+//! this itself: it appends a line to its own file, the record, when it begins and when its last motion has ended. Its
+//! file name is derived from its content. Before that, the driver has the controller open the record with a token of
+//! this preparation. Reading that token back proves that both see one folder, and that no line of the record is from an
+//! earlier preparation.
 
 use sha2::{Digest, Sha256};
 
 use crate::hex;
 
-/// LinuxCNC reads lines of 255 characters.
+/// Maximum length of a path; LinuxCNC reads lines of 255 characters.
 const LONGEST_PATH: usize = 220;
-/// The part of a name that tells the run.
+/// Maximum length of the run's part of a name.
 const LONGEST_RUN: usize = 60;
 
-/// A program in its frame.
+/// Program in its frame.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Program {
-    /// Tells run, cycle and content; without an extension.
+    /// Name that identifies run, cycle and content, without an extension.
     pub name: String,
-    /// The correction that it grinds is that of this cycle: it is the pass of the next.
+    /// Cycle whose correction the program grinds; it is the pass of the next cycle.
     pub cycle: u32,
-    /// What stands in the file.
+    /// Content of the file.
     pub text: Vec<u8>,
-    /// The first line of the pass in the file, counted from 1, and how many lines it has.
+    /// First line of the pass in the file, counted from 1, and the number of its lines.
     pub lines: (u32, u32),
-    /// How often the pass is run.
+    /// Number of times that the pass is run.
     pub rounds: u32,
-    /// The identity of the map that it grinds.
+    /// Identity of the map that the program grinds.
     pub map: [u8; 32],
 }
 
-/// What a program is made of.
+/// Inputs of a program.
 #[derive(Clone, Copy, Debug)]
 pub struct Order<'a> {
-    /// The run, as files call it.
+    /// Name of the run, as in file names.
     pub run: &'a str,
-    /// The cycle whose correction it is.
+    /// Cycle whose correction it is.
     pub cycle: u32,
-    /// The program of the pass.
+    /// Program of the pass.
     pub pass: &'a [u8],
-    /// The identity of the map that it has to be of.
+    /// Identity of the map that the program must be for.
     pub map: &'a [u8; 32],
-    /// How often it is run: once, and once more for each spark-out.
+    /// Number of times that the pass is run: one, plus one for each spark-out.
     pub rounds: u32,
-    /// The folder of programs, as the controller sees it.
+    /// Folder of programs, as the controller sees it.
     pub folder: &'a str,
 }
 
 impl Program {
-    /// Puts the program of a pass into its frame.
+    /// Builds the program of a pass in its frame.
     ///
     /// # Errors
-    /// What makes it one that must not be run, in words.
+    /// Returns the reason, as text, why the program must not be run.
     pub fn frame(order: Order<'_>) -> Result<Self, String> {
         let body = body(order.pass, order.map)?;
         let mut content = Sha256::new();
@@ -69,7 +70,8 @@ impl Program {
             rounds => (format!("{REPEAT}{rounds}]\n"), "o<regrind> endrepeat\n"),
         };
         let head = format!("({name})\n{}{repeat}", says(BEGIN));
-        // The interpreter reads ahead of the motion. Asking for an input makes it wait for all that is before; then comes the end.
+        // The interpreter reads ahead of the motion. Reading an input makes it wait for all earlier motion; then the
+        // end is logged.
         let tail = format!("{again}M66 P0 L0\n{}M2\n", says(END));
         let count = |text: &str| text.bytes().filter(|byte| *byte == b'\n').count() as u32;
         let lines = (count(&head) + 1, count(body).max(1));
@@ -77,7 +79,7 @@ impl Program {
         Ok(Self { name, cycle: order.cycle, text, lines, rounds: order.rounds.max(1), map: *order.map })
     }
 
-    /// Reads a program that was put into its frame before this program began.
+    /// Parses a program that was framed before this process started.
     pub(super) fn read(name: &str, cycle: u32, text: Vec<u8>) -> Option<Self> {
         let whole = std::str::from_utf8(&text).ok()?;
         let repeat = whole.lines().nth(4).and_then(|line| line.strip_prefix(REPEAT)?.strip_suffix(']')?.parse().ok());
@@ -94,7 +96,7 @@ impl Program {
         Some(Self { name: name.to_owned(), cycle, lines, rounds, map: identity, text })
     }
 
-    /// How far a line of the file is, in thousandths of the pass.
+    /// Returns the progress of a line of the file, in thousandths of the pass.
     pub(super) fn thousandths(&self, line: u32) -> u32 {
         let (first, count) = self.lines;
         let done = line.saturating_sub(first).min(count);
@@ -102,13 +104,13 @@ impl Program {
     }
 }
 
-/// How the name of every program of a cycle begins.
+/// Returns the beginning of the name of every program of a cycle.
 pub(super) fn name_begins(run: &str, cycle: u32) -> String {
     let run: String = run.chars().map(plain).take(LONGEST_RUN).collect();
     format!("{run}-c{cycle}-")
 }
 
-/// The extensions of a program and of its record.
+/// Extensions of a program and of its record.
 pub(super) const PROGRAM: &str = "ngc";
 pub(super) const RECORD: &str = "log";
 const PREPARED: &str = "prepared";
@@ -117,12 +119,12 @@ const END: &str = "end";
 const REPEAT: &str = "o<regrind> repeat [";
 const OF_MAP: &str = "(map: sha256 ";
 
-/// A file of the folder as the controller sees it, which is a Unix system always.
+/// Returns the path of a file in the folder at the controller, which is always a Unix system.
 pub(super) fn path(folder: &str, name: &str, extension: &str) -> String {
     format!("{}/{name}.{extension}", folder.trim_end_matches('/'))
 }
 
-/// The lines by which a controller opens a record anew.
+/// Returns the lines with which a controller opens a new record.
 pub(super) fn opening(record: &str, token: u32) -> [String; 3] {
     [format!("(LOGOPEN,{record})"), format!("(LOG,{PREPARED} {token:08x})"), "(LOGCLOSE)".to_owned()]
 }
@@ -131,7 +133,11 @@ fn plain(c: char) -> char {
     if c.is_ascii_alphanumeric() || matches!(c, '-' | '_') { c } else { '_' }
 }
 
-/// Returns the program without its end, if it is of this map, says how exactly it is to be followed, and ends.
+/// Returns the program without its final M2.
+///
+/// # Errors
+/// Returns a text if the program is not of this map, does not set its path tolerance, or does not end with its only end
+/// word.
 fn body<'a>(pass: &'a [u8], map: &[u8; 32]) -> Result<&'a str, String> {
     let text = std::str::from_utf8(pass).ok().filter(|text| text.is_ascii()).ok_or("it is not plain text")?;
     let of_map = format!("{OF_MAP}{})", hex(map));
@@ -150,13 +156,14 @@ fn body<'a>(pass: &'a [u8], map: &[u8; 32]) -> Result<&'a str, String> {
     }
 }
 
-/// The words of a line, without comments.
+/// Returns the words of a line, without comments.
 fn code(line: &str) -> Vec<&str> {
     let line = line.split([';', '(']).next().unwrap_or_default();
     line.split_whitespace().collect()
 }
 
-/// LinuxCNC follows a program at power-on by G64 without a tolerance, which cuts corners by a tenth of a millimetre: it has to say how exactly.
+/// Checks that the program sets its path mode before it moves. At power-on, LinuxCNC uses G64 without a tolerance,
+/// which rounds corners by a tenth of a millimetre.
 fn check_mode(code: &[Vec<&str>]) -> Result<(), String> {
     let mut says = false;
     for words in code {
@@ -178,19 +185,19 @@ fn check_mode(code: &[Vec<&str>]) -> Result<(), String> {
     }
 }
 
-/// What a program wrote of itself.
+/// Record that a program wrote.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Record {
-    /// The word of the preparation that opened it.
+    /// Token of the preparation that opened the record.
     pub prepared: Option<u32>,
-    /// How often it has begun.
+    /// Number of times that the program began.
     pub begun: u32,
-    /// How often its last motion has ended.
+    /// Number of times that its last motion ended.
     pub ended: u32,
 }
 
 impl Record {
-    /// Reads a record; a line that is not whole yet is none.
+    /// Parses a record; an incomplete last line is ignored.
     pub fn read(text: &str) -> Self {
         let mut record = Self::default();
         let whole = text.rfind('\n').map_or("", |end| &text[..end]);

@@ -1,17 +1,18 @@
-//! What is said to linuxcncrsh and what it says: sent strictly, read leniently, without any wire.
+//! Protocol of linuxcncrsh: requests are written strictly, answers are parsed leniently, without any I/O.
 //!
-//! A request is one line. Once `echo` is off and `verbose` is on each has one line for an answer, in the order of the requests; nothing else
-//! ties the two together. So an answer has to name what was asked, and a line that names something else is nobody's.
+//! A request is one line. After `echo` is off and `verbose` is on, each request has one line as its answer, in the
+//! order of the requests; nothing else links the two. So an answer must name what was requested. A line that names
+//! something else belongs to no request.
 
 use std::collections::VecDeque;
 use std::fmt;
 
-/// No line of either side is longer.
+/// Maximum length of a line, in both directions.
 const LONGEST_LINE: usize = 4096;
-/// More lines in a row that answer nothing than that are no conversation.
+/// Maximum number of successive lines that answer nothing; more are not this protocol.
 const MOST_ASIDE: u32 = 100;
 
-/// What a controller can be asked without ownership, and without anything being changed by it but that an error is told once.
+/// Query that needs no control and changes nothing, except that each error is reported once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the words of the protocol")]
 pub enum Get {
@@ -46,7 +47,7 @@ impl Get {
     }
 }
 
-/// A way of working of the controller.
+/// Mode of the controller.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the words of the protocol")]
 pub enum Mode {
@@ -64,22 +65,22 @@ impl Mode {
         }
     }
 
-    /// The mode of this name, in whatever case.
+    /// Returns the mode of this name, in upper or lower case.
     pub fn of(word: &str) -> Option<Self> {
         [Self::Manual, Self::Auto, Self::Mdi].into_iter().find(|mode| mode.word().eq_ignore_ascii_case(word))
     }
 }
 
-/// What a controller can be told. Nothing else is ever sent: no jog, no emergency stop, no override, no home.
+/// Order to a controller. Nothing else is ever sent: no jog, no emergency stop, no override, no homing.
 #[derive(Clone, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the words of the protocol")]
 pub enum Set {
     Verbose,
-    /// Takes control from whoever has it.
+    /// Takes control from any other client.
     Enable {
         password: String,
     },
-    /// Gives control up.
+    /// Releases control.
     Disable,
     Mode(Mode),
     Mdi(String),
@@ -116,7 +117,7 @@ impl fmt::Debug for Set {
     }
 }
 
-/// One line to the controller.
+/// Line to the controller.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the words of the protocol")]
 pub enum Request {
@@ -126,19 +127,19 @@ pub enum Request {
     Set(Set),
 }
 
-/// What an answer says.
+/// Content of an answer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Reply {
-    /// What was asked for.
+    /// Requested value.
     Value(String),
-    /// Taken in. It does not say that it succeeded.
+    /// Acknowledged. This does not mean that it succeeded.
     Acknowledged,
-    /// Not taken in.
+    /// Refused.
     Refused,
 }
 
 impl Request {
-    /// Returns the line, with its end; none where it would not be one line, or not a plain one.
+    /// Returns the line with its line end; `None` if the request is not one plain line.
     pub fn line(&self) -> Option<String> {
         let line = match self {
             Self::Hello { password } => format!("hello {password} regrind 1.1"),
@@ -153,11 +154,11 @@ impl Request {
         (plain && line.len() < LONGEST_LINE).then(|| line + "\r\n")
     }
 
-    /// Whether a line answers it, and what it says then.
+    /// Returns the reply if a line answers this request.
     pub fn answer(&self, line: &str) -> Option<Reply> {
         match self {
             Self::Hello { .. } => said(line, "hello"),
-            // What comes back is its own echo.
+            // The answer is the echo of the request itself.
             Self::EchoOff => None,
             Self::Get(get) => match (after(line, get.word()), after(line, "get")) {
                 (Some(value), _) => Some(Reply::Value(value.to_owned())),
@@ -176,14 +177,14 @@ impl Request {
     }
 }
 
-/// What follows a word at the beginning of a line.
+/// Returns the text after a word at the beginning of a line, in upper or lower case.
 fn after<'a>(line: &'a str, word: &str) -> Option<&'a str> {
     let (head, rest) = line.split_at_checked(word.len())?;
     let ends = rest.is_empty() || rest.starts_with([' ', '\t']);
     (ends && head.eq_ignore_ascii_case(word)).then(|| rest.trim())
 }
 
-/// `HELLO ACK name version`, `HELLO NAK`.
+/// Parses `HELLO ACK name version` or `HELLO NAK`.
 fn said(line: &str, word: &str) -> Option<Reply> {
     let rest = after(line, word)?;
     match after(rest, "ack") {
@@ -192,20 +193,21 @@ fn said(line: &str, word: &str) -> Option<Reply> {
     }
 }
 
-/// `X NAK`, and `NAK` alone: what a server says that does not get so far as to look at the word.
+/// Parses `X NAK` or `NAK` alone. A server answers `NAK` alone if it refuses before it evaluates the word.
 fn refused(rest: &str, word: &str) -> Option<Reply> {
     let rest = after(rest, word).unwrap_or(rest);
     rest.eq_ignore_ascii_case("nak").then_some(Reply::Refused)
 }
 
-/// Lines out of bytes as they come: half ones wait for their other half. Either of CR and LF ends a line, and empty ones are none.
+/// Splitter of a byte stream into lines. An incomplete line waits for its rest. CR or LF ends a line; empty lines are
+/// ignored.
 #[derive(Debug, Default)]
 pub struct Lines {
     bytes: Vec<u8>,
 }
 
 impl Lines {
-    /// Takes bytes in, and returns the lines that are whole now; none where what came is no line of this protocol.
+    /// Adds bytes and returns the lines completed by them; `None` if the data are not a line of this protocol.
     pub fn take(&mut self, bytes: &[u8]) -> Option<Vec<String>> {
         self.bytes.extend_from_slice(bytes);
         let mut lines = Vec::new();
@@ -214,7 +216,7 @@ impl Lines {
                 return None;
             }
             let line: Vec<u8> = self.bytes.drain(..=end).take(end).collect();
-            // Every byte is a character: some answers hold garbage.
+            // Every byte becomes a character: some answers contain garbage.
             let line: String = line.into_iter().map(char::from).collect();
             lines.extend(Some(line.trim().to_owned()).filter(|line| !line.is_empty()));
         }
@@ -222,21 +224,21 @@ impl Lines {
     }
 }
 
-/// Requests that are on their way, in their order, each with what it is kept with.
+/// Pending requests in order, each with an attached value.
 #[derive(Debug)]
 pub struct Waiting<T> {
     requests: VecDeque<(Request, T)>,
     aside: u32,
 }
 
-/// What a line is.
+/// Meaning of a received line.
 #[derive(Debug, PartialEq)]
 pub enum Place<T> {
-    /// The answer to the request that has waited longest.
+    /// Answer to the oldest pending request.
     Answer(T, Reply),
-    /// Nobody's.
+    /// Line of no pending request.
     Aside,
-    /// Nobody's, like so many before it that this is no conversation.
+    /// Line of no pending request, one of more than `MOST_ASIDE` in a row: this is not the protocol.
     Nonsense,
 }
 
@@ -247,22 +249,22 @@ impl<T> Default for Waiting<T> {
 }
 
 impl<T> Waiting<T> {
-    /// Keeps a request that was sent.
+    /// Adds a request that was sent.
     pub fn push(&mut self, request: Request, kept: T) {
         self.requests.push_back((request, kept));
     }
 
-    /// What is kept with the request that has waited longest.
+    /// Returns the value attached to the oldest pending request.
     pub fn first(&self) -> Option<&T> {
         self.requests.front().map(|(_, kept)| kept)
     }
 
-    /// All that wait, which wait no more.
+    /// Removes all pending requests and returns their attached values.
     pub fn drain(&mut self) -> impl Iterator<Item = T> + '_ {
         self.requests.drain(..).map(|(_, kept)| kept)
     }
 
-    /// Says what a line is.
+    /// Assigns a line to the oldest pending request, if it answers it.
     pub fn place(&mut self, line: &str) -> Place<T> {
         match self.requests.front().and_then(|(request, _)| request.answer(line)) {
             Some(reply) => {
@@ -284,7 +286,7 @@ impl<T> Waiting<T> {
 mod tests {
     use super::*;
 
-    /// What went over the wire to and from LinuxCNC 2.9, byte by byte.
+    /// Recorded session with LinuxCNC 2.9, byte by byte.
     const SESSION: [(&str, &str); 17] = [
         ("hello EMC regrind 1.1\r\n", "HELLO ACK EMCNETSVR 1.1\r\n"),
         ("set echo off\r\n", "set echo off\r\n"),
@@ -392,7 +394,7 @@ mod tests {
         let line = Request::Get(Get::Program);
         assert_eq!(line.answer("GET PROGRAM NAK"), Some(Reply::Refused));
         assert_eq!(line.answer("GET NAK"), Some(Reply::Refused));
-        // One word begins the other.
+        // One word is the beginning of the other.
         assert_eq!(line.answer("PROGRAM_LINE 3"), None);
         assert_eq!(line.answer("GET PROGRAM_LINE NAK"), None);
         assert_eq!(Request::Hello { password: "x".into() }.answer("HELLO NAK"), Some(Reply::Refused));

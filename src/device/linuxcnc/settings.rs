@@ -1,4 +1,4 @@
-//! What a cell file says of a grinder by LinuxCNC, and the machine that is made of it.
+//! Settings of a LinuxCNC grinder in a cell file, and the machine created from them.
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
@@ -73,10 +73,10 @@ impl Default for LinuxcncWire {
     }
 }
 
-/// Everything that has to be known to drive a controller.
+/// Settings that drive a controller.
 #[derive(Clone, Debug)]
 pub struct LinuxcncSettings {
-    /// Name or address.
+    /// Name or address of the controller.
     pub host: String,
     /// Port of linuxcncrsh.
     pub port: u16,
@@ -84,23 +84,23 @@ pub struct LinuxcncSettings {
     pub connect_password: String,
     /// Password of `set enable`.
     pub control_password: String,
-    /// The folder of the run, from which programs come.
+    /// Folder of the run, the source of programs.
     pub run_folder: PathBuf,
-    /// The folder of programs, as this computer sees it.
+    /// Folder of programs, as this computer sees it.
     pub programs: PathBuf,
-    /// The folder of programs, as the controller sees it.
+    /// Folder of programs, as the controller sees it.
     pub programs_at_controller: String,
-    /// Whether a simulation is behind the controller, which does not know it itself.
+    /// True if the controller drives a simulated machine; the controller does not know this itself.
     pub simulated: bool,
     /// Joints that must be homed.
     pub joints: usize,
-    /// For an answer.
+    /// Timeout of an answer.
     pub answer_within: Duration,
-    /// For what an order leads to.
+    /// Timeout of the effect of an order.
     pub settle_within: Duration,
-    /// For a record to be seen after its program has stopped running.
+    /// Timeout until a record is visible after its program has stopped running.
     pub record_within: Duration,
-    /// What the machine must call itself: its ini file, or the name of its server.
+    /// Expected name of the machine: its ini file, or the name of its server.
     pub expected_name: Option<String>,
 }
 
@@ -176,7 +176,7 @@ impl Wired for LinuxcncWire {
 }
 
 impl LinuxcncWire {
-    /// The program that prints the path which the controller executes, where the cell is simulated.
+    /// Returns the command that prints the path that the controller executes, if the cell is simulated.
     pub fn executed_path(&self, cell_folder: &Path) -> Option<Command> {
         let (program, arguments) = self.executed_path.as_deref()?.split_first()?;
         let at = Path::new(program);
@@ -188,7 +188,8 @@ impl LinuxcncWire {
         Some(command)
     }
 
-    /// The controller is real and the machine behind it is not: then its path is told.
+    /// Checks `executed_path`: a simulated cell has a real controller but no real machine, so it needs the executed
+    /// path.
     fn check_path(&self, place: &Place<'_>, document: &mut Document) {
         let key = place.key("wire.executed_path");
         match (place.simulated, &self.executed_path) {
@@ -208,7 +209,7 @@ impl LinuxcncWire {
         }
     }
 
-    /// The path stands in a line of the protocol and in a comment of the program.
+    /// Checks the folder at the controller: its path becomes part of a protocol line and of a comment in the program.
     fn check_folder(&self, place: &Place<'_>, document: &mut Document) {
         let (key, folder) = match &self.programs_at_controller {
             Some(folder) => ("wire.programs_at_controller", folder),

@@ -1,6 +1,7 @@
-//! Where a job stands, by what is seen of the controller and what its program wrote down. Pure.
+//! State of a job, from the observed state of the controller and the record of its program. Pure: no I/O.
 //!
-//! What runs is told by the controller; whether it ran to its end it does not tell, and silence is no proof. The record of the program is.
+//! The controller reports what runs. It does not report if a program ran to its end, and an idle controller is no
+//! proof. The record of the program is.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,65 +10,65 @@ use super::controller::{Interpreter, Seen};
 use super::program::{Program, Record};
 use crate::words::{Fault, Job, Outcome, State};
 
-/// A job that was prepared, and all that is known of it.
+/// Prepared job and everything known about it.
 #[derive(Clone, Debug)]
 pub(super) struct Work {
     pub(super) job: Job,
-    /// The number of its start.
+    /// Start sequence number.
     pub(super) sequence: u32,
-    /// The word by which its record was opened.
+    /// Token with which its record was opened.
     pub(super) token: u32,
-    /// Its program; none where what was prepared before is not found any more.
+    /// Program of the job; `None` if a program prepared earlier is not found any more.
     pub(super) program: Option<Arc<Program>>,
-    /// Its path at the controller.
+    /// Path of the program at the controller.
     pub(super) path: String,
     pub(super) stage: Stage,
-    /// How a person would have it end.
+    /// Outcome that a person requested.
     pub(super) wanted: Option<Outcome>,
-    /// What went wrong since it began, in the controller's words.
+    /// Errors since it began, in the controller's words.
     pub(super) errors: Vec<String>,
-    /// How often the pass has been run through, and the line seen last.
+    /// Number of completed rounds of the pass, and the line seen last.
     pub(super) round: (u32, u32),
 }
 
-/// How far a job is.
+/// Stage of a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Stage {
-    /// Checked; START would begin it.
+    /// Checked; START begins it.
     Prepared,
-    /// START was given, or may have been.
+    /// START was sent, or possibly sent.
     Begun,
-    /// It is over.
+    /// The job is over.
     Ended(State, Outcome),
 }
 
-/// What is to be made of a moment.
+/// Verdict on a job at one moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Verdict {
-    /// It is at this, and may go on.
+    /// The job is in this state and can continue.
     At(State),
-    /// It is over.
+    /// The job is over.
     Ended(State, Outcome, Fault),
-    /// The controller runs something that is none of ours.
+    /// The controller runs a program that is not ours.
     Foreign(State),
-    /// The controller stands, and nobody has said how it ended.
+    /// The controller is idle, and nothing shows how the job ended.
     Untold,
 }
 
 impl Work {
-    /// Whether the record is that of this very preparation.
+    /// Returns the record if its token is that of this preparation.
     pub(super) fn owns(&self, record: Option<Record>) -> Option<Record> {
         record.filter(|record| record.prepared == Some(self.token))
     }
 
-    /// Says what a moment means for a job that was begun. `still` is how long the controller has been seen idle; what the program wrote may
-    /// take as long as `settles` to be seen.
+    /// Returns the verdict on a job that was begun. `still` is how long the controller has been seen idle. `settles` is
+    /// the maximum delay until a written record is visible.
     pub(super) fn judge(&self, seen: &Seen, record: Option<Record>, still: Duration, settles: Duration) -> Verdict {
         let record = self.owns(record).unwrap_or_default();
         let is_ours = seen.program.as_deref() == Some(&self.path);
         let aborts = self.wanted == Some(Outcome::Aborted);
         match seen.interpreter {
-            // A pause that came when the program had ended holds nothing.
+            // A pause after the end of the program holds nothing.
             Interpreter::Running | Interpreter::Paused if is_ours && record.ended == 0 => match seen.interpreter {
                 _ if aborts => Verdict::At(State::Aborting),
                 _ if self.wanted == Some(Outcome::Stopped) => Verdict::At(State::Stopping),
@@ -86,22 +87,23 @@ impl Work {
             _ if seen.stopped => Verdict::Ended(State::Faulted, Outcome::Failed, Fault::StopCircuit),
             _ if !seen.on => Verdict::Ended(State::Faulted, Outcome::Failed, Fault::Supplies),
             _ if !self.errors.is_empty() => Verdict::Ended(State::Faulted, Outcome::Failed, self.fault()),
-            // Somebody has broken it off at the machine.
+            // Somebody has aborted it at the machine.
             _ => Verdict::Ended(State::Aborted, Outcome::Aborted, Fault::None),
         }
     }
 
-    /// Takes in the line that is seen, and says how many thousandths of all rounds are done.
+    /// Updates the round from the line seen. Returns the progress in thousandths of a round, done and total over all
+    /// rounds.
     pub(super) fn progress(&mut self, line: u32) -> Option<(u32, u32)> {
         let program = self.program.as_ref()?;
         let (round, before) = self.round;
-        // A pause may take it a little back; the beginning of the next round is far back.
+        // A pause may move the line back a little. The start of the next round is far back.
         let again = line + program.lines.1 / 2 < before && round + 1 < program.rounds;
         self.round = (round + u32::from(again), line);
         Some((1000 * self.round.0 + program.thousandths(line), 1000 * program.rounds))
     }
 
-    /// What an error says, as far as its words are known.
+    /// Returns the fault that the errors mean, as far as their words are known.
     pub(super) fn fault(&self) -> Fault {
         let words = self.errors.join("\n").to_lowercase();
         match () {
@@ -165,9 +167,9 @@ mod tests {
         assert_eq!(judged(&work, &idle, record(1, 0)), aborted);
         assert_eq!(judged(&work, &idle, record(0, 0)), Verdict::Untold);
         assert_eq!(judged(&work, &idle, None), Verdict::Untold);
-        // Another preparation's.
+        // Record of another preparation.
         assert_eq!(judged(&work, &idle, Some(Record { prepared: Some(41), begun: 1, ended: 1 })), Verdict::Untold);
-        // What it wrote may be seen late.
+        // The record may become visible late.
         assert_eq!(work.judge(&idle, record(1, 0), SETTLES / 2, SETTLES), Verdict::At(State::Execute));
     }
 
@@ -200,7 +202,7 @@ mod tests {
             let work = Work { wanted: Some(wanted), ..work() };
             assert_eq!(judged(&work, &running, record(1, 0)), Verdict::At(on_the_way));
             assert_eq!(judged(&work, &idle, record(1, 0)), Verdict::Ended(state, wanted, Fault::None));
-            // It was quicker.
+            // The program ended before the stop took effect.
             assert_eq!(judged(&work, &idle, record(1, 1)), Verdict::Ended(state, Outcome::Complete, Fault::None));
         }
     }

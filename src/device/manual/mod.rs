@@ -1,14 +1,14 @@
-//! A machine that a person serves: nothing is connected, every step is asked of a person and confirmed by one.
+//! Machine operated by a person: nothing is connected, and a person is asked for every step and confirms it.
 //!
 //! ```text
-//!  START    what to do and what to check is shown; at most once for a job and cycle              -> EXECUTE
+//!  START    shows what to do and what to check; at most once for a job and cycle                -> EXECUTE
 //!  EXECUTE  `started` (grinder), then `done`, which for a measurement names its file             -> COMPLETE
-//!  HOLD, STOP and ABORT are asked of the person too                            -> HOLDING, STOPPING, ABORTING
+//!  HOLD, STOP and ABORT: the person is asked too                               -> HOLDING, STOPPING, ABORTING
 //!  HOLDING  `still` -> HELD;  RESUME -> EXECUTE          STOPPING  `still` -> COMPLETE, stopped
 //! ```
 //!
-//! Until a person has confirmed `still` the machine is taken to be moving, and from START until `done` or `still` nobody knows whether
-//! it is clear of the part: nothing is confirmed by silence. docs/manual.md is the page for the shop.
+//! Until a person has confirmed `still`, the machine counts as moving. From START until `done` or `still` it is unknown
+//! if it is clear of the part: silence confirms nothing. Page for the shop: docs/manual.md.
 
 mod settings;
 
@@ -29,33 +29,33 @@ use regrind_formats::{FormatError, ResultFolder, write_atomic};
 
 pub use settings::ManualWire;
 
-/// What a manual machine is told about its run.
+/// Settings of a manual machine for its run.
 #[derive(Clone, Debug)]
 pub struct ManualSettings {
-    /// The part, as prompts call it.
+    /// Name of the part in prompts.
     pub part: String,
-    /// The folder of the run.
+    /// Folder of the run.
     pub folder: PathBuf,
-    /// What is known of the files of measurements.
+    /// Known properties of the files of measurements.
     pub content: Content,
-    /// Where any number of points will do: the least number of them.
+    /// Minimum number of points, if any points are accepted.
     pub free_points: Option<usize>,
-    /// The share of the targets of which a measurement must have a point.
+    /// Minimum share of the targets of which a measurement must have a point.
     pub least_found: f64,
-    /// Whether the plan itself may be given back as what was measured.
+    /// True if the plan itself is accepted as the measurement.
     pub rehearsal: bool,
-    /// By how much the probe radius in a file may differ from the plan's.
+    /// Maximum difference between the probe radius in a file and the plan's, in mm.
     pub probe_tolerance_mm: f64,
 }
 
-/// What the person is asked to do.
+/// Work that the person is asked to do.
 #[derive(Clone, Debug)]
 enum Work {
     Measure(Arc<Plan>),
     Grind(Pass, [u8; 32]),
 }
 
-/// A machine that a person serves.
+/// Machine operated by a person.
 #[derive(Debug)]
 pub struct ManualMachine {
     name: Arc<str>,
@@ -63,27 +63,27 @@ pub struct ManualMachine {
     settings: ManualSettings,
     connected: bool,
     state: State,
-    /// What would be asked, and its digest.
+    /// Loaded work and its digest.
     work: Option<(Work, u32)>,
-    /// The job asked for, and the number of its start.
+    /// Requested job, and its start sequence number.
     job: Option<(Job, u32)>,
-    /// The job of an interrupted run, of which nobody has told what became.
+    /// Unresolved job of an interrupted run: nobody has said what became of it.
     untold: Option<(Job, u32)>,
-    /// Jobs and cycles that were ever asked for: never twice.
+    /// Jobs and cycles that were ever requested: none is requested twice.
     asked: Vec<(u32, u16)>,
     outcome: Outcome,
-    /// When the start was confirmed.
+    /// Time at which the start was confirmed.
     begun: Option<Instant>,
     duration_s: Option<f64>,
-    /// Whether it is clear of the part, by a person's word.
+    /// True if it is clear of the part, as a person confirmed; `None` if unknown.
     clear: Option<bool>,
     measured: Option<Measurement>,
-    /// The SHA-256 of every file that was taken: no two measurements are the same bytes.
+    /// SHA-256 of every accepted file: no two measurements have the same bytes.
     taken: Vec<[u8; 32]>,
 }
 
 impl ManualMachine {
-    /// A machine that a person serves, in one run.
+    /// Creates a machine operated by a person, for one run.
     pub fn new(kind: MachineKind, settings: ManualSettings) -> Self {
         Self {
             name: format!("{kind} by hand").into(),
@@ -122,7 +122,10 @@ impl ManualMachine {
         DeviceError::NotTaken { machine: Arc::clone(&self.name), why: why.to_string() }
     }
 
-    /// Goes where a command leads from one of these states.
+    /// Changes the state to `to` and returns the status.
+    ///
+    /// # Errors
+    /// Refuses with [`Answer::WrongState`] if the current state is not in `from`.
     fn go(&mut self, command: Command, from: &[State], to: State) -> Answered<Status> {
         if !from.contains(&self.state) {
             return Err(self.refused(command, Answer::WrongState));
@@ -137,7 +140,7 @@ impl ManualMachine {
 
     // ---- what a person is asked ---------------------------------------------------------------------------------------------------
 
-    /// What to do and what to check now, and what to type then.
+    /// Returns what to do and what to check now, and what to type then.
     fn prompt(&self) -> Vec<String> {
         let Some((job, _)) = self.job else { return Vec::new() };
         let name = self.kind.name();
@@ -188,7 +191,7 @@ impl ManualMachine {
         ]
     }
 
-    /// The run, as `regrind confirm` has to be told it; nothing where it finds the newest by itself.
+    /// Returns the run argument of `regrind confirm`; empty if the command finds the newest run by itself.
     fn run(&self) -> String {
         let folder = &self.settings.folder;
         if folder.parent() == Some(Path::new("runs")) { String::new() } else { format!(" {}", folder.display()) }
@@ -238,7 +241,7 @@ impl ManualMachine {
         }
     }
 
-    /// Whether a word names another map than the one that is asked for.
+    /// Returns true if a confirmation names another map than the requested one.
     fn is_other(&self, named: Option<[u8; 32]>) -> bool {
         match &self.work {
             Some((Work::Grind(_, map), _)) => named.is_some_and(|named| named != *map),
@@ -246,7 +249,7 @@ impl ManualMachine {
         }
     }
 
-    /// Takes a file as the measurement that was asked for, and keeps its bytes in the folder of the run.
+    /// Accepts a file as the requested measurement, and stores its bytes in the folder of the run.
     async fn take_file(&mut self, file: PathBuf) -> Answered<Vec<String>> {
         let (Some((job, done)), Some((Work::Measure(plan), _))) = (self.job, &self.work) else {
             return Err(self.not_taken("no measurement is asked for"));
@@ -260,7 +263,7 @@ impl ManualMachine {
                 return Err(ExchangeError::Offered { path: file });
             }
             let measurement = measured(&settings, &plan, job, done, &file, &bytes)?;
-            // As it came, under a name that no other file of a cycle has.
+            // The bytes are stored unchanged, under a name that no other file of the cycle has.
             let extension = file.extension().map_or("txt".to_owned(), |e| file_word(&e.to_string_lossy()));
             let name = format!("result{}.{extension}", of_batch(job));
             write_atomic(&cycle_folder.join(&name), &bytes)?;
@@ -278,7 +281,7 @@ fn plan_file(job: Job) -> String {
     format!("plan{}.csv", of_batch(job))
 }
 
-/// What tells the files of a batch from those of the first.
+/// Returns the suffix of the file names of a batch; empty for the first batch.
 fn of_batch(job: Job) -> String {
     match job.number().batch {
         0 => String::new(),
@@ -286,7 +289,8 @@ fn of_batch(job: Job) -> String {
     }
 }
 
-/// Whether a file was taken before this program took the run up: what was taken lies in the folder of its cycle.
+/// Returns true if a file was accepted before this process resumed the run: the folders of the cycles hold all accepted
+/// files.
 fn lies_there(run: &Path, sha256: &[u8; 32]) -> bool {
     let within = |folder: &Path| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
     let stem = |path: &Path, wanted: &str| path.file_stem().is_some_and(|stem| stem == wanted);
@@ -295,7 +299,7 @@ fn lies_there(run: &Path, sha256: &[u8; 32]) -> bool {
     results.any(|path| read_bytes(&path).is_ok_and(|bytes| Sha256::digest(&bytes).as_slice() == sha256))
 }
 
-/// Holds the bytes of a file against the plan.
+/// Parses the bytes of a file and checks them against the plan. Returns the measurement.
 fn measured(
     settings: &ManualSettings,
     plan: &Plan,
@@ -365,7 +369,7 @@ impl Machine for ManualMachine {
     }
 
     async fn prepare(&mut self, job: Job) -> Answered<Armed> {
-        // The cell goes on only behind a person's word that it is over.
+        // The cell continues only after a person has confirmed that the job is over.
         self.untold = None;
         let is_loaded = self.work.as_ref().is_some_and(|(_, digest)| *digest == job.digest);
         if self.state != State::Idle || !is_loaded {
@@ -411,7 +415,7 @@ impl Machine for ManualMachine {
         }
         match self.state {
             State::Prepared => (self.state, self.job) = (State::Idle, None),
-            // A person has confirmed that it stands.
+            // A person has confirmed that it does not move.
             State::Held => self.finish(Outcome::Stopped),
             _ => return self.go(Command::Stop, &[State::Execute, State::Holding], State::Stopping),
         }
@@ -489,7 +493,7 @@ impl Grinder for ManualMachine {
     }
 }
 
-/// The program of a pass in the folder of a cycle, in whatever dialect it is.
+/// Returns the path of the program of a pass in the folder of a cycle, in any dialect.
 fn program_in(folder: &Path) -> Option<PathBuf> {
     let files = std::fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
     let mut programs: Vec<PathBuf> =
@@ -502,7 +506,7 @@ fn program_in(folder: &Path) -> Option<PathBuf> {
 mod tests {
     use super::*;
 
-    /// A machine of a run that broke off at a pass.
+    /// Machine of a resumed run that was interrupted during a pass.
     fn taken_up() -> ManualMachine {
         let settings = ManualSettings {
             part: "a part".into(),
@@ -534,7 +538,7 @@ mod tests {
         let job = Job { job: 7, cycle: 2, digest: 3 };
         let armed = Armed { job, start_sequence: 1, token: 0, boot_id: 0 };
         assert!(matches!(taken_up().reconcile(&armed).await, Ok(Reconciled::Unknown { .. })));
-        // It may be moving: that it stands takes a person's word, and an abort is confirmed by nobody.
+        // It may be moving: a person must confirm that it does not, and nobody has confirmed an abort.
         let mut machine = taken_up();
         machine.connect().await.unwrap();
         assert_eq!(machine.stop().await.unwrap().state, State::Stopping);

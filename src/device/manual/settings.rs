@@ -1,4 +1,4 @@
-//! What a cell file says of a machine that a person serves.
+//! Settings of a machine operated by a person, in a cell file.
 
 use schemars::JsonSchema;
 use serde::Deserialize;

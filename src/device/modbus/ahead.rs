@@ -1,9 +1,10 @@
-//! Full pages of a result, read while its job still runs.
+//! Read-ahead: full pages of a result, read while its job still runs.
 //!
-//! A machine that can says so by a flag of its identity. Between two looks at the status one step is taken at most, the header first and then a
-//! page at a time, so that neither a beat nor an order waits for more than the request under way. What came so is kept beside whose
-//! it is: the line, the machine's boot, the START. The result is proved at its end as always, by its CRC over all pages; what was kept
-//! only need not be read again. Where the proof fails it is thrown away, and all is read anew.
+//! A machine that supports this says so by a flag of its identity. Between two reads of the status at most one step is
+//! taken: first the header, then one page at a time. So a heartbeat or an order waits for at most the request under
+//! way. The pages are stored with the line, the boot of the machine and the START to which they belong. The result is
+//! proved at its end as always, by its CRC over all pages; the stored pages only need not be read again. If the proof
+//! fails, they are discarded and all pages are read again.
 
 use std::time::Duration;
 
@@ -12,16 +13,17 @@ use super::link::Ask;
 use super::{Block, Header, ModbusMachine, PAGE, RESULT_BYTES};
 use crate::{DeviceError, Interrupt, Job, MeasuredPoint, Preliminary, State, digest};
 
-/// An order waits for the request under way. Where a page is longer on the line nothing is read ahead.
+/// Maximum transmission time of a page. An order waits for the request under way, so nothing is read ahead if a page
+/// takes longer.
 const LONGEST_REQUEST: Duration = Duration::from_millis(75);
-/// Bytes of a read of a page on a serial line, with its answer.
+/// Number of bytes of a page read on a serial line, with its answer.
 const PAGE_BYTES: u32 = 8 + 237;
-/// A page that does not show is selected anew after so many looks.
+/// Number of reads after which a page that is not shown is selected again.
 const LOOKS: u32 = 10;
-/// After so many failures the rest of a job is read at its end.
+/// Number of failures after which the rest of a job is read at its end.
 const MISSES: u32 = 3;
 
-/// The pages that were read ahead, and whose they are.
+/// Pages that were read ahead, with the connection, boot and job to which they belong.
 #[derive(Debug)]
 pub(super) struct Ahead {
     generation: u64,
@@ -29,15 +31,15 @@ pub(super) struct Ahead {
     start: u32,
     job: Job,
     header: Header,
-    /// The data of the pages, from the first on.
+    /// Data registers of the pages, from the first page on.
     words: Vec<u16>,
-    /// How often the page that is next was looked at since it was selected; none where it was not.
+    /// Number of reads of the next page since it was selected; `None` if it was not selected.
     looks: Option<u32>,
-    /// The progress at which the page that is next was not full yet.
+    /// Progress at which the next page was not full yet.
     not_full_at: Option<u32>,
 }
 
-/// What went wrong with reading ahead in a job.
+/// Failures of the read-ahead in a job.
 #[derive(Debug, Default)]
 pub(super) struct Misses {
     start: u32,
@@ -45,7 +47,7 @@ pub(super) struct Misses {
 }
 
 impl Ahead {
-    /// Points that are there whole.
+    /// Returns the number of complete points.
     fn points(&self) -> usize {
         self.words.len() / self.header.registers
     }
@@ -54,7 +56,7 @@ impl Ahead {
         (self.words.len() / PAGE) as u32
     }
 
-    /// Whether the page that is next should be full by what the status tells of the progress.
+    /// Returns true if the next page should be full according to the progress in the status.
     fn is_due(&self, progress: u32) -> bool {
         let registers = u64::from(progress) * self.header.registers as u64;
         let end = self.words.len() + PAGE;
@@ -63,7 +65,7 @@ impl Ahead {
 }
 
 impl ModbusMachine {
-    /// Takes one step ahead after a look at the status, at most one after each. Returns the points that are new by it.
+    /// Takes at most one step of reading ahead after a read of the status. Returns the new points, if there are any.
     pub(super) async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<Preliminary> {
         let block = self.seen.take()?;
         let runs = matches!(block.state, State::Execute | State::Holding | State::Held | State::Stopping);
@@ -85,7 +87,7 @@ impl ModbusMachine {
         self.misses.start == start && self.misses.count >= MISSES
     }
 
-    /// Counts a failure. A machine that refuses is not asked again in this job, and one that is busy is no failure.
+    /// Counts a failure. A machine that refuses is not asked again in this job. A busy machine is no failure.
     fn miss(&mut self, start: u32, error: &DeviceError) {
         if self.misses.start != start {
             self.misses = Misses { start, count: 0 };
@@ -124,7 +126,7 @@ impl ModbusMachine {
         self.take_page(page, block.progress.0).await
     }
 
-    /// Whether pages are of this job, and came on this line from this boot of the machine.
+    /// Returns true if pages belong to this job and came over this connection from this boot of the machine.
     fn is_of(&self, ahead: &Ahead, job: Job, start: u32) -> bool {
         let boot_id = self.unit.identity().map(|identity| identity.boot_id);
         self.unit.generation() == Some(ahead.generation)
@@ -132,7 +134,7 @@ impl ModbusMachine {
             && (ahead.job, ahead.start) == (job, start)
     }
 
-    /// Reads the header of what there is so far. It names the job and the plan, and has no number of an end.
+    /// Reads the header of the result so far. It names the job and the plan, and its number of the finished job is 0.
     async fn begin_ahead(&mut self, job: Job, block: &Block) -> Result<(), DeviceError> {
         let address = self.unit.map.outbox_header;
         let words = self.unit.once("outbox header", address, Ask::Read { address, count: 56 }).await?;
@@ -162,7 +164,7 @@ impl ModbusMachine {
         Ok(())
     }
 
-    /// Takes the page that was selected, if it shows and is full.
+    /// Reads the selected page and stores it, if it is shown and full. Returns the new points, if there are any.
     async fn take_page(&mut self, page: u32, progress: u32) -> Result<Option<Preliminary>, DeviceError> {
         let address = self.unit.map.outbox_page;
         let read = self.unit.once("outbox page", address, Ask::Read { address, count: 4 + PAGE as u16 }).await?;
@@ -188,7 +190,7 @@ impl ModbusMachine {
         Ok((!told.points.is_empty()).then_some(told))
     }
 
-    /// Reads the points from the first that was not told.
+    /// Decodes the points from the first one that was not reported yet.
     fn points_of(&self, ahead: &Ahead, told: usize) -> Result<Vec<MeasuredPoint>, DeviceError> {
         let Header { format, registers, scale_mm, .. } = ahead.header;
         let new = &ahead.words[told * registers..ahead.points() * registers];
@@ -197,7 +199,8 @@ impl ModbusMachine {
         points.collect()
     }
 
-    /// What was read ahead of this result; none where it is of another job, line, boot, plan or format, or more than there is.
+    /// Returns the registers that were read ahead of this result. Returns `None` if they belong to another job, line,
+    /// boot, plan or format, or are more than the result has.
     pub(super) fn kept(&self, job: Job, header: &Header, done: u32) -> Option<Vec<u16>> {
         let ahead = self.ahead.as_ref().filter(|ahead| self.is_of(ahead, job, done))?;
         let like = |of: &Header| {

@@ -1,4 +1,4 @@
-//! Registers of any content, given to everything that reads them: for tests and for fuzzing only.
+//! Registers of any content, passed to all code that reads them: for tests and for fuzzing only.
 
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::Duration;
@@ -7,24 +7,25 @@ use super::codec::{Registers, outcome, pass_figures, point, point_registers};
 use super::{Line, Link, ModbusMachine, ModbusSettings, WordOrder};
 use crate::{Job, MachineKind, Status};
 
-/// A driver whose line leads nowhere and is never asked.
+/// Returns a driver whose line leads nowhere and is never used.
 fn driver() -> ModbusMachine {
     let settings = ModbusSettings::new(Line::Tcp { host: "nowhere.invalid".into(), port: 502 });
     let link = Link::new(settings.line.clone(), settings.request_timeout, Duration::ZERO).expect("a thread");
     ModbusMachine::new(MachineKind::Cmm, link, settings)
 }
 
-/// Reads bytes as the registers of each block; the first byte says which block, and in which order the words are.
+/// Reads bytes as the registers of each block. The first byte selects the block and the word order.
 ///
 /// # Panics
-/// What must not be: a value that is no number, a result larger than any, a block that makes the driver panic.
+/// Panics if a forbidden result occurs: a value that is not finite, a result above the maximum size, or a block that
+/// makes the driver panic.
 pub fn any_registers(bytes: &[u8]) {
     static DRIVER: OnceLock<Mutex<ModbusMachine>> = OnceLock::new();
     let Some((which, bytes)) = bytes.split_first() else { return };
     let order = if which & 0x80 == 0 { WordOrder::Big } else { WordOrder::Little };
     let mut machine = DRIVER.get_or_init(|| Mutex::new(driver())).lock().unwrap_or_else(PoisonError::into_inner);
     machine.unit.map.word_order = order;
-    // The line below has seen to the length of an answer.
+    // The line below has checked the length of an answer.
     let sized = |registers: usize| {
         let mut words: Vec<u16> = bytes.as_chunks::<2>().0.iter().map(|pair| u16::from_be_bytes(*pair)).collect();
         words.resize(registers, 0);
@@ -77,7 +78,7 @@ mod tests {
 
     use super::*;
 
-    /// Blocks as a sound machine has them.
+    /// Returns blocks as a correct machine has them.
     fn samples() -> Vec<Vec<u8>> {
         let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fuzz/corpus/registers");
         let mut paths: Vec<_> = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();

@@ -1,7 +1,7 @@
-//! Registers and the values in them, both ways, exactly as docs/modbus.md has it.
+//! Encoding and decoding of registers, exactly as docs/modbus.md defines it.
 //!
-//! Everything of more than one register goes through [`WordOrder`], and nowhere else is an order of words decided. What is read is read by
-//! offset from [`Registers`], which never goes outside; what is written is put together by [`Writer`].
+//! Every value of more than one register goes through [`WordOrder`]; the word order is decided nowhere else. Values are
+//! read by offset from [`Registers`], which never reads outside. Registers to be written are built with [`Writer`].
 
 use sha2::{Digest, Sha256};
 
@@ -16,7 +16,8 @@ impl WordOrder {
     }
 }
 
-/// Registers that were read, and the values at their offsets. An offset outside reads as zero, so that a length has to be checked once.
+/// Registers that were read, with the values at their offsets. An offset outside reads as zero, so the length has to be
+/// checked only once.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Registers<'a> {
     words: &'a [u16],
@@ -56,7 +57,7 @@ impl<'a> Registers<'a> {
         f64::from_bits(self.order.bits(self.slice(at, 4)))
     }
 
-    /// Thirty-two bytes in sixteen registers; a string of bytes has no order of words.
+    /// Returns the 32 bytes in 16 registers. A string of bytes has no word order.
     pub(super) fn identity(&self, at: usize) -> [u8; 32] {
         let mut identity = [0; 32];
         for (pair, word) in identity.chunks_exact_mut(2).zip(self.slice(at, 16)) {
@@ -65,7 +66,7 @@ impl<'a> Registers<'a> {
         identity
     }
 
-    /// Printable ASCII up to the first zero; anything else becomes a question mark.
+    /// Returns the printable ASCII text up to the first zero. Any other byte becomes a question mark.
     pub(super) fn text(&self, at: usize, registers: usize) -> String {
         let bytes = bytes_of(self.slice(at, registers));
         let text = bytes.iter().take_while(|byte| **byte != 0);
@@ -73,7 +74,7 @@ impl<'a> Registers<'a> {
     }
 }
 
-/// Registers to be written, put together from the front.
+/// Builder of registers to be written, filled from the front.
 #[derive(Debug)]
 pub(super) struct Writer {
     words: Vec<u16>,
@@ -134,24 +135,24 @@ impl Writer {
     }
 }
 
-/// The bytes of registers in the order in which they are sent.
+/// Returns the bytes of registers in the order in which they are sent.
 pub(super) fn bytes_of(words: &[u16]) -> Vec<u8> {
     words.iter().flat_map(|word| word.to_be_bytes()).collect()
 }
 
-/// The CRC-32 over the bytes of registers.
+/// Returns the CRC-32 over the bytes of registers.
 pub(super) fn crc32(words: &[u16]) -> u32 {
     crc32fast::hash(&bytes_of(words))
 }
 
-/// The CRC-16 of Modbus RTU: polynomial 0xA001 reflected, from 0xFFFF.
+/// Returns the CRC-16 of Modbus RTU: reflected polynomial 0xA001, initial value 0xFFFF.
 pub(super) fn crc16(bytes: &[u8]) -> u16 {
     bytes.iter().fold(0xffff, |crc, byte| {
         (0..8).fold(crc ^ u16::from(*byte), |crc, _| if crc & 1 == 1 { (crc >> 1) ^ 0xa001 } else { crc >> 1 })
     })
 }
 
-/// The content of a command frame.
+/// Content of a command frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct CommandFrame {
     pub(super) sequence: u32,
@@ -164,7 +165,7 @@ pub(super) struct CommandFrame {
 }
 
 impl CommandFrame {
-    /// The twenty registers of the command block.
+    /// Returns the 20 registers of the command block.
     pub(super) fn words(&self, order: WordOrder) -> Vec<u16> {
         let (job, cycle, digest) = self.job.map_or((0, 0, 0), |job| (job.job, job.cycle, job.digest));
         let mut frame = Writer::new(order);
@@ -176,15 +177,15 @@ impl CommandFrame {
     }
 }
 
-/// A payload that can be carried to a machine.
+/// Payload that can be sent to a machine.
 pub(super) trait Payload: Identified {
-    /// The number of its kind.
+    /// Number of its kind.
     const KIND: u16;
-    /// What messages call it.
+    /// Name in messages.
     const WHAT: &'static str;
-    /// Its registers.
+    /// Returns its registers.
     fn words(&self, order: WordOrder) -> Vec<u16>;
-    /// The first value that no machine could take: the field, its value, and what is allowed.
+    /// Returns the first value that no machine could accept: the field, its value, and the allowed range.
     fn flaw(&self) -> Option<(String, f64, &'static str)>;
 }
 
@@ -192,13 +193,13 @@ fn sha256(words: &[u16]) -> [u8; 32] {
     Sha256::digest(bytes_of(words)).into()
 }
 
-/// The first of these that is not a finite number.
+/// Returns the first value that is not a finite number.
 fn not_finite<'a>(fields: impl IntoIterator<Item = (&'a str, f64)>) -> Option<(String, f64, &'static str)> {
     let flaw = fields.into_iter().find(|(_, value)| !value.is_finite());
     flaw.map(|(field, value)| (field.to_owned(), value, "a finite number"))
 }
 
-/// The first of these that is not a positive, finite number.
+/// Returns the first value that is not a positive, finite number.
 fn not_positive<'a>(fields: impl IntoIterator<Item = (&'a str, f64)>) -> Option<(String, f64, &'static str)> {
     let flaw = fields.into_iter().find(|(_, value)| !(value.is_finite() && *value > 0.0));
     flaw.map(|(field, value)| (field.to_owned(), value, "a finite number above 0"))
@@ -349,16 +350,16 @@ impl Identified for Pass {
     }
 }
 
-/// What is wrong with a record that came from a machine.
+/// Error in a record that a machine sent.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum RecordFlaw {
-    /// A coordinate or figure that is no finite number.
+    /// A coordinate or another value is not a finite number.
     NotFinite { field: String, value: f64 },
-    /// A code that the contract does not have.
+    /// A code is not in the contract.
     Unlisted { field: &'static str, found: u32 },
 }
 
-/// Registers of a record of points.
+/// Returns the number of registers of a point record in a format.
 pub(super) fn point_registers(format: u16) -> Option<usize> {
     match format {
         1 => Some(16),
@@ -367,7 +368,7 @@ pub(super) fn point_registers(format: u16) -> Option<usize> {
     }
 }
 
-/// One measured point from the registers of its record.
+/// Decodes one measured point from the registers of its record. `scale_mm` is the scale of counts in format 2.
 pub(super) fn point(record: Registers<'_>, format: u16, scale_mm: f64) -> Result<MeasuredPoint, RecordFlaw> {
     let index = record.u32(0);
     let status = match record.u16(2) {
@@ -386,7 +387,7 @@ pub(super) fn point(record: Registers<'_>, format: u16, scale_mm: f64) -> Result
     Ok(MeasuredPoint { index, status, quality: record.u16(3), at_mm })
 }
 
-/// The figures of a pass record: job, cycle, outcome, and the six numbers in their order.
+/// Decodes a pass record: job, cycle, outcome, and the six values in their order.
 pub(super) fn pass_figures(record: Registers<'_>) -> Result<(u32, u16, Outcome, [f64; 6]), RecordFlaw> {
     const FIELDS: [&str; 6] =
         ["path travelled", "volume removed", "largest depth", "idle share", "spindle load", "wheel radius"];
@@ -398,7 +399,7 @@ pub(super) fn pass_figures(record: Registers<'_>) -> Result<(u32, u16, Outcome, 
     }
 }
 
-/// How a job ended, from its number.
+/// Decodes the outcome of a job.
 pub(super) fn outcome(number: u16) -> Result<Outcome, RecordFlaw> {
     Ok(match number {
         0 => Outcome::None,
@@ -419,7 +420,7 @@ mod tests {
 
     #[test]
     fn words_go_high_first_or_low_first_and_bytes_always_high_first() {
-        // 0x12345678, and -2.5e-7 whose bits are 0xBE90C6F7A0B5ED8D.
+        // 0x12345678, and -2.5e-7, whose bits are 0xBE90C6F7A0B5ED8D.
         for (order, whole, real) in [
             (WordOrder::Big, [0x1234, 0x5678], [0xbe90, 0xc6f7, 0xa0b5, 0xed8d]),
             (WordOrder::Little, [0x5678, 0x1234], [0xed8d, 0xa0b5, 0xc6f7, 0xbe90]),

@@ -1,16 +1,18 @@
-//! One Modbus line: a TCP connection or a serial port, and everything that can go wrong on it.
+//! One Modbus line: a TCP connection or a serial port, with the handling of all its errors.
 //!
-//! A line lives on a thread of its own with a little runtime of its own, because a serial port can block where it should not, and because
-//! whatever else the program computes must not delay a beat. Requests come in by a channel, one is on the wire at a time, and several
-//! machines on one line share it by cloning the [`Link`].
+//! A line runs on a thread of its own with a small runtime, for two reasons: a serial port can block where it should
+//! not, and other computation of the program must not delay a heartbeat. Requests arrive through a channel, and one at
+//! a time is on the wire. Several machines on one line share it by cloning the [`Link`].
 //!
-//! A line is trusted until the first thing that is wrong. A time-out, a short answer, a foreign echo, bytes that nobody asked for: the
-//! connection is dropped with everything that may still arrive on it, the line is left alone for as long as the slowest machine may
-//! need, a serial line is listened to until it is silent, and only then is it opened anew, under a new *generation* number. Whoever had
-//! proved a machine on the old generation has to prove it again: a request names the generation it trusts and is turned away as stale when
-//! that is gone. An answer to an older question can so never be taken for the answer to a newer one.
+//! A line is trusted until the first error: a timeout, a short answer, a wrong echo, bytes without a request. Then the
+//! connection is dropped with all data that may still arrive on it. The line is not used for as long as the slowest
+//! machine may need for an answer. A serial line is read until it is silent. Only then is the line opened again, under
+//! a new *generation* number. A machine that was proved on the old generation must be proved again: a request names the
+//! generation that it trusts and is rejected as stale if that generation is gone. So the answer to an older request can
+//! never be mistaken for the answer to a newer one.
 //!
-//! The library below checks lengths and echoes only in debug builds, by panicking. The plain responses are asked for here and checked here.
+//! The library checks lengths and echoes only in debug builds, by panicking. So this module requests the plain
+//! responses and checks them itself.
 
 use std::fmt::Debug;
 use std::future::Future;
@@ -34,41 +36,41 @@ use tokio_serial::{SerialPort as _, SerialStream};
 use super::port;
 use super::settings::Line;
 
-/// The first wait before a line is opened again; it doubles up to [`LONGEST_BACKOFF`].
+/// First pause before a line is opened again; it doubles up to [`LONGEST_BACKOFF`].
 const FIRST_BACKOFF: Duration = Duration::from_millis(100);
-/// The longest wait before a line is opened again.
+/// Longest pause before a line is opened again.
 const LONGEST_BACKOFF: Duration = Duration::from_secs(5);
-/// A line that is not silent for so long is not going to be.
+/// Maximum time to wait for silence on a line.
 const LONGEST_DRAIN: Duration = Duration::from_secs(2);
 
-/// What a line has seen since it was made.
+/// Statistics of a line since it was created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LinkFigures {
-    /// Requests sent.
+    /// Number of requests sent.
     pub requests: u64,
-    /// Sound answers.
+    /// Number of valid answers.
     pub answers: u64,
-    /// Modbus exceptions among them.
+    /// Number of Modbus exceptions.
     pub exceptions: u64,
-    /// Requests that nothing came back for in time.
+    /// Number of requests without an answer in time.
     pub timeouts: u64,
-    /// Answers that did not hold: length, echo, unit, function, check sum, or nobody had asked.
+    /// Number of invalid answers: length, echo, unit, function or checksum is wrong, or there was no request.
     pub corrupt: u64,
-    /// Connections that ended from the other side.
+    /// Number of connections that the other side closed.
     pub disconnects: u64,
-    /// Attempts to open the line that failed.
+    /// Number of failed attempts to open the line.
     pub refused: u64,
-    /// Times the line was opened.
+    /// Number of times the line was opened.
     pub opened: u64,
-    /// Requests that were asked again.
+    /// Number of retries.
     pub retries: u64,
-    /// Time from request to answer, summed up over the answers, in nanoseconds.
+    /// Sum of the times from request to answer, in ns.
     pub answer_ns: u64,
-    /// The longest of them.
+    /// Longest time from request to answer, in ns.
     pub slowest_ns: u64,
 }
 
-/// The figures of a line, which its thread writes and its handles read.
+/// Statistics of a line, which its thread writes and its handles read.
 #[derive(Debug, Clone, Default)]
 struct Counters(Arc<Mutex<LinkFigures>>);
 
@@ -78,24 +80,24 @@ impl Counters {
     }
 }
 
-/// What can be wrong with one request.
+/// Error of one request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum LinkFault {
     /// The line could not be opened.
     Unreachable(io::ErrorKind),
-    /// No answer in time.
+    /// No answer arrived in time.
     TimedOut,
-    /// The other side closed.
+    /// The other side closed the connection.
     Disconnected,
-    /// An answer that does not hold.
+    /// The answer is invalid.
     Corrupt { what: &'static str, expected: u64, found: u64 },
-    /// A sound answer that says no.
+    /// The machine answered with a Modbus exception.
     Exception(u8),
     /// The generation that the request trusts is gone; nothing was sent.
     Stale,
 }
 
-/// What is asked.
+/// Request to a line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Ask {
     Read {
@@ -106,7 +108,7 @@ pub(super) enum Ask {
         address: u16,
         words: Arc<[u16]>,
     },
-    /// What came over the line does not hold, by a check that the line cannot make: give it up.
+    /// Drops the connection: a check that the line cannot make has found its data invalid.
     Distrust,
 }
 
@@ -119,38 +121,38 @@ struct Question {
     reply: oneshot::Sender<Answer>,
 }
 
-/// A stream between a line and its machines. Whoever asks can tell whether bytes wait on it to be read.
+/// Stream between a line and its machines. It can report if bytes wait to be read.
 pub trait LineStream: AsyncRead + AsyncWrite + Debug + Send + Unpin {
-    /// Returns how many bytes wait, as far as can be told.
+    /// Returns the number of waiting bytes, as far as known.
     ///
     /// # Errors
-    /// The far side has closed.
+    /// The far side has closed the stream.
     fn waiting(&mut self, cx: &mut Context<'_>) -> io::Result<usize>;
 }
 
-/// How a line is opened where no socket and no port of this computer leads to its machines.
+/// Method to open a line. An own implementation is for lines that use no socket and no port of this computer.
 pub trait Dial: Debug + Send + Sync {
-    /// Opens it.
+    /// Opens the line.
     fn dial<'a>(&'a mut self, line: &'a Line) -> Dialled<'a>;
 }
 
-/// A line that is being opened.
+/// Future of a line that is being opened.
 pub type Dialled<'a> = Pin<Box<dyn Future<Output = io::Result<Box<dyn LineStream>>> + Send + 'a>>;
 
-/// A handle to one line. Clones share it; the line ends with its last handle.
+/// Handle to one line. Clones share it; the line ends with its last handle.
 #[derive(Debug, Clone)]
 pub struct Link {
     line: Line,
     request_timeout: Duration,
     questions: mpsc::Sender<Question>,
-    /// Cuts a pause of the line short.
+    /// Ends a pause of the line early.
     hurried: Arc<Notify>,
     counters: Counters,
 }
 
 impl Link {
-    /// A line that is opened when it is first asked. `quarantine` is how long a machine on it may need for an answer at worst: after an
-    /// error the line is left alone for so long.
+    /// Creates a line that is opened with its first request. `quarantine` is the worst-case answer time of a machine on
+    /// it: after an error the line is not used for this time.
     pub fn new(line: Line, request_timeout: Duration, quarantine: Duration) -> io::Result<Self> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let name = format!("line {line}");
@@ -160,8 +162,8 @@ impl Link {
         Ok(link)
     }
 
-    /// A line that somebody else opens, as a task of the runtime that this is called in; its dice are those of the seed. For machines that
-    /// stand in the same process, and for time that does not pass by itself.
+    /// Creates a line that `dial` opens, as a task of the current runtime. Its random numbers come from `seed`. For
+    /// machines in the same process, and for simulated time.
     pub fn over(line: Line, request_timeout: Duration, quarantine: Duration, dial: Box<dyn Dial>, seed: u64) -> Self {
         let (link, connection, inbox) = Self::ends(line, request_timeout, quarantine, dial, seed);
         tokio::spawn(connection.run(inbox));
@@ -181,17 +183,17 @@ impl Link {
         (link, connection, inbox)
     }
 
-    /// Where it leads.
+    /// Returns the address of the line.
     pub fn line(&self) -> &Line {
         &self.line
     }
 
-    /// What it has seen so far.
+    /// Returns the statistics so far.
     pub fn figures(&self) -> LinkFigures {
         *self.counters.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Lets the next question open the line at once, without the pause after an error.
+    /// Lets the next request open the line at once, without the pause after an error.
     pub(super) fn hurry(&self) {
         self.hurried.notify_one();
     }
@@ -204,12 +206,12 @@ impl Link {
         self.counters.count(|figures| figures.retries += 1);
     }
 
-    /// Asks one thing of one unit. With a generation, only on that connection; without, the line is opened if need be. Gives the
-    /// generation on which the answer came.
+    /// Sends one request to one unit and returns the generation on which the answer came, with the registers. With a
+    /// generation, the request is sent only on that connection; without one, the line is opened if necessary.
     pub(super) async fn ask(&self, unit: u8, generation: Option<u64>, ask: Ask) -> Answer {
         let (reply, answer) = oneshot::channel();
         let question = Question { unit, generation, ask, reply };
-        // The line keeps its own time-outs; this one is for a port that blocks inside the operating system.
+        // The line has its own timeouts; this one is for a port that blocks inside the operating system.
         let limit = self.request_timeout * 4 + LONGEST_BACKOFF * 2 + LONGEST_DRAIN;
         let both = async {
             self.questions.send(question).await.map_err(|_| LinkFault::Disconnected)?;
@@ -219,7 +221,7 @@ impl Link {
     }
 }
 
-/// The far side of the channel: the connection and its history.
+/// Receiving side of the channel: the connection and its history.
 struct Connection {
     line: Line,
     request_timeout: Duration,
@@ -257,7 +259,7 @@ impl Connection {
     async fn run(mut self, mut inbox: mpsc::Receiver<Question>) {
         while let Some(question) = inbox.recv().await {
             if question.reply.is_closed() {
-                continue; // whoever asked has gone; what was never sent need not be
+                continue; // the client has gone, so the request need not be sent
             }
             let answer = self.serve(&question).await;
             let _ = question.reply.send(answer);
@@ -304,7 +306,7 @@ impl Connection {
         }
     }
 
-    /// Drops the connection with all that may still come over it, and leaves the line alone for a while.
+    /// Drops the connection with all data that may still arrive on it, and sets the pause before the next opening.
     fn give_up(&mut self) {
         self.connection = None;
         self.failures = self.failures.saturating_add(1);
@@ -317,7 +319,7 @@ impl Connection {
         tokio::select! {
             biased;
             () = sleep_until(self.not_before) => {}
-            // What the line still carries is drained, and its sync proven, all the same.
+            // The line is drained, and its sync proved, all the same.
             () = self.hurried.notified() => {}
         }
         let limit = self.request_timeout.max(Duration::from_secs(1)) + LONGEST_DRAIN;
@@ -365,7 +367,8 @@ impl Connection {
     }
 }
 
-/// Whether a response is the whole answer to what was asked, and nothing else.
+/// Returns the registers if a response is the complete answer to the request and nothing else; otherwise returns the
+/// error.
 fn check(ask: &Ask, response: tokio_modbus::Result<Response>) -> Result<Vec<u16>, LinkFault> {
     let response = response.map_err(fault_of)?;
     let response = response.map_err(|exception| LinkFault::Exception(exception.into()))?;
@@ -419,7 +422,7 @@ fn fault_of(error: tokio_modbus::Error) -> LinkFault {
 }
 
 impl Line {
-    /// The silence of three and a half characters that parts two frames; nothing on TCP.
+    /// Returns the silence of 3.5 characters that separates two frames; zero on TCP.
     fn silence(&self) -> Duration {
         match self {
             Self::Tcp { .. } => Duration::ZERO,
@@ -428,12 +431,12 @@ impl Line {
         }
     }
 
-    /// How long the longest request and the longest answer are on the line.
+    /// Returns the transmission time of the longest request with the longest answer.
     fn transmission_at_most(&self) -> Duration {
         self.transmission(2 * 256)
     }
 
-    /// How long so many bytes are on the line; no time on TCP.
+    /// Returns the transmission time of a number of bytes; zero on TCP.
     pub(super) fn transmission(&self, bytes: u32) -> Duration {
         match self {
             Self::Tcp { .. } => Duration::ZERO,
@@ -442,7 +445,7 @@ impl Line {
     }
 }
 
-/// Opens a line, and listens to a serial one until it is silent.
+/// Opens a line, and reads a serial line until it is silent.
 async fn connect(line: &Line, dial: &mut dyn Dial) -> io::Result<tokio_modbus::client::Context> {
     let mut stream = dial.dial(line).await?;
     match line {
@@ -465,7 +468,7 @@ impl Dial for OfThisComputer {
                 Line::Tcp { host, port } => {
                     let stream = TcpStream::connect((host.as_str(), *port)).await?;
                     stream.set_nodelay(true)?;
-                    // A connection that is given up takes what it has not sent yet with it: no START arrives after it was given up.
+                    // A connection that is given up discards its unsent data: no START arrives after that.
                     stream.set_zero_linger()?;
                     Ok(Box::new(stream) as Box<dyn LineStream>)
                 }
@@ -477,7 +480,7 @@ impl Dial for OfThisComputer {
     }
 }
 
-/// Reads a serial line empty until it has been silent for a while.
+/// Reads a serial line until it has been silent for a time.
 async fn drain(port: &mut dyn LineStream, silence: Duration) -> io::Result<()> {
     let until = Instant::now() + LONGEST_DRAIN;
     let mut bytes = [0; 256];
@@ -509,8 +512,9 @@ impl LineStream for SerialStream {
     }
 }
 
-/// A stream on which nothing may wait when a request is begun: what waits then was sent to nobody's question, and the answer that follows
-/// could not be told from it. Its flush does not wait for a serial port to have sent everything, for that would block the thread.
+/// Stream on which no byte may wait when a request begins. Bytes that wait belong to no request, and the following
+/// answer could not be distinguished from them. The flush does not wait until a serial port has sent everything,
+/// because that would block the thread.
 #[derive(Debug)]
 struct Listening {
     inner: Box<dyn LineStream>,
@@ -592,7 +596,7 @@ mod tests {
             let answer = link.ask(1, None, Ask::Read { address: 0, count: 1 }).await;
             assert!(matches!(answer, Err(LinkFault::Unreachable(_))), "{answer:?}");
         }
-        // At least half of 0.1 s and of 0.2 s, whatever the dice say.
+        // At least half of 0.1 s and of 0.2 s, whatever the random numbers are.
         assert!(began.elapsed() >= Duration::from_millis(150), "{:?}", began.elapsed());
         assert_eq!((link.figures().refused, link.figures().opened), (3, 0));
     }

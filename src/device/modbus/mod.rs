@@ -1,9 +1,14 @@
-//! The drivers of docs/modbus.md: a measuring machine and a grinder behind Modbus registers.
+//! Drivers of docs/modbus.md: a measuring machine and a grinder with Modbus registers.
 //!
-//! Both are the same machine with other payloads, so nearly everything is in [`ModbusMachine`]. It follows the page literally: a command is
-//! a value with a number, written until it is acknowledged; payloads go up in pages, and the slots in force are read back and compared;
-//! results come down in pages between two readings of their header. The one thing that is never repeated is START: its frame may be written
-//! again, with its number, and if that too does not tell, the outcome is unknown and stays so until the machine is asked.
+//! Both machines differ only in their payloads, so nearly everything is in [`ModbusMachine`]. It follows the page
+//! literally:
+//!
+//! * A command is a value with a number. It is written until it is acknowledged.
+//! * Payloads are sent in pages. The slots in force are read back and compared.
+//! * Results are read in pages between two readings of their header.
+//!
+//! Only START is never repeated under a new number. Its frame may be written again with the same number. If that does
+//! not give an answer either, the outcome is unknown and stays unknown until the machine is asked.
 
 mod ahead;
 #[cfg(any(test, fuzzing))]
@@ -40,22 +45,22 @@ pub use settings::{
 };
 use unit::{Unit, UnitSettings};
 
-/// Registers of data in a full page.
+/// Number of data registers in a full page.
 const PAGE: usize = 112;
-/// A machine whose beat stands for so long is frozen.
+/// Time after which a machine with an unchanged heartbeat counts as frozen.
 const FROZEN_AFTER: Duration = Duration::from_millis(1500);
-/// How long a machine is given to acknowledge a command before the same frame is written again.
+/// Time for a machine to acknowledge a command before the same frame is written again.
 const ACKNOWLEDGED_WITHIN: Duration = Duration::from_millis(500);
-/// How long a machine is given to work a payload in, or to reach the state that it has announced.
+/// Time for a machine to process a payload, or to reach the announced state.
 const SETTLED_WITHIN: Duration = Duration::from_secs(5);
-/// The span over which a start has to be seen not taken.
+/// Time over which a start must be seen as not accepted.
 const SEEN_TWICE_OVER: Duration = Duration::from_millis(1050);
-/// The temperature in the status of a machine that has no thermometer.
+/// Temperature in the status of a machine without a thermometer.
 const NO_THERMOMETER: i16 = i16::MIN;
-/// More than this is no result of a measuring machine.
+/// Maximum size of a result of a measuring machine, in bytes.
 const RESULT_BYTES: u32 = 64 << 20;
 
-/// A payload that is in force at the machine, as far as this driver has brought it there.
+/// Payload that this driver has brought into force at the machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Slot {
     bytes: u32,
@@ -63,7 +68,7 @@ struct Slot {
     identity: [u8; 32],
 }
 
-/// What the drivers of both machines have in common.
+/// Common part of the drivers of both machines.
 #[derive(Debug)]
 pub struct ModbusMachine {
     unit: Unit,
@@ -75,19 +80,21 @@ pub struct ModbusMachine {
     expected_name: Option<String>,
     simulation: Option<bool>,
     sequence: u32,
-    /// Whether the machine has acknowledged this client as its owner on this connection: only an owner's beat says that all is well.
+    /// True if the machine has acknowledged this client as its owner on this connection. Only the heartbeat of an owner
+    /// is written.
     owned: bool,
-    /// Whether this client has met the machine before.
+    /// True if this client has connected to the machine before.
     met: bool,
-    /// The START that was given last, or asked about: only what it has begun is this client's.
+    /// Sequence number of the START that was given last, or that was reconciled last. Only a job that it has begun
+    /// belongs to this client.
     began: Option<u32>,
     beat: u16,
     beaten: Option<Instant>,
     seen_beat: Option<(u16, Instant)>,
     loaded: BTreeMap<u16, Slot>,
-    /// The last look, for the one step ahead that may follow it.
+    /// Last status block, for the one step of reading ahead that may follow it.
     seen: Option<Block>,
-    /// The pages of a result that were read while its job ran.
+    /// Pages of a result that were read while its job ran.
     ahead: Option<Ahead>,
     misses: Misses,
 }
@@ -127,12 +134,13 @@ impl ModbusMachine {
         self.unit.name.clone()
     }
 
-    /// The line of this machine.
+    /// Returns the line of this machine.
     pub fn link(&self) -> &Link {
         &self.unit.link
     }
 
-    // ---- status and beats --------------------------------------------------------------------------------------------------------
+    // ---- status and heartbeats
+    // ---------------------------------------------------------------------------------------------------
 
     async fn connect(&mut self) -> Result<Identity, DeviceError> {
         self.seen_beat = None;
@@ -140,19 +148,20 @@ impl ModbusMachine {
         self.loaded.clear();
         self.ahead = None;
         let identity = self.unit.meet().await?;
-        // Before the first write that means anything to a machine that may be another one.
+        // The check comes before the first meaningful write, because this may be another machine.
         self.check_identity(&identity)?;
         let status = self.look().await?;
         self.sequence = self.sequence.max(status.acknowledged);
-        // The machine's memory counts for more than a clock: an earlier start of this client may have had a later one. Who comes back with
-        // a higher number than this start ever had is another client, and is not outbid.
+        // The memory of the machine counts more than a clock: an earlier start of this client may have had a later
+        // clock. A client that returns with a higher epoch than this start ever had is another client. This client does
+        // not exceed its epoch.
         if !std::mem::replace(&mut self.met, true) && status.owner == self.owner {
             self.epoch = self.epoch.max(status.epoch.saturating_add(1));
         }
         Ok(identity)
     }
 
-    /// Compares who is there with what the cell file says of the machine.
+    /// Compares the identity of the machine with the cell file.
     fn check_identity(&self, identity: &Identity) -> Result<(), DeviceError> {
         if let Some(expected) = self.expected_name.as_ref().filter(|expected| **expected != identity.name) {
             let (expected, found) = (expected.clone(), identity.name.clone());
@@ -166,7 +175,7 @@ impl ModbusMachine {
         }
     }
 
-    /// Tells the machine that its client is alive, if that has not been said just now.
+    /// Writes the heartbeat, unless the last one is recent. Does nothing if this client is not the owner.
     async fn beat(&mut self) -> Result<(), DeviceError> {
         if !self.owned {
             return Ok(());
@@ -181,7 +190,7 @@ impl ModbusMachine {
         self.unit.write("beat", self.unit.map.beat, beat.words()).await
     }
 
-    /// Reads the status block, of one moment, without the further signals.
+    /// Reads the status block, all of one moment, without the additional signals.
     async fn look(&mut self) -> Result<Block, DeviceError> {
         self.beat().await?;
         let address = self.unit.map.status;
@@ -260,13 +269,14 @@ impl ModbusMachine {
         for k in 0..self.signals.len() {
             let reading = self.signal(k).await?;
             status.signals.push(reading);
-            // What is slow to tell does not make the machine believe that its client is gone.
+            // A slow signal must not make the machine believe that its client is lost.
             self.beat().await?;
         }
         Ok(status)
     }
 
-    /// Tells when another client has taken the machine: what it does from then on is not ours to tell. An abort is anybody's.
+    /// Returns an error if another client has taken the machine: its further actions are not ours to report. An abort
+    /// is allowed for every client.
     fn check_owner(&self, status: &Block) -> Result<(), DeviceError> {
         let aborts = matches!(status.state, State::Aborting | State::Aborted);
         if !self.owned || status.owner == self.owner || aborts {
@@ -275,7 +285,8 @@ impl ModbusMachine {
         Err(DeviceError::Taken { machine: self.machine(), ours: self.owner, owner: status.owner })
     }
 
-    /// Reads a signal; one that the machine does not have, or that reads as no number, has no value and says why.
+    /// Reads a signal. A signal that the machine does not have, or that is not a finite number, has no value but a
+    /// cause.
     async fn signal(&mut self, k: usize) -> Result<SignalValue, DeviceError> {
         let signal = self.signals[k].clone();
         let ask = Ask::Read { address: signal.address, count: signal.kind.registers() };
@@ -293,7 +304,7 @@ impl ModbusMachine {
         Ok(SignalValue { name, value, unit, range, cause })
     }
 
-    // ---- commands ----------------------------------------------------------------------------------------------------------------
+    // ---- commands --------------------------------------------------------------------------------------------------
 
     fn next_sequence(&mut self) -> u32 {
         self.sequence = self.sequence.checked_add(1).unwrap_or(1);
@@ -310,7 +321,8 @@ impl ModbusMachine {
         self.order(frame).await
     }
 
-    /// Writes a command until it is acknowledged, and tells a no from a yes. The same frame every time.
+    /// Writes a command until it is acknowledged, with the same frame every time. Returns an error if the machine
+    /// refuses it.
     async fn order(&mut self, frame: CommandFrame) -> Result<Block, DeviceError> {
         let CommandFrame { command, sequence, .. } = frame;
         let status = self.acknowledged(frame).await?;
@@ -371,7 +383,8 @@ impl ModbusMachine {
         Ok(Armed { job, start_sequence: self.next_sequence(), token: status.token, boot_id: status.boot_id })
     }
 
-    /// The first status of which something holds; a fault, or another state than the way there, ends the wait.
+    /// Waits until a condition on the status holds, and returns that status. A fault or the timeout ends the wait with
+    /// an error.
     async fn reaches(&mut self, holds: impl Fn(&Block) -> bool) -> Result<Block, DeviceError> {
         let began = Instant::now();
         loop {
@@ -390,7 +403,7 @@ impl ModbusMachine {
         }
     }
 
-    /// Whether the machine is at the job that is meant.
+    /// Returns an error unless the machine has the intended job.
     fn agree(&self, job: Job, status: &Block) -> Result<(), DeviceError> {
         let held = status.job.unwrap_or(Job { job: 0, cycle: 0, digest: 0 });
         let fields = [
@@ -401,7 +414,7 @@ impl ModbusMachine {
         self.compare(fields)
     }
 
-    /// Refuses the first field in which the machine holds something else than was sent or is meant.
+    /// Returns an error for the first field in which the machine differs from what was sent or intended.
     fn compare<const N: usize>(&self, fields: [(&'static str, u64, u64); N]) -> Result<(), DeviceError> {
         match fields.into_iter().find(|(_, sent, held)| sent != held) {
             Some((field, sent, held)) => Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held }),
@@ -413,10 +426,11 @@ impl ModbusMachine {
         let Armed { job, start_sequence, token, boot_id } = armed;
         let known = self.unit.identity().map_or(0, |identity| identity.boot_id);
         if boot_id != known {
-            // Nothing has been sent: whatever was prepared died with the machine's restart.
+            // Nothing was sent: the restart of the machine has discarded the prepared job.
             return Err(DeviceError::Restarted { machine: self.machine(), was: boot_id, is: known });
         }
-        // Nothing has been sent yet, so a failure here is only that; and a prepared job that has died since is a clear no.
+        // Nothing was sent yet, so an error here is only a failed read. A prepared job that has expired since is a
+        // clear refusal.
         let before = self.look().await?;
         let taken = before.begun_by == start_sequence || before.acknowledged == start_sequence;
         if !taken && (before.state != State::Prepared || before.token != token) {
@@ -446,7 +460,7 @@ impl ModbusMachine {
                 let (machine, field) = (self.machine(), "the START that began the job");
                 Err(unknown(self.machine(), DeviceError::Mismatch { machine, field, sent, held }))
             }
-            // The machine has answered this very START, and the answer was no.
+            // The machine has answered this very START and refused it.
             Err(refused @ DeviceError::Refused { .. }) => Err(refused),
             Err(DeviceError::NotConnected { machine, what }) => Err(DeviceError::NotConnected { machine, what }),
             Err(why) => Err(unknown(self.machine(), why)),
@@ -464,15 +478,17 @@ impl ModbusMachine {
         self.simply(Command::Release).await
     }
 
-    /// Ends at once, whatever became of the connection and whoever has counted further meanwhile: it connects by itself, without
-    /// the pause that others keep, and goes past the number that the machine has now.
+    /// Ends the job at once, whatever the state of the connection and whatever sequence number another client has
+    /// reached. It connects by itself without the pause that other commands observe, and uses a number above the one
+    /// that the machine has now.
     async fn abort(&mut self) -> Result<Block, DeviceError> {
         self.unit.link.hurry();
         if self.unit.identity().is_none() {
             self.unit.meet_within(Duration::ZERO).await?;
         }
         match self.simply(Command::Abort).await {
-            // Somebody else has counted further: what counts is where it led, and else an abort is worth going past them.
+            // Another client has used higher numbers. The state of the machine decides; if it does not abort, an abort
+            // justifies a number above theirs.
             Err(DeviceError::NotAcknowledged { acknowledged, .. }) => match self.look().await? {
                 status if matches!(status.state, State::Aborting | State::Aborted) => Ok(status),
                 _ => {
@@ -502,14 +518,15 @@ impl ModbusMachine {
                 }
             }
         }
-        // A START may still be under way in the network. Once a higher number is acknowledged the machine takes it no more.
+        // A START may still be under way in the network. Once the machine has acknowledged a higher number, it no
+        // longer accepts this START.
         self.sequence = self.sequence.max(intended.start_sequence).max(first.acknowledged);
         self.claim().await?;
         let second = self.look().await?;
         Ok(what_became(intended, &second).unwrap_or(Reconciled::NotStarted(second.into())))
     }
 
-    // ---- payloads ----------------------------------------------------------------------------------------------------------------
+    // ---- payloads --------------------------------------------------------------------------------------------------
 
     async fn load<P: Payload>(&mut self, payload: &P, interrupt: &Interrupt) -> Result<(), DeviceError> {
         if let Some((field, value, limit)) = payload.flaw() {
@@ -578,7 +595,7 @@ impl ModbusMachine {
             page.u32(done).u16(data.len() as u16).zeros(5);
             let page = [page.words(), data].concat();
             match self.unit.write("inbox page", address, &page).await {
-                // Out of turn: an older write has come late and emptied the inbox.
+                // Out of order: an older write has arrived late and emptied the inbox.
                 Err(DeviceError::Exception { code: 3, .. }) => {
                     let state = self.unit.read("inbox state", self.unit.map.inbox_state, 12).await?;
                     let next = self.unit.registers(&state).u32(2);
@@ -597,7 +614,7 @@ impl ModbusMachine {
         }
     }
 
-    /// Waits until the machine says that it has taken the payload, and whether it has it whole.
+    /// Waits until the machine reports that it has accepted the payload, and checks that the payload is complete.
     async fn taken<P: Payload>(&mut self, slot: Slot) -> Result<(), DeviceError> {
         let began = Instant::now();
         loop {
@@ -625,7 +642,7 @@ impl ModbusMachine {
         }
     }
 
-    /// Whether the machine would use what was brought there.
+    /// Returns an error unless the machine would use the payload that was loaded.
     async fn compare_slot(&mut self, kind: u16) -> Result<(), DeviceError> {
         let Some(slot) = self.loaded.get(&kind).copied() else { return Ok(()) };
         let address = self.unit.map.in_force + 24 * (kind - 1);
@@ -648,9 +665,9 @@ impl ModbusMachine {
         Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held })
     }
 
-    // ---- results -----------------------------------------------------------------------------------------------------------------
+    // ---- results ---------------------------------------------------------------------------------------------------
 
-    /// Fetches the result of a job: its header, and its registers, proved whole.
+    /// Fetches the result of a job, with proof that it is complete. Returns the status, the header and the registers.
     async fn fetch(
         &mut self,
         job: Job,
@@ -671,7 +688,7 @@ impl ModbusMachine {
             }
             match self.fetch_once(job, kind, status.done, interrupt).await {
                 Ok(Some((header, words))) => return Ok((status, header, words)),
-                // What was read ahead does not belong to it: now all of it is read.
+                // The pages that were read ahead do not belong to this result; the next attempt reads all pages.
                 Ok(None) => {}
                 Err(error) if !error.is_link() || tries >= self.retries => return Err(error),
                 Err(_) => tries += 1,
@@ -733,7 +750,7 @@ impl ModbusMachine {
         }
         let reals = [("the probe's radius", 12), ("the scale", 16), ("the mean temperature", 20), ("the duration", 24)];
         for (field, at) in reals {
-            // A machine without a thermometer tells no number as the temperature.
+            // A machine without a thermometer gives NaN as the temperature.
             let is_untold = at == 20 && block.f64(at).is_nan();
             if !is_untold && !block.f64(at).is_finite() {
                 return Err(DeviceError::NotFinite { machine, field: field.into(), value: block.f64(at) });
@@ -770,7 +787,8 @@ impl ModbusMachine {
         })
     }
 
-    /// Fetches one page. A machine may need a turn of its program to put it there, so another page's number is asked again for a while.
+    /// Fetches one page. A machine may need a cycle of its program to provide it, so if another page number is there,
+    /// the request is repeated for a while.
     async fn fetch_page(&mut self, page: u32, due: usize, words: &mut Vec<u16>) -> Result<(), DeviceError> {
         let map = self.unit.map;
         let mut select = self.unit.writer();
@@ -821,36 +839,36 @@ impl ModbusMachine {
     }
 }
 
-/// The status block of docs/modbus.md, as far as it is used, all of one moment.
+/// Status block of docs/modbus.md, as far as it is used, all of one moment.
 #[derive(Debug, Clone, PartialEq)]
 struct Block {
     state: State,
-    /// In automatic mode, not in manual.
+    /// True in automatic mode, false in manual mode.
     automatic: bool,
-    /// Guards closed, clear of the part, part clamped, supplies there; from bit 0.
+    /// Bits from bit 0: guards closed, clear of the part, part clamped, supplies present.
     interlocks: u16,
-    /// The sequence number of the last command it acted upon, and its answer.
+    /// Sequence number of the last command that the machine acted upon; `answer` is its answer.
     acknowledged: u32,
     answer: Answer,
     fault: Fault,
-    /// The job prepared, running or finished.
+    /// Job that is prepared, running or finished.
     job: Option<Job>,
-    /// Of the prepared job; 0 when there is none.
+    /// Token of the prepared job; 0 if there is none.
     token: u32,
-    /// The START whose job ended last, and how; 0 when there is none.
+    /// Sequence number of the START whose job ended last, 0 if there is none; `outcome` says how.
     done: u32,
     outcome: Outcome,
     progress: (u32, u32),
-    /// Whose it is; 0 when nobody's.
+    /// Owner; 0 if nobody owns the machine.
     owner: u32,
     epoch: u32,
-    /// The machine's own beat.
+    /// Heartbeat of the machine.
     beat: u16,
-    /// The job and cycle begun last, kept over a restart of the machine.
+    /// Job and cycle that were begun last; the machine keeps them over its restart.
     last_begun: (u32, u16),
-    /// The START that began the running or last job; 0 when there is none.
+    /// Sequence number of the START that began the running or last job; 0 if there is none.
     begun_by: u32,
-    /// None where it has no thermometer.
+    /// Temperature in °C; `None` if the machine has no thermometer.
     temperature_c: Option<f64>,
     boot_id: u32,
 }
@@ -882,7 +900,7 @@ impl From<Block> for Status {
     }
 }
 
-/// The header of a result.
+/// Header of a result.
 #[derive(Debug, Clone)]
 struct Header {
     format: u16,
@@ -893,13 +911,14 @@ struct Header {
     coordinates: u16,
     probe_radius_mm: f64,
     scale_mm: f64,
-    /// None where it has no thermometer.
+    /// Temperature in °C; `None` if the machine has no thermometer.
     temperature_c: Option<f64>,
     duration_s: f64,
     identity: [u8; 32],
 }
 
-/// What a status tells of a start, or nothing when it looks as if the start was not taken, which has to be seen twice.
+/// Returns the outcome of a start according to a status. Returns `None` if the start appears not to be accepted, which
+/// must be seen twice.
 fn what_became(intended: &Armed, status: &Block) -> Option<Reconciled> {
     let Armed { job, start_sequence, boot_id, .. } = *intended;
     let unknown = |why: String| Some(Reconciled::Unknown { why });
@@ -968,7 +987,7 @@ fn answer_of(number: u16) -> Answer {
     }
 }
 
-/// A driver that is a [`ModbusMachine`] and answers as a [`Machine`] by it.
+/// Defines a driver that wraps a [`ModbusMachine`] and implements [`Machine`] with it.
 macro_rules! modbus_driver {
     ($(#[$doc:meta])* $driver:ident, $kind:expr) => {
         $(#[$doc])*
@@ -976,18 +995,19 @@ macro_rules! modbus_driver {
         pub struct $driver(ModbusMachine);
 
         impl $driver {
-            /// A driver on a line of its own. Nothing is sent before it is connected.
+            /// Creates a driver on a line of its own. Sends nothing before it connects.
             pub fn new(settings: ModbusSettings) -> io::Result<Self> {
                 let link = Link::new(settings.line.clone(), settings.request_timeout, settings.quarantine)?;
                 Ok(Self::on(link, settings))
             }
 
-            /// A driver on a line that it shares with other machines. The wire and the time-outs of the line hold, not those of the settings.
+            /// Creates a driver on a line that it shares with other machines. The wire and the timeouts of the line
+            /// apply, not those of the settings.
             pub fn on(link: Link, settings: ModbusSettings) -> Self {
                 Self(ModbusMachine::new($kind, link, settings))
             }
 
-            /// The line, for its figures, or to put another machine on it.
+            /// Returns the line, for its statistics or to put another machine on it.
             pub fn link(&self) -> &Link {
                 self.0.link()
             }
@@ -1041,12 +1061,12 @@ macro_rules! modbus_driver {
 }
 
 modbus_driver!(
-    /// A measuring machine that speaks docs/modbus.md.
+    /// Measuring machine that follows docs/modbus.md.
     ModbusCmm,
     MachineKind::Cmm
 );
 modbus_driver!(
-    /// A grinder that speaks docs/modbus.md.
+    /// Grinder that follows docs/modbus.md.
     ModbusGrinder,
     MachineKind::Grinder
 );

@@ -1,4 +1,4 @@
-//! What a cell file says of a machine on Modbus, and everything that has to be known to drive it.
+//! Modbus settings of a machine in a cell file, and all settings of its driver.
 
 use std::net::IpAddr;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use super::port;
 use crate::place::Place;
 use regrind_document::Document;
 
-/// Registers that a Modbus device can have.
+/// Number of registers that a Modbus device can have.
 const REGISTERS: u32 = 1 << 16;
 
 /// Which word of a value of several registers comes first. The bytes within a register are high byte first always.
@@ -29,7 +29,7 @@ pub enum WordOrder {
 }
 
 impl WordOrder {
-    /// As it is written in a cell file.
+    /// Returns the name in a cell file.
     pub fn name(self) -> &'static str {
         match self {
             Self::Big => "big",
@@ -39,7 +39,7 @@ impl WordOrder {
         }
     }
 
-    /// The order with the other word first.
+    /// Returns the order with the other word first.
     pub fn other(self) -> Self {
         match self {
             Self::Big => Self::Little,
@@ -49,7 +49,7 @@ impl WordOrder {
         }
     }
 
-    /// The order with the other byte of each register first.
+    /// Returns the order with the other byte of each register first.
     pub fn with_other_bytes(self) -> Self {
         match self {
             Self::Big => Self::Badc,
@@ -59,17 +59,17 @@ impl WordOrder {
         }
     }
 
-    /// Whether the low word comes first.
+    /// Returns true if the low word comes first.
     pub fn is_low_first(self) -> bool {
         matches!(self, Self::Little | Self::Dcba)
     }
 
-    /// Whether the low byte of each register comes first.
+    /// Returns true if the low byte of each register comes first.
     pub fn swaps_bytes(self) -> bool {
         matches!(self, Self::Badc | Self::Dcba)
     }
 
-    /// Brings registers from the line into the order of bytes that the rest of the program knows, or back.
+    /// Converts registers between the byte order on the line and the byte order in the rest of the program.
     pub(super) fn bytes_in_order(self, mut words: Vec<u16>) -> Vec<u16> {
         if self.swaps_bytes() {
             words.iter_mut().for_each(|word| *word = word.swap_bytes());
@@ -91,13 +91,14 @@ pub enum Parity {
     Odd,
 }
 
-/// Where a line leads.
+/// Address of a line.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 #[expect(missing_docs, reason = "the fields are told above them")]
 pub enum Line {
     /// Modbus TCP: a host by name or address, and a port, 502 by the standard.
     Tcp { host: String, port: u16 },
-    /// Modbus RTU on a serial port, best by its lasting name under /dev/serial/by-id, at so many bits per second, with 1 or 2 stop bits.
+    /// Modbus RTU on a serial port, preferably by its persistent name under /dev/serial/by-id, with the baud rate in
+    /// bit/s and 1 or 2 stop bits.
     Rtu { device: String, baud: u32, parity: Parity, stop_bits: u8 },
 }
 
@@ -140,7 +141,7 @@ impl TcpWire {
         let host = &self.host;
         let is_here = host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
         if host.is_empty() {
-            // Told by the schema.
+            // Reported by the schema.
         } else if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
             let allowed = "it must be a name or an address alone, such as \"192.168.0.10\"";
             document.report(&place.key("wire.host"), format!("is {host:?}"), allowed, "the port has a key of its own");
@@ -162,12 +163,12 @@ impl TcpWire {
         }
     }
 
-    /// Of a network nothing is known before it is asked.
+    /// Returns `None`: a network address cannot be checked before it is used.
     pub(super) fn missing(&self) -> Option<String> {
         None
     }
 
-    /// Two machines must not be one.
+    /// Reports to the document if both machines have the same address.
     pub(super) fn compare(&self, grinder: &Self, document: &mut Document) {
         if self == grinder && self.port != 0 {
             let found = format!("is {}, as that of the CMM at the same host and port", grinder.unit);
@@ -209,10 +210,10 @@ impl RtuWire {
         Line::Rtu { device, baud, parity, stop_bits }
     }
 
-    /// A name of a port is as good as it is there.
+    /// Does nothing: only the system can check the name of a port, see [`Self::missing`].
     pub(super) fn check_address(&self, _: &Place<'_>, _: &mut Document) {}
 
-    /// Two machines must not be one, and one line has one speed.
+    /// Reports to the document if both machines have the same unit on one line, or different settings of that line.
     pub(super) fn compare(&self, grinder: &Self, document: &mut Document) {
         if self.device != grinder.device {
             return;
@@ -228,7 +229,7 @@ impl RtuWire {
         }
     }
 
-    /// Says that the port is not on this computer, and which are; nothing where it is there.
+    /// Returns in words that the port is not on this computer, and which ports are. Returns `None` if it is there.
     pub(super) fn missing(&self) -> Option<String> {
         port::missing(&self.device)
     }
@@ -299,7 +300,7 @@ impl Default for RegisterMap {
 }
 
 impl RegisterMap {
-    /// Returns every block: its key in a cell file, its first register, and how many it has.
+    /// Returns every block: its key in a cell file, its first register, and its number of registers.
     pub fn blocks(&self) -> [(&'static str, u16, u16); 12] {
         [
             ("identity", self.identity, 32),
@@ -317,7 +318,7 @@ impl RegisterMap {
         ]
     }
 
-    /// Tells the document which blocks overlap or end outside.
+    /// Reports to the document the blocks that overlap or end outside the address range.
     pub fn check(&self, place: &Place<'_>, document: &mut Document) {
         let blocks = self.blocks();
         for (k, &(name, first, count)) in blocks.iter().enumerate() {
@@ -329,7 +330,7 @@ impl RegisterMap {
             }
             for &(other, start, length) in &blocks[..k] {
                 if u32::from(start) < end && u32::from(first) < u32::from(start) + u32::from(length) {
-                    // Where only the earlier block was moved, that is the one to correct.
+                    // If only the earlier block was moved, the earlier block is the one to correct.
                     let moved = document.is_there(&key);
                     let (key, of) =
                         if moved { (key.clone(), other) } else { (place.key(&format!("registers.{other}")), name) };
@@ -360,7 +361,7 @@ pub enum SignalType {
 }
 
 impl SignalType {
-    /// Returns how many registers a value takes.
+    /// Returns the number of registers of a value.
     pub fn registers(self) -> u16 {
         match self {
             Self::U16 | Self::I16 => 1,
@@ -402,27 +403,28 @@ impl Default for SignalTable {
     }
 }
 
-/// A register of the machine that the cell file asks for besides the contract's own: read with every status, checked against its range.
+/// Additional signal that the cell file requests. It is read with every status and checked against its range.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Signal {
-    /// Its name.
+    /// Name of the signal.
     pub name: String,
-    /// The 0-based address of its first register.
+    /// Address of its first register, from 0.
     pub address: u16,
-    /// How the value is kept.
+    /// Type of the value in the registers.
     pub kind: SignalType,
-    /// Which of its words comes first.
+    /// Word order of the value.
     pub word_order: WordOrder,
-    /// What the kept value is multiplied with.
+    /// Factor by which the value in the registers is multiplied.
     pub scale: f64,
-    /// The unit of the product.
+    /// Unit of the product.
     pub unit: String,
-    /// The least and the most that can be.
+    /// Minimum and maximum possible value.
     pub range: [f64; 2],
 }
 
 impl Signal {
-    /// Checks the signals as they are written; none where one is incomplete, which has been told.
+    /// Checks the signals of a cell file and returns them. Returns `None` if one is incomplete; the schema has reported
+    /// that.
     pub fn all(
         written: &[SignalTable],
         word_order: WordOrder,
@@ -469,39 +471,40 @@ impl Signal {
     }
 }
 
-/// Everything that has to be known to drive a machine over Modbus.
+/// All settings of the driver of a machine on Modbus.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModbusSettings {
-    /// Where it is.
+    /// Line of the machine.
     pub line: Line,
-    /// Its unit number.
+    /// Unit number of the machine.
     pub unit: u8,
-    /// Where its blocks begin, and the order of its words.
+    /// Addresses of its blocks, and its word order.
     pub registers: RegisterMap,
-    /// How long an answer may take.
+    /// Timeout for an answer.
     pub request_timeout: Duration,
-    /// How often a request is asked again.
+    /// Number of retries of a request.
     pub retries: u32,
-    /// After how long without an answer a request is given up, however often it was asked.
+    /// Time without an answer after which a request is given up, whatever the number of retries.
     pub lost_after: Duration,
-    /// How long the machine may need for an answer at worst: after an error the line is left alone for so long.
+    /// Worst-case answer time of the machine. After an error the line is not used for this time.
     pub quarantine: Duration,
-    /// The number of this client; not 0.
+    /// Number of this client; not 0.
     pub owner: u32,
-    /// Rises with each start of this client; raised above what the machine has of it.
+    /// Epoch of this client, which increases with each start. It is raised above the epoch that the machine has stored
+    /// for this client.
     pub epoch: u32,
-    /// What to read besides.
+    /// Additional signals to read.
     pub signals: Vec<Signal>,
-    /// A beat is written when the last one is so old; a machine takes its client for lost after a second and a half without one.
+    /// Interval of the heartbeat. A machine regards its client as lost after 1.5 s without a heartbeat.
     pub beat_every: Duration,
-    /// The name that the machine must give of itself; `None` takes any.
+    /// Name that the machine must report; `None` accepts any name.
     pub expected_name: Option<String>,
-    /// Whether the machine must be a simulation or must not be one; `None` takes either.
+    /// True if the machine must be a simulation, false if it must not be one; `None` accepts both.
     pub simulation: Option<bool>,
 }
 
 impl ModbusSettings {
-    /// Settings that suit a machine on a quiet network, to be changed field by field.
+    /// Returns settings for a machine on a quiet network, to be adapted field by field.
     pub fn new(line: Line) -> Self {
         Self {
             line,

@@ -1,10 +1,10 @@
-//! A signal that a cell file asks for besides the contract's own: what its registers say, and what explains that they say nothing.
+//! Additional signal that a cell file requests: the value in its registers, and the cause of a missing value.
 
 use super::codec::Registers;
 use super::settings::{Signal, SignalType, WordOrder};
 
 impl Signal {
-    /// Returns the value that registers have in an order of words, in the signal's unit; it may be no number.
+    /// Returns the value of registers for a word order, in the unit of the signal. The value may be NaN or infinite.
     pub(super) fn value(&self, words: &[u16], order: WordOrder) -> f64 {
         let block = Registers::new(words, order);
         let kept = match self.kind {
@@ -18,7 +18,8 @@ impl Signal {
         kept * self.scale
     }
 
-    /// Says what explains registers that are no number or out of range: the other order of words, if that one is good.
+    /// Returns the cause if registers give no finite number or are out of range. The cause is the other word order, if
+    /// that one gives a good value.
     pub(super) fn cause(&self, words: &[u16]) -> Option<String> {
         let is_good = |value: &f64| (self.range[0]..=self.range[1]).contains(value);
         let value = self.value(words, self.word_order);
@@ -59,10 +60,10 @@ mod tests {
         assert!(told.starts_with("it would be 20.25 C with") && told.contains("word_order = \"little\""), "{told}");
         let little = signal(SignalType::F32, WordOrder::Little);
         assert!(little.cause(&[first, second]).unwrap().contains("word_order = \"big\""));
-        // No number either way: only what it reads as is known.
+        // No number in either order: only the value that the register gives is known.
         let told = big.cause(&[0x7fc0, 0x7fc0]).unwrap();
         assert!(told.starts_with("register 1000 reads as NaN: "), "{told}");
-        // Out of range in both orders, and of one word.
+        // Out of range in both orders, and a value of one word.
         assert_eq!(big.cause(&float(40.0)), None);
         assert_eq!(signal(SignalType::I16, WordOrder::Big).cause(&[7]), None);
     }

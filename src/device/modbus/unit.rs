@@ -1,7 +1,7 @@
-//! One machine on a line: proved before it is believed, proved again whenever the line was opened anew, and asked again when an answer
-//! failed to come.
+//! One machine on a line. It is proved before its data are used, proved again each time the line was reopened, and
+//! asked again if an answer is missing.
 //!
-//! Everything that is asked through a unit may be asked twice: reads, and writes of values. Nothing here is a pulse.
+//! Every request through a unit is idempotent: reads, and writes of values. There are no pulses.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -14,20 +14,21 @@ use super::link::{Ask, Link, LinkFault};
 use super::settings::{RegisterMap, WordOrder};
 use crate::{DeviceError, Identity, MachineKind};
 
-/// The first words of an identity block.
+/// First words of an identity block.
 const MAGIC: [u16; 2] = [0x5247, 0x4431];
-/// The version of the map that is spoken here.
+/// Version of the map that this program uses.
 const VERSION: u16 = 2;
-/// Registers of the identity block.
+/// Number of registers of the identity block.
 const IDENTITY_REGISTERS: u16 = 32;
-/// The flags of an identity block.
+/// Flags of an identity block.
 const SIMULATION: u16 = 1;
 const GIVES_AHEAD: u16 = 2;
-/// A machine that says it is busy is asked again after this.
+/// Pause before a busy machine is asked again.
 const BUSY_PAUSE: Duration = Duration::from_millis(50);
-/// A machine that is busy for so long when it is met is given up: before the cell gives up waiting for it, so that what it said is told.
+/// Time for which a busy machine is retried at connection. It is shorter than the time that the cell waits for the
+/// machine, so that the answer of the machine is reported.
 const BUSY_WHEN_MET: Duration = Duration::from_secs(15);
-/// The sentinels that prove the order of words.
+/// Sentinels that prove the word order.
 const SENTINEL_WHOLE: u32 = 0x1234_5678;
 const SENTINEL_REAL: f64 = -2.5e-7;
 
@@ -41,14 +42,14 @@ pub(super) struct Unit {
     kind: MachineKind,
     retries: u32,
     lost_after: Duration,
-    /// The generation of the line on which the machine was proved.
+    /// Generation of the line on which the machine was proved.
     trusted: Option<u64>,
     identity: Option<Identity>,
-    /// The flags of its identity.
+    /// Flags of its identity.
     flags: u16,
 }
 
-/// What a unit is told about its machine.
+/// Settings of a unit for its machine.
 pub(super) struct UnitSettings {
     pub(super) unit: u8,
     pub(super) map: RegisterMap,
@@ -63,17 +64,18 @@ impl Unit {
         Self { name, link, map, unit, kind, retries, lost_after, trusted: None, identity: None, flags: 0 }
     }
 
-    /// Who was proved to be there.
+    /// Returns the proved identity of the machine.
     pub(super) fn identity(&self) -> Option<&Identity> {
         self.identity.as_ref()
     }
 
-    /// Whether it says that it gives full pages of a result while its job still runs.
+    /// Returns true if the machine offers full pages of a result while its job still runs.
     pub(super) fn gives_ahead(&self) -> bool {
         self.identity.is_some() && self.flags & GIVES_AHEAD != 0
     }
 
-    /// The generation of the line on which the machine was proved, while that line stands as far as is known here.
+    /// Returns the generation of the line on which the machine was proved, as long as that line is valid as far as
+    /// known here.
     pub(super) fn generation(&self) -> Option<u64> {
         self.trusted
     }
@@ -86,12 +88,12 @@ impl Unit {
         Writer::new(self.map.word_order)
     }
 
-    /// Forgets who was there and proves who is there now.
+    /// Discards the known identity and proves the machine again.
     pub(super) async fn meet(&mut self) -> Result<Identity, DeviceError> {
         self.meet_within(BUSY_WHEN_MET).await
     }
 
-    /// As [`Self::meet`], and a machine whose program is still starting has so long.
+    /// Does the same as [`Self::meet`], with a limit of `busy` for a machine whose program is still starting.
     pub(super) async fn meet_within(&mut self, busy: Duration) -> Result<Identity, DeviceError> {
         self.identity = None;
         self.trusted = None;
@@ -99,7 +101,7 @@ impl Unit {
         for tries in 0.. {
             match self.prove().await {
                 Ok(_) => break,
-                // Its program may still be starting: it is there, and says so.
+                // Its program may still be starting: the machine is there and answers so.
                 Err(error) if is_starting(&error) && began.elapsed() < busy => self.ask_again(&error).await,
                 Err(error) if self.gives_up(&error, tries, began) => return Err(error),
                 Err(error) => self.ask_again(&error).await,
@@ -113,12 +115,13 @@ impl Unit {
         self.exchange(what, address, Ask::Read { address, count }).await
     }
 
-    /// Writes registers, on a proved connection only. May be carried out more than once.
+    /// Writes registers, on a proved connection only. The write may be carried out more than once.
     pub(super) async fn write(&mut self, what: &'static str, address: u16, words: &[u16]) -> Result<(), DeviceError> {
         self.exchange(what, address, Ask::Write { address, words: words.into() }).await.map(drop)
     }
 
-    /// Asks once, on the proved connection that there is: for what may fail, and is then done without.
+    /// Sends a request once, on the proved connection that exists. For requests that may fail and that are not
+    /// essential.
     pub(super) async fn once(&mut self, what: &'static str, address: u16, ask: Ask) -> Result<Vec<u16>, DeviceError> {
         let Some(generation) = self.trusted else {
             return Err(DeviceError::NotConnected { machine: self.name.clone(), what });
@@ -127,7 +130,8 @@ impl Unit {
         answer.map(|(_, words)| words).map_err(|fault| self.failed(what, address, fault))
     }
 
-    /// Asks one thing of it; the bytes of each register stand in the order of the contract here, and in the machine's on the line.
+    /// Sends one request. The bytes of each register have the order of the contract here, and the order of the machine
+    /// on the line.
     async fn ask(&self, generation: Option<u64>, ask: Ask) -> Result<(u64, Vec<u16>), LinkFault> {
         let order = self.map.word_order;
         let ask = match ask {
@@ -140,21 +144,22 @@ impl Unit {
         Ok((generation, order.bytes_in_order(words)))
     }
 
-    /// Gives the connection up because something that came over it does not hold, and says what.
+    /// Gives the connection up because data that came over it are invalid. Returns the error that describes them.
     pub(super) async fn distrust(&mut self, what: &'static str, expected: u64, found: u64) -> DeviceError {
         if let Some(generation) = self.trusted.take() {
-            // Stale is as good: then somebody else has given it up already.
+            // A stale generation is equally good: then another machine has given the connection up already.
             let _ = self.link.ask(self.unit, Some(generation), Ask::Distrust).await;
         }
         DeviceError::Corrupt { machine: self.name.clone(), what, expected, found }
     }
 
-    /// Whether a question is not asked again. A machine that answers that it is busy has the whole time; one that does not answer, a few tries.
+    /// Returns true if a request is not retried. A machine that answers that it is busy has the whole time; one that
+    /// does not answer has a few retries.
     fn gives_up(&self, error: &DeviceError, tries: u32, began: Instant) -> bool {
         !error.is_link() || (tries >= self.retries && !error.is_busy()) || began.elapsed() >= self.lost_after
     }
 
-    /// Counts that a question is asked again, and leaves a busy machine alone before.
+    /// Counts a retry, and pauses before it if the machine is busy.
     async fn ask_again(&self, error: &DeviceError) {
         self.link.count_retry();
         if error.is_busy() {
@@ -169,7 +174,8 @@ impl Unit {
         self.tried(what, address, ask, false).await
     }
 
-    /// Asks a few times, also of a machine that says that it is busy: for what is asked between two looks.
+    /// Sends a request with a limited number of retries, also if the machine answers that it is busy. For requests
+    /// between two reads of the status.
     pub(super) async fn few_tries(
         &mut self,
         what: &'static str,
@@ -200,7 +206,8 @@ impl Unit {
             };
             match self.ask(Some(generation), ask.clone()).await {
                 Ok((_, words)) => return Ok(words),
-                // Another machine on the line has met an error; prove again and ask for the first time.
+                // Another machine on the line has met an error. Prove this machine again; the request itself was not
+                // sent yet.
                 Err(LinkFault::Stale) => self.trusted = None,
                 Err(fault) => return Err(self.failed(what, address, fault)),
             }
@@ -223,8 +230,9 @@ impl Unit {
         }
     }
 
-    /// Proves who is at the far end of the present connection: the identity block, which is only read; then two random words that the
-    /// machine has to turn round, so that nothing older than this moment can be answering; then the identity once more.
+    /// Proves the identity of the machine at the far end of the present connection and returns the generation of the
+    /// line. First the identity block, which is only read. Then two random words that the machine has to invert, so
+    /// that the answer cannot be older than this moment. Then the identity block once more.
     async fn prove(&mut self) -> Result<u64, DeviceError> {
         let first = self.map.identity;
         let read = Ask::Read { address: first, count: IDENTITY_REGISTERS };
@@ -269,7 +277,7 @@ impl Unit {
         Ok(())
     }
 
-    /// Reads an identity block, or says what it is that answers instead.
+    /// Decodes an identity block, or returns an error that describes the device that answers.
     pub(super) fn recognise(&self, words: &[u16]) -> Result<Identity, DeviceError> {
         let machine = self.name.clone();
         if let Some(how) = layout_fault(words, self.map.word_order) {
@@ -321,17 +329,18 @@ impl Unit {
     }
 }
 
-/// Whether a machine, and not a gateway that finds none, says that it cannot answer just now.
+/// Returns true if the machine answers that it cannot reply now. The same answer of a gateway that finds no machine
+/// does not count.
 fn is_starting(error: &DeviceError) -> bool {
     matches!(error, DeviceError::Exception { code: 5 | 6, .. })
 }
 
-/// How an identity block that is there lies otherwise than it must, with the order of words that would be right where it is that; none where it
-/// lies right, or where there is none.
+/// Returns in words how the layout of an identity block is wrong, with the correct word order if the bytes are
+/// exchanged. Returns `None` if the layout is correct, or if there is no identity block.
 fn layout_fault(words: &[u16], order: WordOrder) -> Option<Cow<'static, str>> {
     let begins = |from: usize, swap: fn(u16) -> u16| {
         let due = [MAGIC[0], MAGIC[1], VERSION];
-        // One that begins a register early has lost its first word.
+        // A block that begins one register early has lost its first word.
         let (due, from) = if from == 0 { (&due[1..], 0) } else { (&due[..], from - 1) };
         due.iter().enumerate().all(|(k, word)| words.get(from + k).is_some_and(|found| swap(*found) == *word))
     };

@@ -1,4 +1,4 @@
-//! The two wires of Modbus, as the table of drivers knows them.
+//! The two Modbus wires, for the table of drivers.
 
 use super::settings::{Line, ModbusSettings, RtuWire, TcpWire};
 use super::{Link, ModbusCmm, ModbusGrinder};
@@ -50,7 +50,7 @@ modbus_wire!(TcpWire);
 modbus_wire!(RtuWire);
 
 impl ModbusSettings {
-    /// Settings for a unit on a line, as the cell file has them.
+    /// Returns the settings for a unit on a line, from the cell file.
     pub fn of(line: Line, unit: u8, making: &Making<'_>) -> Self {
         let timing = making.timing;
         Self {
@@ -71,7 +71,8 @@ impl ModbusSettings {
     }
 }
 
-/// Makes the line of a machine, or shares that of the other one, and everything that has to be known to drive it.
+/// Creates the line of a machine, or shares the line of the other machine, and returns it with all settings of the
+/// driver.
 fn link(
     line: Line,
     unit: u8,

@@ -1,12 +1,13 @@
-//! Correcting a program that exists already, by a map over x and y.
+//! Correction of an existing program by a map over x and y.
 //!
 //! ```text
 //!  line of the program --control--> what the tool does --Rewriter--> corrected lines --Check--> the new program
 //! ```
-//! Every straight line is divided where the correction along it changes, not by its length; an arc stays an arc where the correction is
-//! the same all along it, and is written as chords where it is not. Rapid moves, moves in machine coordinates (G53) and ways to the
-//! reference point (G28, G30) stay as they are. What moves the tool in a way that the program's text does not tell is refused with its line.
-//! Every line that comes out is read again, by other means, and held against the base and the map before the program gets its name.
+//! Straight lines are divided according to how the correction changes along them, not by length. An arc stays an arc if
+//! the correction is the same all along it; otherwise it is written as chords. Rapid moves, moves in machine
+//! coordinates (G53) and moves to the reference point (G28, G30) are copied unchanged. A line that moves the tool in a
+//! way that the text does not define is rejected with its line number. Before the program gets its name, a second
+//! interpreter reads every written line again and compares it with the base program and the map.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -29,31 +30,33 @@ use regrind_core::geometry::{Point, Vector};
 
 /// Largest program that is read, in bytes.
 const MOST_BYTES: u64 = 1 << 30;
-/// Most points that one line is divided into.
+/// Maximum number of pieces that one line is divided into.
 const MOST_POINTS: f64 = 2e6;
 
-/// A program of which more than this share lies beside the map is not that of the map, or in another unit.
+/// Maximum share of a program that can lie outside the map; a larger share means that the map belongs to another
+/// program or has another unit.
 const MOST_BESIDE: f64 = 0.95;
 
-/// An arc stays one where its ends are moved alike to this.
+/// An arc stays an arc if its ends are displaced equally to within this, in millimetres.
 const MOST_WOUND_MM: f64 = 1e-3;
-/// What six decimals of three coordinates round.
+/// Rounding error of three coordinates with six decimals, in millimetres.
 const ROUNDING_MM: f64 = 2e-6;
 
-/// How a program is corrected.
+/// Settings for the correction of a program.
 #[derive(Debug)]
 pub struct Amendment<'a> {
-    /// What the surface is moved by along its normal, in millimetres, positive away from the part; over x and y of the program's frame.
+    /// Displacement of the surface along its normal over x and y in the program's frame, in millimetres; positive away
+    /// from the part.
     pub shift: &'a Field,
-    /// The nominal surface that a ball grinds; `None` to move the program's points along z.
+    /// Nominal surface, for a ball that grinds it; `None` to move the program's points along z.
     pub along_normals: Option<AlongNormals<'a>>,
-    /// How far the new program may be from the corrected path, in millimetres.
+    /// Maximum distance between the new program and the corrected path, in millimetres.
     pub tolerance_mm: f64,
-    /// The map that the shift was made of.
+    /// Map from which the shift was computed.
     pub map: &'a ProgramMap,
-    /// What the map was multiplied by.
+    /// Factor by which the map was multiplied.
     pub gain: f64,
-    /// A point that would be moved by more than this is refused, in millimetres.
+    /// Maximum displacement of a point, in millimetres; a larger one is rejected.
     pub largest_mm: f64,
 }
 
@@ -62,38 +65,42 @@ pub struct Amendment<'a> {
 pub struct AlongNormals<'a> {
     /// The nominal surface, without a correction.
     pub nominal: &'a Wanted,
-    /// How far above the program's point the ball's centre is: 0 where the program moves the centre, the radius where it moves the tip.
+    /// Height of the ball's centre above the program's point: 0 if the program moves the centre, the radius if it moves
+    /// the tip.
     pub centre_above_mm: f64,
 }
 
-/// What became of a program.
+/// Summary of a correction.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Amended {
-    /// Lines read.
+    /// Number of lines read.
     pub lines: u64,
-    /// Straight moves at feed, as read.
+    /// Number of straight moves at feed, as read.
     pub straight: u64,
-    /// Arcs, as read.
+    /// Number of arcs, as read.
     pub arcs: u64,
-    /// Arcs that stayed arcs.
+    /// Number of arcs that stayed arcs.
     pub arcs_kept: u64,
-    /// Moves at feed that were written.
+    /// Number of moves at feed that were written.
     pub written: u64,
-    /// Largest change of a point, in millimetres.
+    /// Largest displacement of a point, in millimetres.
     pub largest_mm: f64,
     /// Length of the moves at feed, in millimetres.
     pub feed_mm: f64,
-    /// The part of it that lies beside the map, where its outermost values are levelled off.
+    /// Length of the moves at feed that lie outside the map, in millimetres; there the outermost values are continued
+    /// (levelled off).
     pub beside_map_mm: f64,
-    /// Whether the program says neither G20 nor G21 before its first coordinate, so that millimetres were assumed and written.
+    /// True if the program has neither G20 nor G21 before its first coordinate, so that millimetres were assumed and
+    /// written.
     pub unit_assumed: bool,
 }
 
 /// Reads a program, corrects it, and writes it under another name.
 ///
 /// # Errors
-/// A program that has the map in it already, that belongs to another part or has another correction in it than the map takes up, or that
-/// holds what cannot be corrected; one without a move at feed, or with hardly any over the map; corrected lines that are not the base and the map; files.
+/// A program that already contains the map, that belongs to another part, or that contains a correction other than the
+/// one the map is based on; a program with content that cannot be corrected; a program without a move at feed, or with
+/// almost none over the map; corrected lines that do not match the base program and the map; errors of files.
 pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result<Amended, GcodeError> {
     let bytes = read_whole(base, MOST_BYTES)?;
     let program = |what: &str, remedy| GcodeError::Program { path: base.to_owned(), what: what.into(), remedy };
@@ -116,13 +123,13 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     for (number, line) in (1..).zip(text.lines()) {
         let refused = |(what, remedy): Refusal| GcodeError::Line { path: base.to_owned(), line: number, what, remedy };
         if writer.control.ended {
-            // No control reads on.
+            // No control reads beyond the end of the program.
             draft.write(format!("{line}\n").as_bytes())?;
             continue;
         }
         let block = block(line).map_err(refused)?;
         let is_blank = block.words.is_empty() && block.comments.is_empty() && !block.percent;
-        // The header stands behind the percent sign, if there is one.
+        // The header follows the percent sign, if there is one.
         if !begun && !block.percent && !is_blank {
             draft.write(header.as_bytes())?;
             begun = true;
@@ -151,7 +158,7 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     Ok(done)
 }
 
-/// Returns a program as text: UTF-8, or Latin-1, in which older programs have their remarks; none where it is neither.
+/// Returns a program as text: UTF-8, or Latin-1, which older programs use for remarks; `None` if it is neither.
 fn decoded(bytes: &[u8]) -> Option<std::borrow::Cow<'_, str>> {
     if bytes.iter().any(|b| *b < b' ' && !b"\t\r\n\x0c".contains(b)) {
         return None;
@@ -160,10 +167,10 @@ fn decoded(bytes: &[u8]) -> Option<std::borrow::Cow<'_, str>> {
     Some(std::str::from_utf8(bytes).map_or_else(|_| latin(), Into::into))
 }
 
-/// Tells a program of another control than LinuxCNC by its first lines.
+/// Detects a program for a control other than LinuxCNC by its first lines; returns its kind and the remedy.
 fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
     const AGAIN: &str = "compensate reads and writes the dialect of LinuxCNC; plan the next program by regrind plan --program and its dialect";
-    /// Behind so many lines nothing tells the control any more.
+    /// Number of lines that are checked; later lines do not identify the control.
     const LOOKED_AT: usize = 20;
     let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty() && *line != "%").take(LOOKED_AT);
     lines
@@ -184,7 +191,7 @@ fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
         .map(|what| (what, AGAIN))
 }
 
-/// Whether G20 or G21 stands before the first coordinate.
+/// Returns true if G20 or G21 occurs before the first coordinate.
 fn states_unit_first(text: &str) -> bool {
     for line in text.lines() {
         let Ok(block) = block(line) else { return true };
@@ -198,14 +205,15 @@ fn states_unit_first(text: &str) -> bool {
     true
 }
 
-/// Refuses a program that has the map in it, that belongs to another part than the map, or to another correction.
+/// Rejects a program that already contains the map, that belongs to another part than the map, or that contains a
+/// correction other than the base of the map.
 fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), GcodeError> {
     let refused = |what: &str, remedy| Err(GcodeError::Program { path: path.to_owned(), what: what.into(), remedy });
     let mut maps = Vec::new();
     let comments = text.lines().filter(|line| line.contains("sha256") || line.contains(UNCORRECTED));
     for line in comments {
         if line.contains(UNCORRECTED) {
-            // It is the map named last that the program does without.
+            // The program was written without correction: the map named last before this line is not in it.
             maps.pop();
         }
         maps.extend(identity_in(line, "map:"));
@@ -236,7 +244,7 @@ fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), 
 
 fn header(base: &[u8; 32], amendment: &Amendment, unit_assumed: bool) -> String {
     let mut text = String::new();
-    // Writing to a string does not fail.
+    // Writing to a string cannot fail.
     let _ = writeln!(text, "(Regrind {} corrected program)", env!("CARGO_PKG_VERSION"));
     if amendment.map.simulation {
         text.push_str("(SIMULATION)\n");
@@ -255,15 +263,15 @@ fn header(base: &[u8; 32], amendment: &Amendment, unit_assumed: bool) -> String 
     text
 }
 
-/// The text that comes out, and where it has the tool.
+/// Text of the corrected program, and the position of the tool in it.
 struct Rewriter<'a> {
     amendment: &'a Amendment<'a>,
     control: Control,
     text: Vec<u8>,
     done: Amended,
-    /// Where the corrected program has the tool; `None` where an axis is not known.
+    /// Position of the tool in the corrected program; `None` for an axis whose position is unknown.
     actual: [Option<f64>; 3],
-    /// Words of axes that stand at 0 and go with the next move that is written.
+    /// Words of rotary axes that are at 0; they are written with the next move.
     beside: String,
 }
 
@@ -273,7 +281,7 @@ impl<'a> Rewriter<'a> {
         Self { amendment, control, text: Vec::new(), done, actual: [None; 3], beside: String::new() }
     }
 
-    /// Takes one line and writes what becomes of it.
+    /// Reads one line and writes the corrected lines.
     fn line(&mut self, line: &str, block: &Block) -> Result<(), Refusal> {
         self.done.lines += 1;
         if block.words.is_empty() {
@@ -282,7 +290,7 @@ impl<'a> Rewriter<'a> {
             return Ok(());
         }
         let act = self.control.take(block)?;
-        // An axis that a word of this line made unknown is so in the corrected program too.
+        // If a word of this line makes the position of an axis unknown, it is unknown in the corrected program too.
         (0..3).filter(|&k| self.control.at[k].is_none()).for_each(|k| self.actual[k] = None);
         self.copy_words(block, |w| !is_of_the_move(w, &act) && !takes_effect_after(w));
         self.beside.clear();
@@ -310,7 +318,7 @@ impl<'a> Rewriter<'a> {
         Ok(())
     }
 
-    /// A rapid move goes where it went; only the axes that it names.
+    /// Writes a rapid move to its original end; only the axes that it names move.
     fn rapid(&mut self, to: [Option<f64>; 3]) {
         self.text.extend_from_slice(b"G0");
         for k in 0..3 {
@@ -323,7 +331,7 @@ impl<'a> Rewriter<'a> {
         self.text.push(b'\n');
     }
 
-    /// A move in coordinates of the machine, or to its reference point, is written as it was.
+    /// Copies a move in machine coordinates, or to the reference point, unchanged.
     fn machine(&mut self, block: &Block, by: Option<u8>) {
         if self.control.relative {
             self.text.extend_from_slice(b"G91\n");
@@ -344,7 +352,7 @@ impl<'a> Rewriter<'a> {
         }
     }
 
-    /// Writes a move at feed, corrected.
+    /// Writes a corrected move at feed.
     fn feed(
         &mut self,
         from: Point,
@@ -362,12 +370,12 @@ impl<'a> Rewriter<'a> {
             shifts.iter().enumerate().map(|(k, shift)| way(k as f64 / count as f64) + shift).collect();
         self.measure(way, length, &shifts)?;
         let arc = arc.filter(|_| {
-            // An arc of two radii is refused by controls.
+            // Controls reject an arc with two radii.
             let alike = (0.5 * tolerance).min(MOST_WOUND_MM);
             shifts.iter().all(|shift| (shift - shifts[0]).norm() <= alike)
         });
-        // After a rapid move the tool stands where the base program has it: it is brought to where the corrected path begins. The centre of an arc
-        // counts from there.
+        // After a rapid move the tool is where the base program has it. A move brings it to the start of the corrected
+        // path; the centre of an arc is relative to that start.
         let near = if arc.is_some() { ROUNDING_MM } else { 0.5 * tolerance };
         let beside = all(self.actual).is_none_or(|here| (here - corrected[0]).norm() > near);
         if beside && (lateral > 0.0 || self.amendment.along_normals.is_some()) {
@@ -389,7 +397,8 @@ impl<'a> Rewriter<'a> {
         Ok(())
     }
 
-    /// By how much the map moves points of a way, at equal steps that are fine enough for the map, the arc and the tolerance.
+    /// Returns the displacements by the map at points of a move, at equal steps that are fine enough for the map, the
+    /// arc and the tolerance.
     fn shifts(
         &self,
         way: &dyn Fn(f64) -> Point,
@@ -409,7 +418,7 @@ impl<'a> Rewriter<'a> {
             let shifts: Vec<Vector> = (0..=pieces as usize)
                 .map(|k| displacement(self.amendment, &way(k as f64 / pieces)))
                 .collect::<Result<_, _>>()?;
-            // An eighth of the second difference is what a line between two points is off by.
+            // The error of a line between two points is one eighth of the second difference.
             let bends = shifts.windows(3).map(|three| (three[0] - three[1] * 2.0 + three[2]).norm() / 8.0);
             if changes == 0.0 || (pieces > 1.0 && bends.fold(0.0, f64::max) <= 0.05 * tolerance) {
                 return Ok(shifts);
@@ -418,7 +427,7 @@ impl<'a> Rewriter<'a> {
         }
     }
 
-    /// Puts down how far a move is corrected and how much of it lies beside the map; refuses one that is corrected by more than is allowed.
+    /// Records the displacement of a move and its length outside the map; rejects a displacement above the limit.
     fn measure(&mut self, way: &dyn Fn(f64) -> Point, length: f64, shifts: &[Vector]) -> Result<(), Refusal> {
         let largest_mm = shifts.iter().map(Vector::norm).fold(0.0, f64::max);
         if largest_mm > self.amendment.largest_mm {
@@ -432,7 +441,7 @@ impl<'a> Rewriter<'a> {
             !self.amendment.map.covers([at.x, at.y])
         });
         let share = beside.count() as f64 / count as f64;
-        // A move on the spot has no length, and a place all the same.
+        // A move without change of position has no length, but has a place.
         let length = length.max(1e-6);
         self.done.feed_mm += length;
         self.done.beside_map_mm += if share == 1.0 { length } else { share * length };
@@ -463,12 +472,12 @@ impl<'a> Rewriter<'a> {
         if self.control.unit_mm == 1.0 {
             push_fixed(&mut self.text, rounded(value_mm));
         } else {
-            // A millionth of an inch is 25 nm: two digits more.
+            // A millionth of an inch is 25 nm, so inches need two digits more.
             let _ = std::io::Write::write_fmt(&mut self.text, format_args!("{:.8}", value_mm / self.control.unit_mm));
         }
     }
 
-    /// What takes effect after a move: stops and the end.
+    /// Copies the words that take effect after a move: stops and the program end.
     fn copy_after(&mut self, block: &Block) {
         let begin = self.text.len();
         for (k, word) in block.words.iter().filter(|w| takes_effect_after(w)).enumerate() {
@@ -497,7 +506,7 @@ impl<'a> Rewriter<'a> {
     }
 }
 
-/// What the map moves a point of the program by.
+/// Returns the displacement of a point of the program by the map, in millimetres.
 pub(super) fn displacement(amendment: &Amendment, at: &Point) -> Result<Vector, Refusal> {
     let shift = amendment.shift;
     let Some(along) = &amendment.along_normals else { return Ok(Vector::z() * shift.at([at.x, at.y]).value) };
@@ -510,18 +519,18 @@ pub(super) fn displacement(amendment: &Amendment, at: &Point) -> Result<Vector, 
     })
 }
 
-/// Words that are written anew for every move, and numbers of lines, which would stand twice.
+/// Returns true for words that every move writes itself, and for line numbers, which would otherwise occur twice.
 fn is_of_the_move(word: &Word, act: &Act) -> bool {
     match word.letter {
         b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'N' | b'A' | b'B' | b'C' => true,
-        // Of a line that does not move the tool it belongs to another word.
+        // In a line without an arc, R and P belong to another word.
         b'R' | b'P' => matches!(act, Act::Feed { arc: Some(_), .. }),
         b'G' => [0.0, 1.0, 2.0, 3.0, 80.0, 90.0, 91.0].contains(&word.value) || is_machine(word),
         _ => false,
     }
 }
 
-/// Whether a word makes the move of its line one in coordinates of the machine.
+/// Returns true if a word turns the move of its line into one in machine coordinates.
 fn is_machine(word: &Word) -> bool {
     word.letter == b'G' && [28.0, 30.0, 53.0].contains(&word.value)
 }
@@ -534,7 +543,8 @@ fn takes_effect_after(word: &Word) -> bool {
     word.letter == b'M' && [0.0, 1.0, 2.0, 30.0, 60.0].contains(&word.value)
 }
 
-/// Which points must be written so that the lines between them keep to all of them (Douglas and Peucker); without the first.
+/// Returns the indices of the points to write, without the first, so that the lines between them stay within the
+/// tolerance of all points (Douglas and Peucker).
 fn kept(points: &[Point], tolerance: f64) -> Vec<usize> {
     let mut kept = Vec::new();
     let mut open = vec![(0, points.len() - 1)];
@@ -548,7 +558,7 @@ fn kept(points: &[Point], tolerance: f64) -> Vec<usize> {
         };
         let worst = (from + 1..to).map(|k| (off(k), k)).max_by(|a, b| a.0.total_cmp(&b.0));
         match worst {
-            // The nearer half last, so that it is taken first: the points come in order.
+            // The first half is pushed last, so that it is processed first and the points come in order.
             Some((deviation, k)) if deviation > tolerance => open.extend([(k, to), (from, k)]),
             _ => kept.push(to),
         }

@@ -1,4 +1,5 @@
-//! Arcs and helices of a program that was read: where they run, and how many chords stand for them. Those that are written come from the path.
+//! Arcs and helices of a program that was read: their points, and the number of chords that approximate them. The
+//! planned path provides the arcs that are written into new programs.
 
 use std::f64::consts::TAU;
 
@@ -11,34 +12,35 @@ use regrind_core::geometry::Point;
 pub(super) struct Arc {
     plane: Plane,
     from: Point,
-    /// In the plane.
+    /// Centre in the plane.
     centre: [f64; 2],
     radius: f64,
-    /// The radius at the end, which rounding makes another one: the arc winds from one to the other.
+    /// Radius at the end. Rounding makes it differ from the radius at the start; the arc spirals from one to the other.
     end_radius: f64,
     begins: f64,
-    /// Counter-clockwise is positive.
+    /// Angle of the sweep, in radians; positive is counter-clockwise.
     pub(super) sweep: f64,
     rise: f64,
 }
 
-/// How the centre of an arc is given.
+/// Centre of an arc, as the program gives it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Centre {
-    /// By its place along the two axes.
+    /// Position along the two axes of the plane.
     At([f64; 2]),
-    /// By the radius; negative for the longer way.
+    /// Radius; negative for the longer arc.
     Radius(f64),
 }
 
-/// How far the radius at the end may be from that at the beginning: in millimetres, as LinuxCNC documents it, and as a share of a very small one.
+/// Maximum difference between the radii at the end and at the start: in millimetres, as LinuxCNC documents it, and as a
+/// share of the radius for very small radii.
 const RADIUS_TOLERANCE: [f64; 2] = [0.0127, 0.1];
 
 impl Arc {
-    /// Lays an arc between two points.
+    /// Computes the arc between two points.
     ///
     /// # Errors
-    /// A radius that does not fit the ends.
+    /// A radius that does not match the end points.
     pub(super) fn new(plane: Plane, from: Point, to: Point, clockwise: bool, centre: Centre) -> Result<Self, Refusal> {
         let [a, b, c] = plane.0;
         let (p, q) = ([from[a], from[b]], [to[a], to[b]]);
@@ -56,7 +58,7 @@ impl Arc {
         }
         let begins = v.atan2(u);
         let turn = t.atan2(s) - begins;
-        // The end at the beginning is a whole turn.
+        // If the end equals the start, the arc is a full turn.
         let sweep = if clockwise {
             let down = turn.rem_euclid(TAU) - TAU;
             if down > -1e-9 { down - TAU } else { down }
@@ -67,7 +69,7 @@ impl Arc {
         Ok(Self { plane, from, centre, radius, end_radius: end, begins, sweep, rise: to[c] - from[c] })
     }
 
-    /// Returns the point at a share of the way.
+    /// Returns the point at a share of the arc, 0 to 1.
     pub(super) fn at(&self, share: f64) -> Point {
         let [a, b, c] = self.plane.0;
         let (sine, cosine) = (self.begins + self.sweep * share).sin_cos();
@@ -79,30 +81,30 @@ impl Arc {
         at
     }
 
-    /// Returns the centre from the beginning, along the two axes of the plane.
+    /// Returns the centre relative to the start, along the two axes of the plane.
     pub(super) fn centre_from_start(&self) -> [(usize, f64); 2] {
         let [a, b, _] = self.plane.0;
         [(a, self.centre[0] - self.from[a]), (b, self.centre[1] - self.from[b])]
     }
 
-    /// Returns how long it is.
+    /// Returns the length, in millimetres.
     pub(super) fn length(&self) -> f64 {
         (self.radius * self.sweep).hypot(self.rise)
     }
 
-    /// Returns how many chords are within a tolerance of it.
+    /// Returns the number of chords that stay within a tolerance of the arc.
     pub(super) fn chords(&self, tolerance: f64) -> f64 {
         let angle = 2.0 * (1.0 - (tolerance / self.radius).min(1.0)).acos();
         (self.sweep.abs() / angle.max(1e-9)).ceil().max(1.0)
     }
 }
 
-/// Where the centre of an arc of a radius is: on the side that makes it the shorter way, or with a negative radius the longer.
+/// Returns the centre of an arc of a given radius: for the shorter arc, or with a negative radius for the longer one.
 fn by_radius(p: [f64; 2], q: [f64; 2], radius: f64, clockwise: bool) -> Result<[f64; 2], Refusal> {
     let (dx, dy) = (q[0] - p[0], q[1] - p[1]);
     let chord = dx.hypot(dy);
     let above2 = radius * radius - 0.25 * chord * chord;
-    // A little short, by rounding, is half a turn.
+    // A radius that rounding made slightly too small gives half a turn.
     if chord == 0.0 || above2 < -1e-3 * radius * radius {
         let found = format!("an arc of radius {radius} mm does not join two points {chord:.4} mm apart");
         return Err((found, "give its centre by I, J, K"));

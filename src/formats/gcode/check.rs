@@ -1,6 +1,7 @@
-//! Reads a corrected program again, line by line beside its base, and holds it against base and map.
+//! Check of a corrected program: it is read again line by line, next to its base, and compared with base and map.
 //!
-//! The interpreter here shares nothing with the one that corrects but how a line is taken apart: what one of them misreads, the other one finds.
+//! This interpreter shares only the splitting of a line into words with the interpreter that corrects, so that each
+//! finds the mistakes of the other.
 
 use std::collections::BTreeMap;
 
@@ -9,20 +10,21 @@ use super::number::PER_MM;
 use super::read::{Block, Refusal, block};
 use regrind_core::geometry::{Point, Vector};
 
-/// More than the last digit that is written: rounding of three coordinates, and of an arc's centre.
+/// Tolerance above the last written digit, for the rounding of three coordinates and of an arc's centre, in
+/// millimetres.
 const DIGITS_MM: f64 = 4.0 / PER_MM;
 
-/// Radii at the ends of an arc that differ by more are refused by controls, in millimetres.
+/// Maximum difference between the radii at the ends of an arc, in millimetres; controls reject a larger one.
 const MOST_WOUND_MM: f64 = 0.0127 + DIGITS_MM;
 
-/// The base and what became of it, side by side.
+/// Base program and corrected program, read side by side.
 pub(super) struct Check<'a> {
     amendment: &'a Amendment<'a>,
     base: Machine,
     corrected: Machine,
 }
 
-/// What a machine does and has in force.
+/// Modal state and position of a machine.
 #[derive(Clone, Debug, Default)]
 struct Machine {
     at: [Option<f64>; 3],
@@ -31,25 +33,25 @@ struct Machine {
     centres_absolute: bool,
     /// 0 for XY, 1 for ZX, 2 for YZ.
     plane: usize,
-    /// The zero in force, in tenths of its word.
+    /// Zero (work coordinate system) in force, as ten times the number of its G word.
     zero: Option<i64>,
     motion: Option<u8>,
     feed: Option<f64>,
     over: bool,
 }
 
-/// What one line moves.
+/// Movement of one line.
 #[derive(Debug)]
 enum Way {
-    /// Not at feed: where it ends, and whether in coordinates of the machine.
+    /// Rapid move, not at feed: its end position, as far as it is known.
     Rapid([Option<f64>; 3]),
-    /// In coordinates of the machine: the motion and the words.
+    /// Move in machine coordinates: its motion, whether it is incremental, and its words.
     Machine(Option<u8>, bool, String),
     Straight(Point, Point),
     Round(Round),
 }
 
-/// A way around a centre, perhaps with a rise.
+/// Move around a centre, with or without a rise.
 #[derive(Debug)]
 struct Round {
     from: Point,
@@ -78,7 +80,7 @@ impl Way {
 }
 
 impl Round {
-    /// Turns the arm at the beginning about the centre, and stretches it to the one at the end.
+    /// Rotates the vector from centre to start, and scales it to the length at the end.
     fn at(&self, share: f64) -> Point {
         let [a, b, c] = self.axes;
         let [p, q] = [self.from[a] - self.centre[0], self.from[b] - self.centre[1]];
@@ -192,7 +194,7 @@ impl Machine {
         };
         let (begin, end) = (p - centre, q - centre);
         let mut angle = (begin.x * end.y - begin.y * end.x).atan2(begin.x * end.x + begin.y * end.y);
-        // On the spot it is a whole turn.
+        // If start and end are equal, the arc is a full turn.
         if left && angle < 1e-9 {
             angle += std::f64::consts::TAU;
         } else if !left && angle > -1e-9 {
@@ -209,20 +211,20 @@ impl Machine {
 }
 
 impl<'a> Check<'a> {
-    /// Begins with the header of the corrected program.
+    /// Starts with the header of the corrected program.
     pub(super) fn new(amendment: &'a Amendment<'a>, header: &str) -> Self {
         let mut check = Self { amendment, base: Machine::default(), corrected: Machine::default() };
         for line in header.lines() {
-            // The header moves nothing.
+            // The header contains no moves.
             let _ = block(line).map(|block| check.corrected.read(&block));
         }
         check
     }
 
-    /// Takes a line of the base and what became of it.
+    /// Compares a line of the base with the corrected lines written for it.
     ///
     /// # Errors
-    /// Lines that do something else than the base and the map.
+    /// Corrected lines that differ from base and map.
     pub(super) fn line(&mut self, line: &str, text: &[u8]) -> Result<(), Refusal> {
         self.compared(line, text).map_err(|found| {
             let found = format!("the corrected lines would not be the base and the map: {found}");
@@ -272,7 +274,7 @@ impl<'a> Check<'a> {
         }
     }
 
-    /// Whether both have the same in force behind a line.
+    /// Checks that both machines have the same state after a line.
     fn same_state(&self) -> Result<(), String> {
         let (base, corrected) = (&self.base, &self.corrected);
         let same = base.inches == corrected.inches && base.plane == corrected.plane && base.feed == corrected.feed;
@@ -285,7 +287,7 @@ impl<'a> Check<'a> {
         }
     }
 
-    /// Whether the corrected moves keep to the base's way and the map, in order and without a detour.
+    /// Checks that the corrected moves follow the base path displaced by the map, in order and without a detour.
     fn along(&self, way: &Way, found: &[Way]) -> Result<(), String> {
         let allowed = self.amendment.tolerance_mm + DIGITS_MM;
         let at = |share: f64| {
@@ -294,7 +296,7 @@ impl<'a> Check<'a> {
         };
         let (begin, end) = (at(0.0)?, at(1.0)?);
         let off = |from: Point, to: Point| (from - to).norm();
-        // The first one may only bring the tool to where the corrected way begins.
+        // The first move is allowed to only bring the tool to the start of the corrected path.
         let brings = found.len() > 1 && off(found[0].at(1.0), begin) <= allowed;
         let found = if brings && off(found[0].at(0.0), begin) > 0.0 { &found[1..] } else { found };
         let (first, last) = (found[0].at(0.0), found[found.len() - 1].at(1.0));
@@ -304,27 +306,27 @@ impl<'a> Check<'a> {
         let samples = 2 * found.len() + 3;
         let (mut k, mut before, mut length) = (0, begin, 0.0);
         for sample in 0..=samples {
-            // Not where the points were chosen.
+            // The samples differ from the points that the correction chose.
             let share = if sample == samples { 1.0 } else { (sample as f64 + 0.37) / samples as f64 };
             let wanted = at(share)?;
             length += off(before, wanted);
             before = wanted;
             let away = |way: &Way| match way {
                 Way::Straight(from, to) => beside(*from, *to, wanted),
-                // The arc that stayed one goes along by the same shares.
+                // An arc that stayed an arc is compared at the same share of its length.
                 round => off(round.at(share), wanted),
             };
             while k + 1 < found.len() && away(&found[k + 1]) <= away(&found[k]) {
                 k += 1;
             }
-            // A straight move down to the part may begin where the rapid one ended.
+            // A straight move down to the part can begin where the rapid move ended.
             let reaches = away(&found[k]).min(beside(first, begin, wanted));
             if reaches > allowed {
                 return Err(format!("it is {reaches:.6} mm from where the map has it"));
             }
         }
         let written: f64 = found.iter().map(Way::length).sum();
-        // Chords of the samples are shorter than an arc.
+        // The chords between the samples are shorter than an arc.
         let longest = length.max(way.length()) + off(first, begin) + 4.0 * allowed;
         if written > longest * (1.0 + 1e-6) {
             return Err(format!("it is {:.6} mm longer", written - longest));
@@ -333,7 +335,7 @@ impl<'a> Check<'a> {
     }
 }
 
-/// How far a point is from a straight line between two.
+/// Returns the distance of a point from a straight segment between two points.
 fn beside(from: Point, to: Point, point: Point) -> f64 {
     let (along, arm) = (to - from, point - from);
     let length2 = along.norm_squared();
@@ -341,7 +343,7 @@ fn beside(from: Point, to: Point, point: Point) -> f64 {
     (arm - along * share).norm()
 }
 
-/// Whether a line has an arc whose turns P counts.
+/// Returns true if a line has an arc with the number of turns in P.
 fn is_turn(block: &Block) -> bool {
     let has = |letter: u8, of: &[f64]| block.words.iter().any(|w| w.letter == letter && of.contains(&w.value));
     block.words.iter().any(|w| matches!(w.letter, b'I' | b'J' | b'K' | b'R'))
@@ -355,9 +357,9 @@ fn count_words(block: &Block, counts: &mut BTreeMap<String, i32>, by: i32) {
         let moves = match word.letter {
             b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'N' | b'A' | b'B' | b'C' => true,
             b'G' => [0.0, 1.0, 2.0, 3.0, 80.0, 90.0, 91.0].contains(&word.value),
-            // The radius of an arc becomes its centre.
+            // The radius of an arc is rewritten as its centre.
             b'R' => !block.words.iter().any(|w| w.letter == b'M' && w.value == 19.0),
-            // One turn, as without it.
+            // P1 means one turn, the same as without P.
             b'P' => is_turn(block),
             _ => false,
         };

@@ -1,7 +1,7 @@
-//! What a control has in force while it reads a program, and what each line has it do.
+//! Modal state of a control while it reads a program, and the action of each line.
 //!
-//! A word without a meaning in its line is refused. What a word makes unknown is forgotten: the length of a tool changes where Z is, another
-//! zero changes where all axes are.
+//! A word without a meaning in its line is rejected. If a word makes a position unknown, that position is forgotten:
+//! another tool length makes Z unknown, another zero makes all axes unknown.
 
 use super::arc::{Arc, Centre, Plane};
 use super::number::LARGEST_MM;
@@ -12,7 +12,7 @@ pub(super) const INCH_MM: f64 = 25.4;
 pub(super) const AXES: [u8; 3] = *b"XYZ";
 const TURNING: [u8; 3] = *b"ABC";
 
-/// G words of which one line may have one, in tenths.
+/// Groups of G words of which one line can have only one, as ten times the number of the word.
 const GROUPS: [&[i64]; 12] = [
     &[0, 10, 20, 30],
     &[40, 280, 300, 530],
@@ -27,53 +27,53 @@ const GROUPS: [&[i64]; 12] = [
     &[610, 611, 640],
     &[960, 970],
 ];
-/// The same of M words.
+/// The same groups for M words.
 const M_GROUPS: [&[i64]; 4] = [&[0, 1, 2, 30, 60], &[3, 4, 5, 19], &[6], &[48, 49]];
 
-/// What a line has the tool do, in millimetres.
+/// Action of a line, lengths in millimetres.
 #[derive(Debug)]
 pub(super) enum Act {
-    /// Nothing: the line puts something in force.
+    /// No movement: the line only changes the modal state.
     Stay,
-    /// Axes that turn are brought to 0, by the motion in force.
+    /// Rotary axes move to 0, with the motion in force.
     Upright { by: u8 },
-    /// A rapid move of the axes that are named.
+    /// Rapid move of the named axes.
     Rapid([Option<f64>; 3]),
-    /// A move to the reference point (G28, G30) or in machine coordinates (G53), by the motion in force.
+    /// Move to the reference point (G28, G30) or in machine coordinates (G53), with the motion in force.
     Machine { by: Option<u8> },
-    /// A move at feed: a straight one, or an arc.
+    /// Move at feed: a straight line or an arc.
     Feed { from: Point, to: Point, arc: Option<Arc> },
 }
 
-/// The state of a control, as far as it tells where the tool moves.
+/// State of a control, as far as it determines where the tool moves.
 #[derive(Debug)]
 pub(super) struct Control {
-    /// Where the program has the tool; `None` where an axis is not known.
+    /// Position of the tool in the program; `None` for an axis whose position is unknown.
     pub at: [Option<f64>; 3],
     pub unit_mm: f64,
     pub relative: bool,
     pub arcs_absolute: bool,
-    /// Whether the program ended.
+    /// True if the program ended.
     pub ended: bool,
     motion: Option<u8>,
     plane: Plane,
     system: Option<i64>,
-    /// Whether anything was moved at feed by now: neither the zero nor an axis that turns may change after that.
+    /// True if there was a move at feed; after that neither the zero nor a rotary axis can change.
     moved: bool,
-    /// The axes that turn and are known to stand at 0.
+    /// True for each rotary axis that is known to be at 0.
     upright: [bool; 3],
 }
 
-/// What the words of a line ask for.
+/// Requests of the words of a line.
 #[derive(Default)]
 struct Asked {
     motion: Option<u8>,
     dwell: bool,
     machine: bool,
     reference: bool,
-    /// Words that take P, Q, R, H or D.
+    /// Letters among P, Q, R, H and D that a word of the line uses.
     takes: Vec<u8>,
-    /// Axes that are not known any more before the line moves.
+    /// Axes whose position becomes unknown before the line moves.
     forgets: [bool; 3],
 }
 
@@ -93,7 +93,7 @@ impl Control {
         }
     }
 
-    /// Takes in a line and returns what it has the tool do.
+    /// Reads a line, updates the state and returns the action of the line.
     pub(super) fn take(&mut self, block: &Block) -> Result<Act, Refusal> {
         let asked = self.states(block)?;
         (0..3).filter(|&k| asked.forgets[k]).for_each(|k| self.at[k] = None);
@@ -139,7 +139,7 @@ impl Control {
         Ok(Act::Feed { from, to, arc })
     }
 
-    /// Takes in what a line puts in force; refuses what moves the tool otherwise.
+    /// Applies the modal words of a line; rejects words that move the tool in another way.
     fn states(&mut self, block: &Block) -> Result<Asked, Refusal> {
         let mut asked = Asked::default();
         let is_move = |word: &&Word| word.letter == b'G' && [0.0, 1.0, 2.0, 3.0].contains(&word.value);
@@ -150,7 +150,7 @@ impl Control {
                 b'M' => self.m(word, &mut asked)?,
                 b'X' | b'Y' | b'Z' | b'I' | b'J' | b'K' | b'R' | b'F' | b'S' | b'T' | b'H' | b'D' | b'P' | b'Q'
                 | b'N' | b'A' | b'B' | b'C' => {}
-                // Of inputs and outputs alone.
+                // Allowed only for inputs and outputs.
                 b'E' | b'L' if has_io(block) => {}
                 b'U' | b'V' | b'W' => return Err(axis_refused(word)),
                 _ => return Err((format!("{} is not known", word.text), "remove it, if it does not move the tool")),
@@ -178,10 +178,10 @@ impl Control {
             280 | 300 => asked.reference = true,
             530 => asked.machine = true,
             code @ (540 | 550 | 560 | 570 | 580 | 590 | 591 | 592 | 593) => self.choose_system(code, word, asked)?,
-            // Beside a move in its line it changes nothing: the move is in force.
+            // If its line also has a motion word, G80 changes nothing: that motion is in force.
             800 if asked.motion.is_none() => self.motion = None,
             800 => {}
-            // Another length of the tool is another Z under the same place.
+            // Another tool length means another Z at the same position.
             430 | 490 => {
                 asked.forgets[2] = true;
                 asked.takes.push(b'H');
@@ -189,7 +189,7 @@ impl Control {
             640 => asked.takes.extend(b"PQ"),
             960 => asked.takes.push(b'D'),
             400 | 610 | 611 | 940 | 950 | 970 | 980 | 990 => {}
-            // Takes back zeros that were moved; where the tool is under those of the program is not known then.
+            // Cancels shifted zeros; the position of the tool in the coordinates of the program is then unknown.
             921 if !self.moved => asked.forgets = [true; 3],
             930 => {
                 let remedy = "let the CAM system write feeds a minute (G94)";
@@ -229,7 +229,7 @@ impl Control {
     fn m(&mut self, word: &Word, asked: &mut Asked) -> Result<(), Refusal> {
         match word.value {
             v if v == 2.0 || v == 30.0 => self.ended = true,
-            // The tool goes where the machine changes it.
+            // The tool moves to the place where the machine changes it.
             6.0 => asked.forgets = [true; 3],
             19.0 => asked.takes.extend(b"RPQ"),
             v if v.fract() == 0.0 && (matches!(v as i64, 61..=68)) => asked.takes.extend(b"PQEL"),
@@ -243,9 +243,10 @@ impl Control {
         Ok(())
     }
 
-    /// Takes in axes that turn the part or the tool: they may be brought to 0, where a map over x and y holds.
+    /// Processes the rotary axes, which turn the part or the tool: they can only move to 0, where a map over x and y is
+    /// valid.
     ///
-    /// Returns the first of them, and whether one of them may turn now.
+    /// Returns the word of the first rotary axis, and whether one of the axes can turn now.
     fn turning<'w>(&mut self, block: &'w Block, asked: &Asked) -> Result<Option<(&'w Word<'w>, bool)>, Refusal> {
         let mut first = None;
         for word in &block.words {
@@ -262,7 +263,7 @@ impl Control {
         Ok(first)
     }
 
-    /// A move that the program tells in coordinates of the machine: its axes are not known after it.
+    /// Processes a move that the program gives in machine coordinates: the positions of its axes are unknown after it.
     fn machine(&mut self, asked: &Asked, named: [Option<f64>; 3], axes: bool) -> Result<Act, Refusal> {
         if asked.machine && (self.relative || self.motion.is_none_or(|motion| motion > 1)) {
             return Err(("G53 stands with an arc, without a move or in G91".into(), "G53 goes with G0 and G1, in G90"));
@@ -270,12 +271,12 @@ impl Control {
         if asked.machine && !axes {
             return Err(("G53 names no axis".into(), "name the axes that move"));
         }
-        // Without an axis all of them go to the reference point.
+        // If no axis is named, all of them go to the reference point.
         (0..3).filter(|&k| named[k].is_some() || !axes).for_each(|k| self.at[k] = None);
         Ok(Act::Machine { by: self.motion.filter(|_| asked.machine) })
     }
 
-    /// Where the program moves to.
+    /// Returns the position to which the program moves.
     fn target(&self, named: [Option<f64>; 3]) -> Result<[Option<f64>; 3], Refusal> {
         let mut target = self.at;
         for k in 0..3 {
@@ -326,7 +327,7 @@ impl Control {
     }
 }
 
-/// Whether a line reads inputs or sets outputs (M62 to M68).
+/// Returns true if a line reads inputs or sets outputs (M62 to M68).
 fn has_io(block: &Block) -> bool {
     block.words.iter().any(|word| word.letter == b'M' && (62.0..=68.0).contains(&word.value))
 }
@@ -339,7 +340,7 @@ pub(super) fn all(of: [Option<f64>; 3]) -> Option<Point> {
     Some(Point::new(of[0]?, of[1]?, of[2]?))
 }
 
-/// Ten times the number of a word, if it has one decimal at most.
+/// Returns ten times the number of a word, if it has at most one decimal.
 pub(super) fn tenths(word: &Word) -> Option<i64> {
     let tenths = (word.value * 10.0).round();
     ((word.value * 10.0 - tenths).abs() <= 1e-6).then_some(tenths as i64)
@@ -353,7 +354,7 @@ fn axis_refused(word: &Word) -> Refusal {
     )
 }
 
-/// Refuses words that stand twice, and words of which a line may have one.
+/// Rejects words that occur twice, and two words of a group of which a line can have only one.
 fn check_once(block: &Block) -> Result<(), Refusal> {
     for (k, word) in block.words.iter().enumerate() {
         let before = &block.words[..k];
@@ -381,7 +382,7 @@ fn check_once(block: &Block) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// Refuses words that nothing in their line takes.
+/// Rejects words that no other word in their line uses.
 fn check_uses(block: &Block, asked: &Asked, moves: bool, is_arc: bool) -> Result<(), Refusal> {
     for word in &block.words {
         let used = match word.letter {

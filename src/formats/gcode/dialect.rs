@@ -1,7 +1,8 @@
-//! How a kind of control wants its programs written: words, numbers, comments, path modes, first and last lines, as data.
+//! Dialects: the form in which a kind of control needs its programs, as data: words, numbers, comments, path modes,
+//! first and last lines.
 //!
-//! A dialect is a file. What it cannot say of a pass is not left out but refused ([`Dialect::post`]): a program that rounds corners off by
-//! more than the recipe allows is worse than none.
+//! A dialect is a file. If it cannot express what a pass needs, the program is rejected ([`Dialect::post`]) and nothing
+//! is omitted: a program that rounds corners by more than the recipe allows is worse than no program.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -331,7 +332,7 @@ impl Default for Frame {
     }
 }
 
-/// What is wrong with a key of a dialect: which, what was found, what is allowed, what to do.
+/// Fault of a key of a dialect: the key, the value found, the allowed values and the remedy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fault {
     /// The key as a path.
@@ -344,7 +345,7 @@ pub struct Fault {
     pub remedy: &'static str,
 }
 
-/// What a program asks for that a dialect cannot say.
+/// Requirement of a program that a dialect cannot express.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -408,37 +409,38 @@ pub enum DialectError {
     Number { dialect: String, least: u32, most: u32, cycle: u16 },
 }
 
-/// A dialect that can say what a program asks for, and how it says how exactly to keep to the path.
+/// A dialect that can express a program, with its lines for the path mode and its words for arcs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Post<'a> {
     /// The dialect.
     pub dialect: &'a Dialect,
-    /// Lines before the moves and after them, which tell the path mode.
+    /// Lines before and after the moves that set the path mode.
     pub mode: [Vec<String>; 2],
-    /// Where arcs are written: their words, and what they keep to.
+    /// Words for arcs and the limits of arcs; `None` if no arcs are written.
     pub arcs: Option<(&'a ArcWords, ArcOptions)>,
 }
 
-/// How exactly a program is to be followed.
+/// Accuracy with which a control has to follow a program.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exactness {
     /// The path mode.
     pub mode: PathMode,
-    /// How far corners may be rounded off with [`PathMode::Blend`], in millimetres.
+    /// Maximum rounding of corners with [`PathMode::Blend`], in millimetres.
     pub tolerance_mm: f64,
-    /// How far the control rounds them off by a setting of its own, where that is known, in millimetres.
+    /// Maximum rounding of corners by a setting of the control itself, in millimetres, if it is known.
     pub controller_mm: Option<f64>,
-    /// How far points may be from where they should be, in millimetres.
+    /// Maximum distance of points from their exact position, in millimetres.
     pub chord_error_mm: f64,
-    /// How far arcs in place of lines may be from the path, in millimetres; none for lines alone.
+    /// Maximum distance from the path of arcs that replace lines, in millimetres; `None` for lines only.
     pub arcs_within_mm: Option<f64>,
 }
 
 impl Dialect {
-    /// Returns what is written for a program that is to be followed so exactly.
+    /// Returns the dialect with its words for a program of the given accuracy.
     ///
     /// # Errors
-    /// A path mode without words, a tolerance that cannot be said and is not known to be kept, too few decimals.
+    /// A path mode without words; a tolerance that the dialect cannot express and that the control is not known to
+    /// keep; too few decimals.
     pub fn post(&self, exactness: &Exactness) -> Result<Post<'_>, DialectError> {
         let dialect = || self.dialect.name.clone();
         let (mode, word, key) = match exactness.mode {
@@ -465,10 +467,10 @@ impl Dialect {
         Ok(Post { dialect: self, mode: [lines(&mode.begin), lines(&mode.end)], arcs })
     }
 
-    /// Returns the words of arcs that are to be within so many millimetres of the path, and what else they keep to.
+    /// Returns the words for arcs that stay within `within_mm` of the path, and the other limits of arcs.
     ///
     /// # Errors
-    /// A dialect without such words, and a tolerance that its decimals do not hold.
+    /// A dialect without words for arcs; a tolerance smaller than the rounding by its decimals.
     pub fn arcs(&self, within_mm: f64) -> Result<(&ArcWords, ArcOptions), DialectError> {
         let dialect = || self.dialect.name.clone();
         let words = self.arcs.as_ref().ok_or_else(|| DialectError::NoArcs { dialect: dialect() })?;
@@ -482,21 +484,22 @@ impl Dialect {
             radius_error_mm: 1e-3 * words.radius_error_um,
             largest_mm: self.numbers.largest_mm,
             helix: words.third_axis,
-            // No arc in more blocks than the lines that it stands for.
+            // An arc must not need more blocks than the lines that it replaces.
             least_lines: if words.centre == CentreWords::BlockBefore { 3 } else { 2 },
         };
         Ok((words, options))
     }
 
-    /// How far points are off by their decimals: each of three coordinates by half a step at most.
+    /// Returns the maximum rounding error of a point, from half a step of the last decimal in each of three
+    /// coordinates.
     fn rounding_um(&self) -> f64 {
         1e3 * 0.5 * 10f64.powi(-i32::from(self.numbers.decimals)) * 3f64.sqrt()
     }
 
-    /// Returns what a control is told of a head that tilts the wheel.
+    /// Returns the lines that set up the control for a head that tilts the wheel.
     ///
     /// # Errors
-    /// A way of tilting without words.
+    /// A way of tilting for which the dialect has no words.
     pub fn turning(&self, rotary: &Rotary) -> Result<&Turning, DialectError> {
         let dialect = || self.dialect.name.clone();
         match rotary.pivot_mm {
@@ -524,7 +527,7 @@ impl Dialect {
         }
     }
 
-    /// Returns the number of the program of a cycle, where programs have numbers.
+    /// Returns the number of the program of a cycle, if programs have numbers.
     ///
     /// # Errors
     /// A cycle beyond the last number.
@@ -547,7 +550,7 @@ impl Dialect {
         part.chars().map(plain).take(room).collect::<String>() + &cycle
     }
 
-    /// Returns what is wrong with it beyond what its schema holds it to.
+    /// Returns the faults of the dialect that its schema does not detect.
     pub fn faults(&self) -> Vec<Fault> {
         let mut faults = Vec::new();
         let mut fault = |key: &str, found: String, allowed, remedy| {
@@ -597,7 +600,7 @@ impl Dialect {
         faults
     }
 
-    /// All fixed words and lines with their keys.
+    /// Returns all fixed words and lines with their keys.
     fn lines(&self) -> impl Iterator<Item = (String, &String)> {
         let of = |key: &'static str, lines: &'static str| move |(k, line)| (format!("{key}{lines}[{k}]"), line);
         let frame = &self.program;
@@ -643,7 +646,7 @@ impl Dialect {
             .chain(of_arcs)
     }
 
-    /// What is wrong with a fixed line.
+    /// Returns the fault of a fixed line, if it has one.
     fn fault_of(&self, key: &str, line: &str) -> Option<(String, &'static str, &'static str)> {
         if !line.chars().all(|c| matches!(c, ' '..='~')) {
             return Some((
@@ -669,7 +672,7 @@ impl Dialect {
             let allowed = "{name} and, beside program.numbers, {number} may stand in program.begin and program.end, {tolerance_mm} in path.blend.begin";
             return Some((format!("is {line:?}"), allowed, "remove it"));
         }
-        // Slides that turn with a head are the one place where a feed is by time.
+        // Only slides that move with a tilting head use a feed by time.
         let allowed = if key.starts_with("rotary.slides.begin") { "G93" } else { "" };
         let is_other = |word: &&str| *word != allowed && OTHER.contains(word);
         let other = line.to_ascii_uppercase().split_whitespace().find(is_other).map(str::to_owned);
@@ -679,7 +682,7 @@ impl Dialect {
         })
     }
 
-    /// The longest block that a move can be, in characters.
+    /// Returns the length of the longest possible block of a move, in characters.
     fn longest_move(&self) -> usize {
         let words = &self.words;
         let digits = |largest: f64| largest.log10().floor().max(0.0) as usize + 1;
@@ -699,7 +702,7 @@ impl Dialect {
 }
 
 impl ArcWords {
-    /// What is wrong with them: key, found, allowed, remedy.
+    /// Returns the faults of the arc words: key, text found, allowed values, remedy.
     fn faults(&self) -> impl Iterator<Item = (&'static str, String, &'static str, &'static str)> {
         let missing = || "is missing".to_owned();
         let allowed = "an arc is told by its end and its centre";
@@ -736,7 +739,7 @@ impl ArcWords {
         .flatten()
     }
 
-    /// All fixed words with their keys.
+    /// Returns all fixed words with their keys.
     fn words(&self) -> impl Iterator<Item = (&'static str, &String)> {
         [
             ("arcs.clockwise", &self.clockwise),
@@ -750,7 +753,7 @@ impl ArcWords {
         .chain(self.centre_block.iter().map(|word| ("arcs.centre_block", word)))
     }
 
-    /// The most characters that an arc has beyond the places of a line.
+    /// Returns the maximum number of characters of an arc in addition to the positions of a line.
     fn longest(&self) -> usize {
         let longest = |words: &Option<[String; 3]>| words.iter().flatten().map(String::len).max().unwrap_or(0);
         self.clockwise.len().max(self.counter_clockwise.len())
@@ -761,18 +764,18 @@ impl ArcWords {
     }
 }
 
-/// What stands for something else in the lines of a dialect.
+/// Placeholders in the lines of a dialect.
 pub(super) const NAME: &str = "{name}";
 pub(super) const NUMBER: &str = "{number}";
 const TOLERANCE: &str = "{tolerance_mm}";
-/// Words of inches, of places from the last one, of feeds by time or turn.
+/// Words for inches, for incremental positions, and for feeds by time or by revolution.
 const OTHER: [&str; 9] = ["G20", "G70", "G700", "G91", "G93", "G95", "G96", "G961", "INCH"];
 
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
 
-    /// A dialect as it ships.
+    /// Returns a dialect that is delivered with Regrind.
     pub(in super::super) fn shipped(name: &str) -> Dialect {
         let file = format!("{}/../../config/dialects/{name}.toml", env!("CARGO_MANIFEST_DIR"));
         toml::from_str(&std::fs::read_to_string(file).unwrap()).unwrap()

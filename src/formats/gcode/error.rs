@@ -1,4 +1,4 @@
-//! Why a program could not be written, read or corrected.
+//! Errors of writing, reading and correcting programs.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use thiserror::Error;
 use super::dialect::DialectError;
 use crate::FormatError;
 
-/// Why a program could not be written, read or corrected. Lines count from 1.
+/// Reason why a program could not be written, read or corrected. Lines count from 1.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -37,7 +37,7 @@ pub enum GcodeError {
 }
 
 impl GcodeError {
-    /// Counts the moves that came before those whose error this is.
+    /// Returns the error with its move number increased by the moves that came before.
     pub(super) fn after(self, moves: u64) -> Self {
         match self {
             Self::NotFinite { axis, value_mm, number } => Self::NotFinite { axis, value_mm, number: number + moves },

@@ -1,4 +1,4 @@
-//! A map over x and y to correct a program by: `error_map.csv` or `correction.csv`.
+//! Maps over x and y for the correction of a program: `error_map.csv` or `correction.csv`.
 
 use std::io::{BufRead, BufReader, Read as _};
 use std::path::Path;
@@ -10,52 +10,52 @@ use crate::FormatError;
 use regrind_core::geometry::grid_order::NO_POINT;
 use regrind_core::geometry::{Grid, Point, recognise_grid};
 
-/// Largest map that is read.
+/// Largest map that is read, in bytes.
 const MOST_BYTES: u64 = 512 << 20;
 
-/// What the values of a map are.
+/// Meaning of the values of a map.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MapKind {
-    /// The error of the part: positive stands proud, and is taken off.
+    /// Error of the part: positive is proud, and is ground off.
     Error,
-    /// The correction of the surface: positive leaves material.
+    /// Correction of the surface: positive leaves material.
     Correction,
 }
 
-/// What the program that a map is put on must have in it already.
+/// Correction that a program must already contain before the map is applied to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MapBase {
-    /// No correction: the map is absolute, it replaces what was before it.
+    /// No correction: the map is absolute and replaces any previous one.
     Nothing,
     /// This map: the error was measured after a pass that was ground with it.
     Map([u8; 32]),
-    /// Whatever: the map does not say what it was measured after.
+    /// Any correction: the map does not state after which pass it was measured.
     Anything,
 }
 
-/// A map as read.
+/// Map as read from its file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ProgramMap {
-    /// Where the nodes are.
+    /// Grid of the nodes.
     pub grid: Grid,
     /// The values in millimetres, row by row with x fastest.
     pub values_mm: Vec<f64>,
-    /// Whether enough was measured around a node; all, where the file does not say.
+    /// True for nodes with enough measured points around them; true for all if the file does not state it.
     pub valid: Vec<bool>,
-    /// What they are.
+    /// Meaning of the values.
     pub kind: MapKind,
-    /// The map's own identity, or the SHA-256 of the file where it states none.
+    /// Identity that the map states, or else the SHA-256 of the file.
     pub identity: [u8; 32],
-    /// The part that it belongs to, where it says so.
+    /// Part that the map belongs to, if it states one.
     pub part: Option<[u8; 32]>,
-    /// What the program must have in it already.
+    /// Correction that the program must already contain.
     pub base: MapBase,
-    /// Whether it comes from a simulated cell.
+    /// True if the map comes from a simulated cell.
     pub simulation: bool,
 }
 
 impl ProgramMap {
-    /// Returns whether a place lies over a node around which enough was measured.
+    /// Returns true if a position lies over a node with enough measured points around it.
     pub fn covers(&self, place_mm: [f64; 2]) -> bool {
         let counts = self.grid.counts();
         let [column, row] = [0, 1].map(|k| ((place_mm[k] - self.grid.first_mm[k]) / self.grid.spacing_mm[k]).round());
@@ -64,12 +64,14 @@ impl ProgramMap {
     }
 }
 
-/// Reads a map: a header `x_mm,y_mm,error_mm` or `x_mm,y_mm,correction_mm`, perhaps with further columns, and a row for every node of a
-/// regular grid. A column `valid` says with 0 around which nodes too little was measured: a map that Regrind made has them levelled off, in another one their
-/// values are not used, and the nearest valid ones stand there. Comments tell `part: sha256 ...`, `map: sha256 ...`, `ground with: sha256 ...` and `SIMULATION`.
+/// Reads a map: a header `x_mm,y_mm,error_mm` or `x_mm,y_mm,correction_mm`, optionally with more columns, and one row
+/// for every node of a regular grid. A 0 in the column `valid` marks a node with too few measured points around it.
+/// Maps that Regrind wrote already have extrapolated (levelled off) values there. In other maps these values are not
+/// used, and the nearest valid ones replace them. Comments can state `part: sha256 ...`, `map: sha256 ...`, `ground
+/// with: sha256 ...` and `SIMULATION`.
 ///
 /// # Errors
-/// A file that cannot be read, other columns, rows that are no numbers, nodes that are no whole grid.
+/// A file that cannot be read; other columns; rows that are not numbers; nodes that do not form a complete grid.
 pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
     let unreadable = |source| GcodeError::File(FormatError::Unreadable { path: path.to_owned(), source });
     let file = crate::system::open_to_read(path).map_err(unreadable)?;
@@ -94,24 +96,24 @@ pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
     }
 }
 
-/// What the lines of a map have told so far.
+/// Content of the lines of a map that were read so far.
 #[derive(Default)]
 struct MapLines {
     hash: Sha256,
     kind: Option<MapKind>,
-    /// Which column says whether a node is valid.
+    /// Index of the column that says whether a node is valid.
     valid_column: Option<usize>,
     nodes: Vec<Point>,
     valid: Vec<bool>,
     simulation: bool,
     part: Option<[u8; 32]>,
-    /// The map's own identity.
+    /// Identity that the map states.
     stated: Option<[u8; 32]>,
     ground_with: Option<[u8; 32]>,
 }
 
 impl MapLines {
-    /// Takes one line; the error says what is wrong with it.
+    /// Reads one line; the error describes the fault.
     fn take(&mut self, line: &[u8]) -> Result<(), String> {
         self.hash.update(line);
         let text = std::str::from_utf8(line).map_err(|_| "the line is no text")?.trim_start_matches('\u{feff}').trim();
@@ -136,7 +138,7 @@ impl MapLines {
         Ok(())
     }
 
-    /// Lays the nodes on their grid once all lines are told.
+    /// Arranges the nodes on their grid after all lines were read.
     fn into_map(self, path: &Path) -> Result<ProgramMap, GcodeError> {
         let remedy = "every node of a regular grid of three rows and three columns at least needs its row";
         let no_grid = |what: String| GcodeError::Program { path: path.to_owned(), what, remedy };
@@ -148,7 +150,7 @@ impl MapLines {
         if !valid.contains(&true) {
             return Err(no_grid("none of its nodes is valid".into()));
         }
-        // A map of ours is levelled off; of another one what stands at a node that is not valid means nothing.
+        // A map written by Regrind is levelled off already. In another map the value of an invalid node has no meaning.
         let is_ours = self.stated.is_some() || self.part.is_some();
         let is_known = |(value, valid): (&f64, &bool)| *valid || (is_ours && value.is_finite());
         let known: Vec<bool> = values_mm.iter().zip(&valid).map(is_known).collect();
@@ -179,13 +181,13 @@ fn columns(header: &str) -> Option<MapKind> {
     }
 }
 
-/// Reads the node of a row; the value of one that is not valid may be anything.
+/// Reads the node of a row; the value of an invalid node can be any text.
 fn node(row: &str, valid: bool) -> Option<Point> {
     let mut cells = row.split(',').map(|cell| cell.trim().parse::<f64>().ok().filter(|v| v.abs() < 1e7));
     Some(Point::new(cells.next()??, cells.next()??, cells.next()?.or((!valid).then_some(f64::NAN))?))
 }
 
-/// The grid of the nodes, and which of them stands at each of its places.
+/// Returns the grid of the nodes, and the index of the point at each node of the grid.
 fn grid(points: &[Point]) -> Option<(Grid, Vec<usize>)> {
     let order = recognise_grid(points)?;
     if order.point_at.contains(&NO_POINT) {
@@ -198,7 +200,7 @@ fn grid(points: &[Point]) -> Option<(Grid, Vec<usize>)> {
     Some((grid, (0..grid.len()).map(|k| order.point_at[k] as usize).collect()))
 }
 
-/// Gives nodes whose value is not known that of the nearest one whose is, by steps along rows and columns.
+/// Gives each node with an unknown value the value of the nearest known node, by steps along rows and columns.
 fn level_off(values_mm: &mut [f64], known: &[bool], columns: usize) {
     let mut known = known.to_vec();
     let mut next: std::collections::VecDeque<usize> = (0..known.len()).filter(|&k| known[k]).collect();
@@ -219,7 +221,7 @@ fn level_off(values_mm: &mut [f64], known: &[bool], columns: usize) {
     }
 }
 
-/// Finds an identity after a name in a comment.
+/// Returns the identity that follows a name in a comment.
 pub(super) fn identity_in(comment: &str, name: &str) -> Option<[u8; 32]> {
     let digits = comment.split_once(name)?.1.trim_start().strip_prefix("sha256")?.trim_start().get(..64)?;
     let mut bytes = [0; 32];

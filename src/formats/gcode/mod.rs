@@ -1,4 +1,5 @@
-//! Programs for numerically controlled machines: writing them in the dialect of a control, reading and correcting those of LinuxCNC.
+//! Programs for numerically controlled machines: written in the dialect of a control, and read and corrected in the
+//! dialect of LinuxCNC.
 //!
 //! ```text
 //!  ToolPath + Dialect --write_program--> part.ngc, part.nc, part.mpf, part.h

@@ -1,20 +1,20 @@
-//! Numbers of a program: a sign, digits, a point, six decimals. No exponent, which LinuxCNC takes for an E word.
+//! Numbers of a program: a sign, digits, a point, six decimals. No exponent, because LinuxCNC reads it as an E word.
 
-/// Decimals that are written: a nanometre.
+/// Number of decimals that are written: the last one is a nanometre.
 pub(super) const PER_MM: f64 = 1e6;
 /// Largest coordinate that is written, in millimetres.
 pub(super) const LARGEST_MM: f64 = 1e9;
 
-/// Rounds a length to what is written of it, in millionths of a millimetre.
+/// Rounds a length to the written decimals; returns millionths of a millimetre.
 #[inline]
 pub(super) fn rounded(value_mm: f64) -> i64 {
     (value_mm * PER_MM).round() as i64
 }
 
-/// Appends a number of millionths with six decimals.
+/// Appends a number, given in millionths, with six decimals.
 #[inline]
 pub(super) fn push_fixed(text: &mut Vec<u8>, millionths: i64) {
-    // Nineteen digits, a point and a sign at most; filled from the end.
+    // At most nineteen digits, a point and a sign; filled from the end.
     let mut digits = [0u8; 24];
     let mut at = digits.len();
     let mut rest = millionths.unsigned_abs();
@@ -41,7 +41,7 @@ pub(super) fn push_fixed(text: &mut Vec<u8>, millionths: i64) {
     text.extend_from_slice(&digits[at..]);
 }
 
-/// Appends a number of so many decimals, counted in the last of them.
+/// Appends a number with the given number of decimals; the value counts units of the last decimal.
 #[inline]
 pub(super) fn push_decimals(text: &mut Vec<u8>, count: i64, decimals: u8) {
     if decimals == 6 {
@@ -49,7 +49,7 @@ pub(super) fn push_decimals(text: &mut Vec<u8>, count: i64, decimals: u8) {
     }
     let mut digits = [0u8; 32];
     let (mut at, mut rest, mut written) = (digits.len(), count.unsigned_abs(), 0);
-    // At least one digit before the point.
+    // There is at least one digit before the point.
     while written <= decimals || rest > 0 {
         if written == decimals && decimals > 0 {
             at -= 1;
@@ -77,7 +77,7 @@ const PAIRS: [[u8; 2]; 100] = {
     pairs
 };
 
-/// Returns a number without trailing zeros, as headers and feeds have it.
+/// Returns a number without trailing zeros, as headers and feeds use it.
 pub(super) fn short(value: f64) -> String {
     let mut text = Vec::new();
     push_fixed(&mut text, rounded(value));

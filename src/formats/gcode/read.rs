@@ -1,6 +1,7 @@
-//! Lines of a program taken apart: words, comments, and what is refused because nobody can know where it moves the tool.
+//! Splitting of program lines into words and comments. Content that makes the position of the tool unknowable is
+//! rejected.
 
-/// A word of a line: a letter and its number, and how it is written.
+/// Word of a line: a letter and its number, with the text as written.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Word<'a> {
     pub(super) letter: u8,
@@ -8,23 +9,23 @@ pub(super) struct Word<'a> {
     pub(super) text: &'a str,
 }
 
-/// A line taken apart.
+/// A line split into words and comments.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Block<'a> {
     pub(super) words: Vec<Word<'a>>,
-    /// As written, with their marks.
+    /// Comments as written, with their marks.
     pub(super) comments: Vec<&'a str>,
-    /// A line of a percent sign alone.
+    /// True for a line that is only a percent sign.
     pub(super) percent: bool,
 }
 
-/// What is wrong with a line, and what to do.
+/// Fault of a line, and the remedy.
 pub(super) type Refusal = (String, &'static str);
 
-/// Longest line that LinuxCNC takes.
+/// Longest line that LinuxCNC accepts.
 const LONGEST_LINE: usize = 255;
 
-/// Takes a line apart.
+/// Splits a line into words and comments.
 ///
 /// # Errors
 /// Block delete, variables and expressions, O-words, a letter without a number, a comment without an end.
@@ -74,7 +75,7 @@ fn expression() -> Refusal {
     ("a variable or an expression is used, whose value only the controller knows".into(), remedy)
 }
 
-/// Reads the word that begins at a byte, and returns where it ends.
+/// Reads the word that begins at a byte, and returns it with its end.
 fn word(line: &str, at: usize) -> Result<(Word<'_>, usize), Refusal> {
     let bytes = line.as_bytes();
     let letter = bytes[at].to_ascii_uppercase();
@@ -110,7 +111,7 @@ mod tests {
     #[test]
     fn words_and_comments_are_told_apart() {
         let block = block("n10 G1x-1.5 Y + 2. (to (here) z.25;rest").map(|b| b.words.len());
-        // Blanks within a number are not taken.
+        // Blanks within a number are not accepted.
         assert!(block.is_err());
         let block = super::block("n10 G1x-1.5 Y+2. (to here) z.25;rest (of it").unwrap();
         let words: Vec<(char, f64)> = block.words.iter().map(|w| (char::from(w.letter), w.value)).collect();

@@ -1,4 +1,4 @@
-//! The table for controllers that compensate by one: an offset of Z over X and Y.
+//! Table for controllers that compensate by a table: an offset of Z over X and Y.
 
 use std::path::Path;
 
@@ -7,13 +7,14 @@ use crate::FormatError;
 use crate::registration::write_rows;
 use regrind_core::geometry::Grid;
 
-/// Writes `toolpath_z.csv`: `x_mm,y_mm,dz_mm`, a row per node, row by row with x fastest.
+/// Writes `toolpath_z.csv`: `x_mm,y_mm,dz_mm`, one row per node, row by row with x fastest.
 ///
-/// x and y are where the axes have the wheel's centre; dz is added to Z. It corrects a program of the nominal surface at the same level: sag
-/// compensation over two axes, levelling meshes. A program that holds the correction already must not be given the table too.
+/// x and y are the positions of the wheel's centre on the axes; the controller adds dz to Z. The table corrects a
+/// program of the nominal surface at the same level, as in sag compensation over two axes or with levelling meshes. Do
+/// not use the table with a program that already contains the correction.
 ///
 /// # Errors
-/// Those of [`crate::write_deviations`].
+/// The same as for [`crate::write_deviations`].
 pub fn write_axis_table(
     path: &Path,
     grid: &Grid,

@@ -1,4 +1,4 @@
-//! Writing a program in the dialect of a control, a move a block, as fast as a file takes it.
+//! Writing of a program in the dialect of a control, one move per block, at the speed of the file.
 
 use std::path::Path;
 
@@ -10,58 +10,59 @@ use super::{GcodeError, hex};
 use crate::registration::Draft;
 use regrind_core::compensation::path::{Arc, ArcSummary, Block, Move, Plane, Rotary, Summary, ToolPath, TurnAxis};
 
-/// Bytes that are gathered before they go to the file.
+/// Bytes that are collected before they are written to the file.
 const CHUNK: usize = 1 << 16;
-/// Points whose lines are made at the same time and wait for their turn, some 30 bytes each.
+/// Number of points whose lines are formatted in parallel and then wait to be written, some 30 bytes each.
 const AT_ONCE: u64 = 200_000;
 
-/// What the header of a program without a correction says of its map.
+/// Text in the header of a program without a correction, in place of the identity of a map.
 pub(super) const UNCORRECTED: &str = "map: 0 everywhere";
 
-/// What the header of a program tells.
+/// Content of the header of a program.
 #[derive(Clone, Debug)]
 pub struct ProgramHeader {
-    /// The part by name.
+    /// Name of the part.
     pub part: String,
-    /// The pass, from 1.
+    /// Number of the pass, from 1.
     pub cycle: u16,
-    /// SHA-256 of what the nominal surface came from: what the path was made over.
+    /// SHA-256 of the source of the nominal surface, over which the path was made.
     pub base_identity: [u8; 32],
     /// Identity of the correction that is in the path.
     pub map_identity: [u8; 32],
-    /// Whether that is 0 everywhere.
+    /// True if that correction is 0 everywhere.
     pub uncorrected: bool,
-    /// Height of the surface wanted over the nominal one, in millimetres.
+    /// Height of the target surface above the nominal one, in millimetres.
     pub level_mm: f64,
-    /// Whether the wheel comes from -z.
+    /// True if the wheel comes from -z.
     pub from_below: bool,
-    /// The rotary axis by which the wheel leans, if it does.
+    /// Rotary axis that tilts the wheel, if there is one.
     pub rotary: Option<Rotary>,
-    /// How it leans, in words.
+    /// Tilt of the wheel, in words.
     pub lean: String,
-    /// The wheel in words.
+    /// Description of the wheel, in words.
     pub wheel: String,
-    /// Which parameters of the machine are taken back in the path, a line each.
+    /// Parameters of the machine that the path compensates, one line each.
     pub parameters: Vec<String>,
-    /// The tracks in words.
+    /// Description of the tracks, in words.
     pub tracks: String,
-    /// How often the program is run again without going deeper.
+    /// Number of times that the program is repeated without going deeper.
     pub spark_out_passes: u16,
-    /// Whether the cell is simulated.
+    /// True if the cell is simulated.
     pub simulation: bool,
-    /// How exactly it is to be followed.
+    /// Accuracy with which the control has to follow the path.
     pub exactness: Exactness,
 }
 
 /// Writes a program: the header, the moves track by track, the end.
 ///
-/// Frame: the model frame, which the work offset must have its zero in. Units: mm, mm/min. A coordinate that does not change within a track
-/// is left out; every track says all of its beginning anew, so that a program can be gone on with at any of them, and many are written at the
-/// same time where blocks have no numbers. The file appears whole or not at all.
+/// Frame: the model frame; the work offset must have its zero there. Units: mm, mm/min. A coordinate that does not
+/// change within a track is omitted. Every track states its complete start again, so that a program can be resumed at
+/// any track, and so that many tracks are formatted in parallel if blocks have no numbers. The file appears complete or
+/// not at all.
 ///
 /// # Errors
-/// What the dialect cannot say; a coordinate that is not finite or larger than it takes, a feed of which nothing is left; a number of moves
-/// other than the summary has; a file that cannot be written.
+/// A request that the dialect cannot express; a coordinate that is not finite or exceeds the limit of the dialect; a
+/// feed that rounds to 0; a number of moves that differs from the summary; a file that cannot be written.
 pub fn write_program(
     file: &Path,
     header: &ProgramHeader,
@@ -98,7 +99,7 @@ where
     let mut lines = Lines::new(dialect, rotary, 0, numbered);
     let at_once = (AT_ONCE * tracks.len() as u64 / summary.points.max(1)) as usize;
     if at_once < 2 || dialect.blocks.is_some() {
-        // Long tracks, and those whose blocks are counted, go to the file as they come.
+        // Long tracks, and tracks whose blocks are numbered, are written to the file as they come.
         for track in tracks {
             lines.begin();
             for one in track.clone() {
@@ -130,26 +131,26 @@ where
     Ok(())
 }
 
-/// The lines of the moves, and what is in force after them.
+/// Lines of the moves, and the modal state after them.
 struct Lines<'a> {
     dialect: &'a Dialect,
     rotary: Option<&'a Rotary>,
     text: Vec<u8>,
-    /// In the last digit that is written; the largest number where nothing is in force.
+    /// Last coordinates, in units of the last written digit; `i64::MAX` if none is in force.
     last: [i64; 3],
     turned: i64,
     motion: Option<Motion>,
     plane: Option<Plane>,
     feed: i64,
     count: u64,
-    /// Blocks with a number so far.
+    /// Number of numbered blocks so far.
     numbered: u64,
     per_mm: f64,
     per_deg: f64,
     feed_per: f64,
 }
 
-/// How a block moves.
+/// Kind of motion of a block.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Motion {
     Rapid,
@@ -158,13 +159,13 @@ enum Motion {
     CounterClockwise,
 }
 
-/// No time is told of a shorter way.
+/// Minimum length for which an inverse time is computed, in millimetres.
 const LEAST_MM: f64 = 1e-6;
-/// What a place or a feed is that is not in force.
+/// Value of a position or a feed that is not in force.
 const NOTHING: i64 = i64::MAX;
 
 impl<'a> Lines<'a> {
-    /// Nothing is in force, after so many moves and so many numbered blocks.
+    /// Creates an empty state, after `count` moves and `numbered` numbered blocks.
     fn new(dialect: &'a Dialect, rotary: Option<&'a Rotary>, count: u64, numbered: u64) -> Self {
         let power = |decimals: u8| 10f64.powi(i32::from(decimals));
         let numbers = &dialect.numbers;
@@ -174,7 +175,7 @@ impl<'a> Lines<'a> {
         Self { dialect, rotary, text, last, turned, motion, plane, feed, count, numbered, per_mm, per_deg, feed_per }
     }
 
-    /// The lines of a whole track.
+    /// Formats the lines of a whole track.
     fn of<T: Iterator<Item: Into<Block>> + Clone>(
         dialect: &'a Dialect,
         rotary: Option<&'a Rotary>,
@@ -185,7 +186,7 @@ impl<'a> Lines<'a> {
         Ok(lines)
     }
 
-    /// Nothing is in force any more.
+    /// Resets the modal state: nothing is in force any more.
     fn begin(&mut self) {
         (self.last, self.turned, self.feed) = ([NOTHING; 3], NOTHING, NOTHING);
         (self.motion, self.plane) = (None, None);
@@ -200,7 +201,7 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// The number of a block, where it has one.
+    /// Writes the number of a block, if blocks have one.
     #[inline]
     fn number(&mut self) {
         number(&mut self.text, self.dialect, self.numbered);
@@ -232,8 +233,9 @@ impl<'a> Lines<'a> {
         Ok(())
     }
 
-    /// The feed as the control takes it: of the wheel's centre, which it keeps, or the inverse of the time in minutes where the program moves the
-    /// slides, which is of its own block and no other.
+    /// Returns the feed in the form that the control uses: the feed of the wheel's centre if the control keeps that
+    /// centre in place, or the inverse of the time in minutes if the program moves the slides. An inverse time is valid
+    /// for its own block only.
     fn feed_of(&mut self, feed_mm_min: f64, centre_mm: f64) -> f64 {
         if !self.moves_slides() {
             return feed_mm_min;
@@ -246,7 +248,7 @@ impl<'a> Lines<'a> {
         self.rotary.is_some_and(|rotary| rotary.pivot_mm.is_some())
     }
 
-    /// The words of a move: those that say something new, or all that are known where none does.
+    /// Writes the words of a move: those that changed, or all known ones if none changed.
     #[inline]
     fn block(
         &mut self,
@@ -265,7 +267,7 @@ impl<'a> Lines<'a> {
         let feed = feed_mm_min.map_or(Ok(self.feed), |feed| self.rounded_feed(feed))?;
         let turned = tilt_rad.map_or(Ok(self.turned), |tilt| self.rounded_turn(tilt))?;
         let still = to == self.last && turned == self.turned;
-        // An inverse time alone would be no move.
+        // A block with only an inverse time would not be a move.
         let nothing_new = still && (feed == self.feed || self.moves_slides());
         let mut first = true;
         for (k, &value) in to.iter().enumerate() {
@@ -282,7 +284,8 @@ impl<'a> Lines<'a> {
         Ok(())
     }
 
-    /// The block of an arc, or two of them where the centre has one of its own; both ends and the centre are always told.
+    /// Writes the block of an arc, or two blocks if the centre has its own block; the end point and the centre are
+    /// always written.
     fn arc(&mut self, arc: &Arc) -> Result<(), GcodeError> {
         let dialect = self.dialect;
         let (words, Some(arcs)) = (&dialect.words, &dialect.arcs) else { return Ok(()) };
@@ -319,7 +322,7 @@ impl<'a> Lines<'a> {
         Ok(())
     }
 
-    /// What begins an arc: its plane where that is another one, and which way it turns.
+    /// Writes the start of an arc: its plane, if that changed, and the direction of rotation.
     fn turn(&mut self, arc: &Arc, arcs: &ArcWords) {
         if let Some(planes) = arcs.planes.as_ref().filter(|_| self.plane != Some(arc.plane)) {
             let known = [Plane::XY, Plane::ZX, Plane::YZ].iter().position(|plane| *plane == arc.plane);
@@ -332,7 +335,7 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// The centre along the axes of a plane, in the order of the axes.
+    /// Writes the centre along the axes of a plane, in the order of the axes.
     fn centre(&mut self, letters: &[String; 3], plane: Plane, centre: [i64; 2], first: &mut bool) {
         for (k, letter) in letters.iter().enumerate() {
             if let Some(at) = plane.0[..2].iter().position(|axis| *axis == k) {
@@ -341,7 +344,7 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// What begins a block, where it is not in force.
+    /// Writes the word of the motion, if that motion is not in force.
     #[inline]
     fn begins(&mut self, motion: Motion, words: &str) {
         if self.dialect.words.each_block || self.motion != Some(motion) {
@@ -350,7 +353,7 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// A word and a place.
+    /// Writes a word and a position.
     #[inline]
     fn place(&mut self, word: &str, value: i64, first: &mut bool) {
         self.between(first);
@@ -362,7 +365,7 @@ impl<'a> Lines<'a> {
         push_decimals(&mut self.text, value, numbers.decimals);
     }
 
-    /// A feed that is not in force.
+    /// Writes a feed, if it is not in force.
     #[inline]
     fn feed(&mut self, feed: i64, first: &mut bool) {
         if feed != self.feed {
@@ -380,7 +383,7 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// A coordinate in the last digit that is written.
+    /// Returns a coordinate in units of the last written digit.
     #[inline]
     fn rounded(&self, axis: usize, value_mm: f64) -> Result<i64, GcodeError> {
         let largest_mm = self.dialect.numbers.largest_mm;
@@ -403,7 +406,7 @@ impl<'a> Lines<'a> {
         push_decimals(&mut self.text, turned, numbers.angle_decimals);
     }
 
-    /// An angle on the scale of the axis, in the last digit that is written.
+    /// Returns an angle on the scale of the axis, in units of the last written digit.
     fn rounded_turn(&self, tilt_rad: f64) -> Result<i64, GcodeError> {
         let Some(rotary) = self.rotary.filter(|_| tilt_rad.is_finite()) else {
             return Err(GcodeError::NotFinite { axis: 'A', value_mm: tilt_rad, number: self.count });
@@ -411,7 +414,7 @@ impl<'a> Lines<'a> {
         Ok((rotary.on_scale_rad(tilt_rad).to_degrees() * self.per_deg).round() as i64)
     }
 
-    /// A feed in the last digit that is written.
+    /// Returns a feed in units of the last written digit.
     fn rounded_feed(&self, feed_mm_min: f64) -> Result<i64, GcodeError> {
         match (feed_mm_min * self.feed_per).round() as i64 {
             0 => {
@@ -422,7 +425,7 @@ impl<'a> Lines<'a> {
     }
 }
 
-/// A feed without zeros at its end.
+/// Writes a feed without trailing zeros.
 fn push_feed(text: &mut Vec<u8>, feed: i64, dialect: &Dialect) {
     let before = text.len();
     push_decimals(text, feed, dialect.numbers.feed_decimals);
@@ -439,11 +442,11 @@ fn push_feed(text: &mut Vec<u8>, feed: i64, dialect: &Dialect) {
     }
 }
 
-/// The number of a block, where blocks have one.
+/// Writes the number of a block, if blocks have one.
 #[inline]
 fn number(text: &mut Vec<u8>, dialect: &Dialect, numbered: u64) {
     let Some(blocks) = &dialect.blocks else { return };
-    // After the last comes the first again.
+    // After the last number the first one follows again.
     let round = u64::from(blocks.last.saturating_sub(blocks.first) / blocks.step.max(1)) + 1;
     let number = u64::from(blocks.first) + u64::from(blocks.step) * (numbered % round);
     text.extend_from_slice(format!("{}{number} ", blocks.letter).as_bytes());
@@ -457,7 +460,7 @@ fn end_line(text: &mut Vec<u8>, dialect: &Dialect) {
     });
 }
 
-/// What stands before and after the moves.
+/// Lines before and after the moves.
 struct Frame<'a> {
     dialect: &'a Dialect,
     begin: Vec<String>,
@@ -493,7 +496,7 @@ impl<'a> Frame<'a> {
 
     /// Appends a line; returns whether it has a number.
     fn line(&self, text: &mut Vec<u8>, line: &str, has_number: bool, numbered: &mut u64) {
-        // A percent sign is none of a control's blocks.
+        // A percent sign is not a block and has no number.
         if has_number && line != "%" {
             number(text, self.dialect, *numbered);
             *numbered += 1;
@@ -502,7 +505,8 @@ impl<'a> Frame<'a> {
         end_line(text, self.dialect);
     }
 
-    /// The lines before the moves, with the number of all lines counted in, and how many blocks of them have a number.
+    /// Returns the lines before the moves, which state the total number of lines, and the number of numbered blocks
+    /// among them.
     fn head(&self, header: &ProgramHeader, summary: &Summary, arcs: Option<&ArcSummary>) -> (String, u64) {
         let lines = |count: u64| {
             let (mut text, mut numbered) = (Vec::new(), 0);
@@ -525,17 +529,17 @@ impl<'a> Frame<'a> {
         lines(count)
     }
 
-    /// The lines after the moves.
+    /// Returns the lines after the moves.
     fn tail(&self, mut numbered: u64) -> String {
         let mut text = Vec::new();
         self.end.iter().for_each(|line| self.line(&mut text, line, true, &mut numbered));
         String::from_utf8_lossy(&text).into_owned()
     }
 
-    /// Comments that say something: as many as its length asks for.
+    /// Returns a text as comments: as many lines as its length requires.
     fn comments(&self, words: &str) -> Vec<String> {
         let text = &self.dialect.text;
-        // A number before them takes its place too.
+        // A block number before the comment takes space too.
         let marks = text.comment_begins.len() + text.comment_ends.len() + 12;
         let room = text.longest_line.saturating_sub(marks).max(20);
         let words = comment(words);
@@ -555,7 +559,7 @@ impl<'a> Frame<'a> {
     }
 }
 
-/// What the header tells, a comment each.
+/// Returns the content of the header, one comment each.
 fn header_words(h: &ProgramHeader, s: &Summary, arcs: Option<&ArcSummary>, lines: u64) -> Vec<String> {
     let mut said = Vec::new();
     let mut say = |words: std::fmt::Arguments| said.push(words.to_string());
@@ -601,7 +605,7 @@ fn header_words(h: &ProgramHeader, s: &Summary, arcs: Option<&ArcSummary>, lines
     said
 }
 
-/// What the header says of a wheel that leans, and of what X, Y and Z are then.
+/// Returns the header's text about the tilt of the wheel and about the resulting meaning of X, Y and Z.
 fn tilt_in_words(rotary: &Rotary, h: &ProgramHeader, s: &Summary) -> [String; 2] {
     let about = if rotary.about == TurnAxis::X { "x" } else { "y" };
     let sense = if rotary.reversed { "left-handed" } else { "right-handed" };
@@ -621,7 +625,8 @@ fn tilt_in_words(rotary: &Rotary, h: &ProgramHeader, s: &Summary) -> [String; 2]
     [format!("{}, {} turns about {about} {sense}{reached}", h.lean, rotary.letter), of]
 }
 
-/// Returns words that may stand in a comment: no brackets, which would end it or begin another, and plain characters.
+/// Returns text that is allowed in a comment: without brackets, which would end the comment or begin another, and in
+/// plain characters.
 pub(super) fn comment(words: &str) -> String {
     let plain = |c: char| match c {
         '(' => '[',
@@ -639,7 +644,7 @@ mod tests {
     use regrind_core::compensation::path::{PathMode, Peak};
     use regrind_core::geometry::Point;
 
-    /// Along x there and back, one track after the other.
+    /// Tracks along x, forward and back, one after the other.
     fn tracks(count: usize) -> Vec<std::vec::IntoIter<Move>> {
         let feed = |x: f64, y: f64| Move::Feed { at: Point::new(x, y, 0.1 * y), feed_mm_min: 600.0 };
         let track = |k: usize| {
@@ -718,7 +723,7 @@ mod tests {
         assert_eq!(lines, [&first[..], &second, &["M2"]].concat());
     }
 
-    /// The blocks of a program: what is no comment.
+    /// The blocks of a program without comments.
     fn blocks(name: &str) -> Vec<String> {
         let dialect = shipped(name);
         let text = write_in(&dialect, &tracks(1), 2).unwrap();
@@ -780,7 +785,8 @@ mod tests {
         assert_eq!(found[1..], expected.collect::<Vec<_>>());
     }
 
-    /// A track with a quarter of a turn about the origin in the plane of z and x, y along with it or not, a line, and the same turn backwards.
+    /// A track with a quarter turn about the origin in the plane of z and x, with or without motion along y, a line,
+    /// and the same turn backwards.
     fn turning(y_mm: f64) -> Vec<std::vec::IntoIter<Block>> {
         let arc = |clockwise: bool, to: Point| {
             let (plane, centre_mm) = (Plane::ZX, [0.0, 0.0]);
@@ -839,7 +845,7 @@ mod tests {
             "L Z+5.0000 R0 FMAX",
         ];
         assert_eq!(words, expected);
-        // Places in place of ways from the beginning.
+        // Absolute centres instead of centres relative to the start.
         let mut places = shipped("linuxcnc");
         places.arcs.as_mut().unwrap().centre = CentreWords::Absolute;
         let text = write_with(&places, &turning(0.0), 0, Some(&ArcSummary { moves: 8, ..ArcSummary::default() }));
@@ -898,7 +904,7 @@ mod tests {
         let after_header = |text: String| text[text.find("G0").unwrap()..].to_owned();
         let [at_once, one_by_one] = [2000, u64::MAX].map(|points| after_header(write(&many, points).unwrap()));
         assert!(at_once == one_by_one && at_once.lines().count() == 5001);
-        // A few at a time, with some left over.
+        // A few at a time, with a remainder.
         let some = after_header(write(&many, AT_ONCE * 1000 / 7).unwrap());
         assert!(some == at_once);
     }

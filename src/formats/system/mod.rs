@@ -1,4 +1,4 @@
-//! What one system does otherwise than another with files: a module each, with the same functions.
+//! File functions that differ between operating systems: one module each, with the same functions.
 
 #[cfg(unix)]
 mod unix;
@@ -14,29 +14,29 @@ use windows as here;
 
 pub(super) use here::{create_owners, is_socket, link_to, open_to_read, sync_folder};
 
-/// That others than its owner may read a file.
+/// Fact that users other than the owner can read a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct OpenToOthers {
-    /// What lets them.
+    /// Permission that allows them to read it.
     pub how: String,
-    /// The command that takes it from them.
+    /// Command that removes the permission.
     pub remedy: String,
 }
 
-/// Says how others than its owner may read a file, and what to do about it; none where they may not.
+/// Returns how users other than the owner can read a file, and the remedy; `None` if they cannot.
 ///
 /// # Errors
-/// A file that is not there, or of which the system does not tell it.
+/// A file that does not exist, or whose permissions the system does not report.
 pub fn readable_by_others(path: &Path) -> std::io::Result<Option<OpenToOthers>> {
     here::readable_by_others(path)
 }
 
-/// Returns whether two names are those of one file that is there.
+/// Returns true if two paths lead to the same existing file.
 pub fn is_same_file(one: &Path, other: &Path) -> bool {
     here::is_same_file(one, other).unwrap_or(false)
 }
 
-/// Returns the name of a user whom the system knows by a number; none where it has no such list.
+/// Returns the name of the user with a number; `None` if the system has no list of users or no entry.
 pub fn user_name(uid: u32) -> Option<String> {
     here::user_name(uid)
 }

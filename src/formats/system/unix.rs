@@ -1,4 +1,4 @@
-//! Files have modes, folders can be brought to the disk, devices have names among the files.
+//! Files have modes, folders can be flushed to the disk, devices have names in the file system.
 
 use std::fs::{self, File, OpenOptions};
 use std::io;
@@ -7,7 +7,7 @@ use std::path::Path;
 
 use super::OpenToOthers;
 
-/// Makes a file that nobody but its owner may read, for writing.
+/// Creates a file that only its owner can read, for writing.
 pub(crate) fn create_owners(path: &Path) -> io::Result<File> {
     OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
 }
@@ -30,8 +30,8 @@ pub(super) fn user_name(uid: u32) -> Option<String> {
     users.find(|user| user[2].parse() == Ok(uid) && !user[0].is_empty()).map(|user| user[0].clone())
 }
 
-/// Opens a file for reading. A named pipe is waited for by whoever opens it, and a device may have no end: neither is opened but under `/dev/fd` and
-/// the like, where a shell lays what a program is given to read.
+/// Opens a file for reading. Opening a named pipe waits for its writer, and a device can have no end. Both are opened
+/// only under `/dev/fd` and similar folders, where a shell places the input of a program.
 pub(crate) fn open_to_read(path: &Path) -> io::Result<File> {
     let kind = fs::metadata(path)?.file_type();
     let is_given =
@@ -42,17 +42,17 @@ pub(crate) fn open_to_read(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// Whether what is at a path, itself and not what it links to, is a socket.
+/// Returns true if the entry at a path is a socket; a link is not followed.
 pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
     Ok(fs::symlink_metadata(path)?.file_type().is_socket())
 }
 
-/// Gives a device another name.
+/// Creates another name (a link) for a device.
 pub(crate) fn link_to(device: &Path, link: &Path) -> io::Result<()> {
     std::os::unix::fs::symlink(device, link)
 }
 
-/// Brings the names in a folder to the disk.
+/// Flushes the names in a folder to the disk.
 pub(crate) fn sync_folder(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }

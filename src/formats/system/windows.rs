@@ -1,4 +1,5 @@
-//! Files have lists of who may do what, folders bring their names to the disk themselves, devices and pipes are no files.
+//! Files have access control lists, the file system itself flushes the names in a folder, devices and pipes are not
+//! files.
 
 use std::fs::{self, File};
 use std::io;
@@ -6,12 +7,12 @@ use std::path::Path;
 
 use super::OpenToOthers;
 
-/// Makes a file that nobody but its owner may read, for writing.
+/// Creates a file that only its owner can read, for writing.
 pub(crate) fn create_owners(path: &Path) -> io::Result<File> {
     regrind_windows::create_owners_file(path)
 }
 
-/// By their full names: a second name of one file, a hard link, is not told.
+/// Compares full paths: a hard link, which is a second name of the same file, is not detected.
 pub(super) fn is_same_file(one: &Path, other: &Path) -> io::Result<bool> {
     Ok(one.canonicalize()? == other.canonicalize()?)
 }
@@ -31,22 +32,23 @@ pub(crate) fn open_to_read(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// Whether what is at a path is a socket; none is, for programs talk to each other by pipes, which lie in no folder.
+/// Returns true if the entry at a path is a socket. There are none: programs communicate by pipes, which are not in a
+/// folder.
 pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
     fs::symlink_metadata(path).map(|_| false)
 }
 
-/// A port has the one name that the system gives it.
+/// A port has only the name that the system gives it.
 pub(crate) fn link_to(_: &Path, _: &Path) -> io::Result<()> {
     Err(io::ErrorKind::Unsupported.into())
 }
 
-/// The file system keeps a journal of names itself; nobody else can bring a folder to the disk.
+/// The file system keeps a journal of names; a program cannot flush a folder.
 pub(crate) fn sync_folder(_: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Users have identifiers there that are no numbers.
+/// User identifiers are not numbers on this system.
 pub(super) fn user_name(_: u32) -> Option<String> {
     None
 }

@@ -1,4 +1,4 @@
-//! What `main.xml` says.
+//! Content of `main.xml`.
 
 use std::path::Path;
 
@@ -8,22 +8,22 @@ use crate::error::{FormatError, excerpt};
 use crate::height_map::{MOST_SAMPLES, check_size};
 use crate::xml::{Beyond, beyond_bounds};
 
-/// Most nodes of the document: three for a sample that stands in it.
+/// Maximum number of nodes of the document: three for each sample that it contains.
 const MOST_NODES: u32 = 10_000_000;
 
-/// What is read of `main.xml`.
+/// Parts of `main.xml` that are used.
 pub(super) struct Main {
-    /// x, y and z.
+    /// Axes x, y and z.
     pub(super) axes: [Axis; 3],
     pub(super) extent: Extent,
-    /// Whether the first row is the uppermost one.
+    /// True if the first row is the uppermost one.
     pub(super) rows_from_north: bool,
-    /// The entry with the sum of `main.xml`.
+    /// Entry with the checksum of `main.xml`.
     pub(super) checksum_file: Option<String>,
     pub(super) notes: Vec<String>,
 }
 
-/// How an axis is coded: value in metres = offset + increment * (raw value, or index where the axis is not absolute).
+/// Coding of an axis: value in metres = offset + increment * (raw value, or index if the axis is not absolute).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Axis {
     pub(super) absolute: bool,
@@ -32,7 +32,7 @@ pub(super) struct Axis {
     pub(super) offset_m: f64,
 }
 
-/// The type of a value: the standard's I, L, F and D.
+/// Type of a value: I, L, F and D of the standard.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Kind {
     Int16,
@@ -50,7 +50,7 @@ impl Kind {
         }
     }
 
-    /// Reads a value of as many bytes.
+    /// Reads a value from as many bytes as the type has.
     pub(super) fn value(self, at: &[u8]) -> f64 {
         match self {
             Self::Int16 => at.first_chunk().map_or(f64::NAN, |b| i16::from_le_bytes(*b).into()),
@@ -61,7 +61,7 @@ impl Kind {
     }
 }
 
-/// How many samples there are.
+/// Number of samples.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Extent {
     Matrix([usize; 2]),
@@ -69,7 +69,7 @@ pub(super) enum Extent {
 }
 
 impl Extent {
-    /// Returns the number of samples, if it is one that is read.
+    /// Returns the number of samples, if it is within the limits.
     pub(super) fn count(self, path: &Path) -> Result<usize, FormatError> {
         let [columns, rows] = match self {
             Self::Matrix(size) => size,
@@ -80,22 +80,22 @@ impl Extent {
     }
 }
 
-/// An entry of the container and its MD5 sum, if one is on record.
+/// Entry of the container and its MD5 checksum, if one is recorded.
 pub(super) struct Sealed {
     pub(super) entry: String,
     pub(super) md5: Option<String>,
 }
 
-/// Raw values of the absolute axes of a sample, 0 for the others; `None` where it was not measured.
+/// Raw values of the absolute axes of a sample, 0 for the others; `None` if it was not measured.
 pub(super) type Record = Option<[f64; 3]>;
 
-/// Where the samples are.
+/// Storage of the samples.
 pub(super) enum Samples {
     Inline(Vec<Record>),
     Linked { data: Sealed, valid: Option<Sealed> },
 }
 
-/// A document and where it comes from, for messages.
+/// Document and its origin, for messages.
 struct Place<'a> {
     path: &'a Path,
     entry: &'a str,
@@ -126,7 +126,7 @@ impl Place<'_> {
         number.ok_or_else(|| self.unexpected(node, "a finite number", &text))
     }
 
-    /// Returns the number in an element; a default where it is not there or empty.
+    /// Returns the number in an element, or a default if the element is missing or empty.
     fn number_or(&self, parent: Node<'_, '_>, name: &str, default: f64) -> Result<f64, FormatError> {
         match child(parent, name).filter(|node| !text(*node).is_empty()) {
             Some(node) => self.number(node),
@@ -140,7 +140,7 @@ impl Place<'_> {
     }
 }
 
-/// Returns the first child of a name, whatever its namespace: writers disagree on it.
+/// Returns the first child with a name, in any namespace: writers use different ones.
 fn child<'a, 'd>(node: Node<'a, 'd>, name: &str) -> Option<Node<'a, 'd>> {
     node.children().find(|c| c.is_element() && c.tag_name().name() == name)
 }
@@ -150,7 +150,7 @@ fn text(node: Node<'_, '_>) -> String {
 }
 
 impl Main {
-    /// Parses the document; returns with it the samples, or where they are.
+    /// Parses the document; also returns the samples, or the entry that contains them.
     pub(super) fn parse(path: &Path, entry: &str, bytes: &[u8]) -> Result<(Self, Samples), FormatError> {
         let place = Place { path, entry };
         let source = std::str::from_utf8(bytes).map_err(|error| {
@@ -191,7 +191,7 @@ impl Main {
     }
 }
 
-/// Refuses a frame that is turned against the axes of the data.
+/// Rejects a frame that is rotated against the axes of the data.
 fn check_frame<'d>(place: &Place<'_>, axes: Node<'d, 'd>) -> Result<(), FormatError> {
     let Some(rotation) = child(axes, "Rotation") else { return Ok(()) };
     for element in rotation.children().filter(Node::is_element) {
@@ -206,7 +206,7 @@ fn check_frame<'d>(place: &Place<'_>, axes: Node<'d, 'd>) -> Result<(), FormatEr
     Ok(())
 }
 
-/// Tells whether the rows begin above; the standard knows no such element, and some writers use it.
+/// Returns true if the rows begin at the top; the standard has no element for this, but some writers use one.
 fn from_north<'d>(place: &Place<'_>, axes: Node<'d, 'd>, notes: &mut Vec<String>) -> Result<bool, FormatError> {
     let Some(origin) = child(axes, "Origin") else { return Ok(false) };
     match text(origin).as_str() {
@@ -242,7 +242,7 @@ fn axis<'d>(place: &Place<'_>, node: Node<'d, 'd>, revision: &str) -> Result<Axi
     if !absolute && increment <= 0.0 || increment == 0.0 {
         return Err(place.unexpected(node, "an increment above 0", &increment.to_string()));
     }
-    // Before the amendment of 2020 the increment of floating point values had no meaning, and some readers leave it out.
+    // Before the amendment of 2020 the increment of floating-point values had no meaning, and some readers ignore it.
     let floating = matches!(kind, Kind::Float32 | Kind::Float64);
     if absolute && floating && increment != 1.0 && !revision.contains("25178") {
         let expected = "an increment of 1, as it is not said whether floating point values are multiplied by it; export the \
@@ -305,7 +305,8 @@ fn samples<'d>(place: &Place<'_>, third: Node<'d, 'd>, axes: &[Axis; 3]) -> Resu
     Ok(Samples::Inline(records))
 }
 
-/// Reads a sample in XML: the values of the absolute axes with semicolons between them, or nothing where none was measured.
+/// Reads a sample in XML: the values of the absolute axes, separated by semicolons, or empty text if it was not
+/// measured.
 fn record<'d>(place: &Place<'_>, datum: Node<'d, 'd>, axes: &[Axis; 3]) -> Result<Record, FormatError> {
     let text = text(datum);
     if text.is_empty() {
@@ -325,7 +326,7 @@ fn record<'d>(place: &Place<'_>, datum: Node<'d, 'd>, axes: &[Axis; 3]) -> Resul
     Ok(values.iter().all(|v| v.is_finite()).then_some(values))
 }
 
-/// Returns whether a word is an MD5 sum in hexadecimal digits.
+/// Returns true if a word is an MD5 checksum in hexadecimal digits.
 pub(super) fn is_sum(word: &str) -> bool {
     word.len() == 32 && word.bytes().all(|b| b.is_ascii_hexdigit())
 }

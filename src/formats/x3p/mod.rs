@@ -7,9 +7,10 @@
 //!  md5checksum.hex   MD5 of main.xml; those of the binary parts stand in main.xml
 //! ```
 //!
-//! Read are files as they are found: entries in a folder of their own beside what an operating system leaves there, NaN and infinity for
-//! samples that were not measured, sums in either case, any dash in the revision. Refused is what may be another surface than it
-//! seems: another sum than was sealed, layers, profiles, a turned frame, heights of which nobody can tell the unit.
+//! Files are accepted as programs write them: entries in a folder of their own, next to files that an operating system
+//! adds; NaN and infinity for samples that were not measured; checksums in upper or lower case; any dash in the
+//! revision. Content that can mean another surface than it appears to is rejected: a wrong checksum, layers, profiles,
+//! a rotated frame, heights of unknown unit.
 
 mod document;
 mod write;
@@ -27,25 +28,25 @@ use document::{Axis, Extent, Main, Record, Samples, Sealed, is_sum};
 use regrind_core::geometry::{Grid, Point};
 pub use write::{MapRecord, escaped, write_error_map_x3p, write_x3p};
 
-/// Largest `main.xml`, heights included.
+/// Largest `main.xml` including heights, in bytes.
 const MOST_XML_BYTES: u64 = 64 << 20;
-/// Where the sum of `main.xml` stands, if the document does not name another entry.
+/// Entry with the checksum of `main.xml`, if the document does not name another one.
 const SEAL: &str = "md5checksum.hex";
-/// Largest entry with a sum.
+/// Largest entry with a checksum, in bytes.
 const MOST_SEAL_BYTES: u64 = 4096;
-/// Most entries of a container.
+/// Maximum number of entries of a container.
 const MOST_ENTRIES: usize = 10_000;
 
-/// What an X3P file holds.
+/// Content of an X3P file.
 #[derive(Clone, Debug, PartialEq)]
 pub enum X3pFile {
     /// Heights over a regular grid.
     Map(HeightMap),
-    /// Points in millimetres, those not measured left out.
+    /// Points in millimetres, without those that were not measured.
     Points(Vec<Point>),
 }
 
-/// X3P, told by its first bytes.
+/// X3P format, detected by its first bytes.
 pub(super) const FORMAT: MapFormat = MapFormat {
     begins: is_zip,
     read: |path| read_x3p(path).map(Into::into),
@@ -64,8 +65,9 @@ impl From<X3pFile> for MapPoints {
 /// Reads an X3P file of at most 1 GiB.
 ///
 /// # Errors
-/// A file that is not readable, no zip container, damaged or encrypted; without `main.xml` or its data; with another sum than was
-/// sealed; whose data are more or fewer than its size says; a profile, layers, a turned frame.
+/// A file that is not readable, not a zip container, damaged or encrypted; a file without `main.xml` or its data; a
+/// checksum that differs from the recorded one; an amount of data that differs from the stated size; a profile, layers,
+/// a rotated frame.
 pub fn read_x3p(path: impl AsRef<Path>) -> Result<X3pFile, FormatError> {
     let path = path.as_ref();
     let opened = open(path)?;
@@ -77,14 +79,14 @@ pub fn read_x3p(path: impl AsRef<Path>) -> Result<X3pFile, FormatError> {
     parse_x3p(path, &opened.read_all(path, MOST_BYTES)?)
 }
 
-/// Parses the bytes of an X3P file; `path` is only what messages call it.
+/// Parses the bytes of an X3P file; `path` only names the file in messages.
 ///
 /// # Errors
-/// Those of [`read_x3p`].
+/// The same as for [`read_x3p`].
 pub fn parse_x3p(path: &Path, bytes: &[u8]) -> Result<X3pFile, FormatError> {
     let mut container = Container::open(path, bytes)?;
     let xml = container.entry("main.xml", MOST_XML_BYTES)?;
-    // A changed document is told as such, not by what it says now.
+    // A modified document is reported as modified, before its content is used.
     container.check_sealed(SEAL, &xml)?;
     let (main, samples) = Main::parse(path, &container.name("main.xml"), &xml)?;
     if let Some(seal) = main.checksum_file.as_deref().filter(|seal| *seal != SEAL) {
@@ -108,7 +110,7 @@ pub fn parse_x3p(path: &Path, bytes: &[u8]) -> Result<X3pFile, FormatError> {
     assembled(path, &main, &records)
 }
 
-/// Returns whether a file begins like a zip container, be it an empty one.
+/// Returns true if a file begins like a zip container, even an empty one.
 fn is_zip(head: &[u8]) -> bool {
     head.starts_with(b"PK\x03\x04") || head.starts_with(b"PK\x05\x06")
 }
@@ -131,13 +133,13 @@ fn linked(
             let (own, rest) = at.split_at(axis.kind.bytes());
             (*value, at) = (axis.kind.value(own), rest);
         }
-        // Instruments write NaN or an infinity where they saw nothing.
+        // Instruments write NaN or infinity for samples that they could not measure.
         values.iter().all(|v| v.is_finite()).then_some(values)
     };
     Ok(bytes.chunks_exact(width).enumerate().map(|(k, at)| if is_valid(k) { record(at) } else { None }).collect())
 }
 
-/// Makes a map or points of the samples.
+/// Creates a map or points from the samples.
 fn assembled(path: &Path, main: &Main, records: &[Record]) -> Result<X3pFile, FormatError> {
     let [x, y, z] = &main.axes;
     let mm = |axis: &Axis, raw: f64| 1e3 * (axis.offset_m + raw * axis.increment);
@@ -191,11 +193,11 @@ fn check_sum(path: &Path, entry: &str, bytes: &[u8], expected: &str) -> Result<(
     Err(FormatError::Checksum { path: path.to_owned(), entry, expected, found })
 }
 
-/// The zip container of a file.
+/// Zip container of a file.
 struct Container<'a> {
     path: &'a Path,
     zip: ZipArchive<Cursor<&'a [u8]>>,
-    /// The folder in which everything stands, with its slash; mostly none.
+    /// Folder that contains all entries, with its slash; usually empty.
     folder: String,
 }
 
@@ -212,7 +214,7 @@ impl<'a> Container<'a> {
         for name in (0..zip.len()).filter_map(|k| zip.name_for_index(k)) {
             let name = name.map_err(|source| FormatError::Container { path: path.to_owned(), source })?;
             let name = name.replace('\\', "/");
-            // What macOS leaves beside the entries bears their names.
+            // Files that macOS adds for the entries have the same names.
             if name.starts_with("__MACOSX/") || name.contains("/__MACOSX/") {
                 continue;
             }
@@ -249,7 +251,7 @@ impl<'a> Container<'a> {
         (0..self.zip.len()).find(is_it)
     }
 
-    /// Unpacks an entry, whose length in the container is not believed, up to a limit.
+    /// Decompresses an entry up to a limit; its length stated in the container is not trusted.
     fn entry(&mut self, entry: &str, limit: u64) -> Result<Vec<u8>, FormatError> {
         let missing = || FormatError::Missing { path: self.path.to_owned(), expected: entry.to_owned() };
         let index = self.find(entry).ok_or_else(missing)?;
@@ -265,7 +267,7 @@ impl<'a> Container<'a> {
         Ok(bytes)
     }
 
-    /// Unpacks an entry of a known length and checks its sum.
+    /// Decompresses an entry of a known length and verifies its checksum.
     fn sealed(&mut self, sealed: &Sealed, length: u64) -> Result<Vec<u8>, FormatError> {
         let bytes = self.entry(&sealed.entry, length)?;
         if bytes.len() as u64 != length {
@@ -279,7 +281,7 @@ impl<'a> Container<'a> {
         }
     }
 
-    /// Checks the sum of `main.xml` that an entry holds; one that is not there or holds none says nothing.
+    /// Verifies the checksum of `main.xml` in an entry; a missing entry, or one without a checksum, is ignored.
     fn check_sealed(&mut self, seal: &str, xml: &[u8]) -> Result<(), FormatError> {
         if self.find(seal).is_none() {
             return Ok(());

@@ -13,26 +13,26 @@ use crate::registration::write_atomic;
 use regrind_core::compensation::ErrorMap;
 use regrind_core::geometry::Grid;
 
-/// What a file says of how its map came to be.
+/// Statements of a file about the origin of its map.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MapRecord {
-    /// When the map was made, as in `2026-03-01T12:00:00Z`.
+    /// Time when the map was made, as in `2026-03-01T12:00:00Z`.
     pub date: String,
-    /// Who made it, a person or a program.
+    /// Person or program that made it.
     pub creator: String,
-    /// What it was made with.
+    /// Instrument or program with which it was made.
     pub instrument: String,
-    /// What else is to be known; several lines if need be.
+    /// Further remarks, in one or several lines.
     pub comment: String,
 }
 
-/// Writes the map of a part's error as X3P: heights are errors in metres over x and y of the model frame, positive where
-/// material stands proud.
+/// Writes the map of a part's error as X3P: heights are errors in metres over x and y of the model frame, positive
+/// where material is proud.
 ///
 /// Nodes that were not measured are NaN and marked in the mask. The same map and date give the same bytes.
 ///
 /// # Errors
-/// Those of [`write_x3p`].
+/// The same as for [`write_x3p`].
 pub fn write_error_map_x3p(path: &Path, map: &ErrorMap, date: &str, simulation: bool) -> Result<(), FormatError> {
     let samples = map.values_mm.iter().zip(&map.valid).map(|(value, valid)| valid.then_some(*value));
     let heights = HeightMap::new(path, map.grid, samples)?;
@@ -48,10 +48,11 @@ pub fn write_error_map_x3p(path: &Path, map: &ErrorMap, date: &str, simulation: 
     write_x3p(path, &heights, &record)
 }
 
-/// Writes a map as X3P, heights as 64-bit numbers in metres; samples that were not measured are NaN and marked in the mask.
+/// Writes a map as X3P, heights as 64-bit numbers in metres; samples that were not measured are NaN and marked in the
+/// mask.
 ///
 /// # Errors
-/// A file that cannot be written. The file of that name is then what it was.
+/// A file that cannot be written. An existing file of that name is then unchanged.
 pub fn write_x3p(path: &Path, map: &HeightMap, record: &MapRecord) -> Result<(), FormatError> {
     let failed = |source: zip::result::ZipError| FormatError::Unwritable {
         path: path.to_owned(),
@@ -119,7 +120,7 @@ fn main_xml(map: &HeightMap, record: &MapRecord, data: &str, mask: &str) -> Stri
     )
 }
 
-/// Replaces what XML and HTML reserve or forbid in a text.
+/// Replaces characters that XML and HTML reserve or forbid in a text.
 pub fn escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {

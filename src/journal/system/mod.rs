@@ -1,4 +1,5 @@
-//! What one system does otherwise than another with the files of a record: a module each, with the same functions.
+//! File operations of the journal that differ between operating systems: one module for each system, with the same
+//! functions.
 
 #[cfg(unix)]
 mod unix;
@@ -10,10 +11,10 @@ pub(super) use unix::*;
 #[cfg(windows)]
 pub(super) use windows::*;
 
-/// That others may read an audit key.
+/// Reason why other users can read or exchange an audit key, with the remedy.
 pub(super) struct OpenToOthers {
-    /// What lets them.
+    /// Reason why others have access.
     pub(super) how: String,
-    /// What takes it from them.
+    /// Action that removes their access.
     pub(super) remedy: String,
 }

@@ -1,4 +1,4 @@
-//! Files have modes, folders can be brought to the disk, and a lock keeps nobody from reading.
+//! Unix: files have modes, folders can be synced to the disk, and a lock does not prevent reading.
 
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io;
@@ -11,16 +11,18 @@ use rustix::io::Errno;
 
 use super::OpenToOthers;
 
-/// Where locks may lie, the best first: a place that is the same for every user and every session of a computer. `TMPDIR` is not.
+/// Candidate places for locks, the best first. Each is the same for every user and every session of a computer;
+/// `TMPDIR` is not.
 const PLACES: [&str; 4] = ["/run/lock", "/var/lock", "/var/tmp", "/tmp"];
 
-/// Makes a folder that nobody but its owner may look into, and those above it, where they are not there.
+/// Creates a folder that only its owner can read, and its missing parents.
 pub(crate) fn create_owners_folder(folder: &Path) -> io::Result<()> {
     DirBuilder::new().recursive(true).mode(0o700).create(folder)
 }
 
-/// Makes the folder of a run, into which nobody but its owner may look: who reads a record can hold it up. Where the folder above hands its group down
-/// to what is made in it (`chmod g+s`), that group may look too. One that is there stays as it is.
+/// Creates the folder of a run, which only its owner can read: a reader can block the writing of its record. If the
+/// parent folder passes its group on to new files (`chmod g+s`), that group can read too. An existing folder keeps its
+/// mode.
 pub(crate) fn create_run_folder(folder: &Path) -> io::Result<()> {
     let above = folder.parent().filter(|above| !above.as_os_str().is_empty()).unwrap_or(Path::new("."));
     fs::create_dir_all(above)?;
@@ -35,12 +37,12 @@ pub(crate) fn create_run_folder(folder: &Path) -> io::Result<()> {
     }
 }
 
-/// Whether every user of the computer may look into a folder.
+/// Returns true if every user of the computer can read or enter a folder.
 pub(crate) fn is_open_to_all(folder: &Path) -> bool {
     fs::metadata(folder).is_ok_and(|found| found.mode() & 0o005 != 0)
 }
 
-/// Says how others than its owner may exchange what lies in a folder; none where they may not.
+/// Returns how users other than the owner can exchange files in a folder, or `None` if they cannot.
 pub(crate) fn changeable_by_others(folder: &Path) -> io::Result<Option<OpenToOthers>> {
     let mode = fs::metadata(folder)?.mode() & 0o7777;
     let open = || OpenToOthers {
@@ -50,50 +52,52 @@ pub(crate) fn changeable_by_others(folder: &Path) -> io::Result<Option<OpenToOth
     Ok((mode & 0o022 != 0 && mode & 0o1000 == 0).then(open))
 }
 
-/// Makes a file that nobody but its owner may read, for writing.
+/// Creates a file that only its owner can read, and opens it for writing.
 pub(crate) fn create_owners_file(path: &Path) -> io::Result<File> {
     OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
 }
 
-/// Says how others than its owner may read a file; none where they may not.
+/// Returns how users other than the owner can read a file, or `None` if they cannot.
 pub(crate) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>> {
     let mode = fs::metadata(path)?.mode() & 0o777;
     let open = || OpenToOthers { how: format!("mode {mode:03o}, at most 600"), remedy: "`chmod 600` it".into() };
     Ok((mode & 0o077 != 0).then(open))
 }
 
-/// Brings what a file holds to the disk, whoever wrote it.
+/// Syncs the content of a file to the disk, whoever wrote it.
 pub(crate) fn sync_file(path: &Path) -> io::Result<()> {
     File::open(path)?.sync_all()
 }
 
-/// Brings the names in a folder to the disk.
+/// Syncs the names in a folder to the disk.
 pub(crate) fn sync_folder(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }
 
-/// Tells one file from every other on this computer, whatever it is called.
+/// Device and inode: identify a file on this computer, whatever its name.
 pub(crate) type FileIdentity = [u64; 2];
 
-/// Returns which file is at a path.
+/// Returns the identity of the file at a path.
 pub(crate) fn identity(path: &Path) -> io::Result<FileIdentity> {
     fs::metadata(path).map(|found| [found.dev(), found.ino()])
 }
 
-/// How much room is left for the user of this program on the disk of a folder.
+/// Returns the free space, in bytes, that the user of this program has on the disk of a folder.
 pub(crate) fn free_bytes(folder: &Path) -> io::Result<u64> {
     let room = rustix::fs::statvfs(folder)?;
     Ok(room.f_bavail.saturating_mul(room.f_frsize))
 }
 
-/// Whether a file, and no link, belongs to the user of this program or to root.
+/// Returns true if the path is a regular file (not a link) of the user of this program or of root.
 pub(crate) fn is_own_file(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|found| found.is_file() && is_trusted(found.uid()))
 }
 
-/// The first place for locks that is there, that every user can write, and in which nobody can take away what is another's; none where there is no such place.
+/// Returns the place for locks. Prefers a place where root has created the folder. Otherwise returns the first existing
+/// place that every user can write, and where nobody can remove the files of others. Returns `None` if no place
+/// qualifies.
 pub(crate) fn place_of_locks(folder: &str) -> Option<PathBuf> {
-    // One that root has set up, as the package does, comes before any other.
+    // A folder that root has created, as the package does, comes before any other.
     let by_root =
         |place: &&str| fs::symlink_metadata(Path::new(place).join(folder)).is_ok_and(|m| m.is_dir() && m.uid() == 0);
     let set_up = PLACES.iter().find(|place| by_root(place)).map(PathBuf::from);
@@ -106,24 +110,26 @@ fn first_for_all<'a>(places: &[&'a Path]) -> Option<&'a Path> {
     places.iter().copied().find(|place| for_all(place))
 }
 
-/// The folder in which the locks of this computer lie. It is reached by its descriptor: whatever becomes of its name, nothing is opened elsewhere.
+/// Folder for the locks of this computer. It is accessed by its descriptor: even if its name changes, no file is opened
+/// elsewhere.
 ///
-/// Anybody may write where it lies, so somebody may have been there first: what is found is looked at and never made anybody's, and no link is followed.
-/// The folder and each file come whole, with their modes, by one change of a name.
+/// Every user can write to the parent place, so another user could have created the folder or a file first. Existing
+/// entries are therefore checked, their owner and mode are never changed, and no link is followed. The folder and each
+/// file appear complete, with their modes, by one atomic rename or link.
 pub(crate) struct LockFolder {
     folder: OwnedFd,
-    /// Whether every user of the computer may make files in it, or only a group.
+    /// True if every user of the computer can create files in it; false if only a group can.
     is_for_all: bool,
 }
 
-/// Why a folder for locks is not used.
+/// Reason why a folder for locks cannot be used, with the remedy.
 pub(crate) struct BadFolder {
     pub(crate) what: String,
     pub(crate) remedy: String,
 }
 
 impl LockFolder {
-    /// Opens it where it lies, and makes it where it is not there.
+    /// Opens the folder, and creates it if it does not exist.
     pub(crate) fn open(place: &Path, name: &str) -> Result<Self, BadFolder> {
         let path = place.join(name);
         let bad = |what: String| {
@@ -167,12 +173,14 @@ impl LockFolder {
         Ok(Self { folder, is_for_all: mode & 0o002 != 0 })
     }
 
-    /// Opens the file of a machine, which every user of the folder may lock; says why it is not used where somebody laid something else in its place.
+    /// Opens the lock file of a machine, which every user of the folder can lock. Returns an error text if something
+    /// else is in its place.
     pub(crate) fn shared(&self, name: &str) -> Result<LockFile, String> {
         self.file(name, if self.is_for_all { 0o666 } else { 0o660 })
     }
 
-    /// Opens the file of a machine that is this user's alone: nobody else may open it, so that nobody else can hold or spoil it.
+    /// Opens the lock file of a machine for this user only. No other user can open it, so no other user can hold or
+    /// damage it.
     pub(crate) fn own(&self, name: &str) -> Result<LockFile, String> {
         let file = self.file(name, 0o600)?;
         if file.owner != rustix::process::geteuid().as_raw() {
@@ -194,7 +202,7 @@ impl LockFolder {
         let (file, may_write) = match opened {
             Ok(file) => (file, true),
             Err(Errno::LOOP) => return Err("it is a link".to_owned()),
-            // A lock needs no more than a look.
+            // Read access is sufficient for a lock.
             Err(Errno::ACCESS | Errno::PERM) => match open(OFlags::RDONLY) {
                 Ok(file) => (file, false),
                 Err(error) => return Err(format!("it cannot be opened: {}", words(error))),
@@ -211,31 +219,31 @@ impl LockFolder {
             return Err(format!("it has {names} names and {bytes} bytes, and a lock has one and {MOST_TOLD} at most"));
         }
         let lock = File::from(file);
-        // One that others have spoiled is still the lock; what stands in it is left alone.
+        // A lock file that others have damaged is still the lock, but its content is neither read nor changed.
         let told = if may_write && !is_spoiled { lock.try_clone().ok() } else { None };
         let identity = [found.st_dev, found.st_ino];
         Ok(LockFile { lock, told, is_spoiled, owner: found.st_uid, identity })
     }
 
-    /// Makes a file with its mode, unless one comes there first.
+    /// Creates a file with its mode. Succeeds also if another process creates it first.
     fn make(&self, name: &str, mode: u32) -> Result<(), Errno> {
         let draft = format!(".{:016x}", rand::random::<u64>());
         let flags = AS_FILE | OFlags::RDWR | OFlags::CREATE | OFlags::EXCL;
         let file = rustix::fs::openat(&self.folder, &draft, flags, Mode::from_raw_mode(0o600))?;
         let made = rustix::fs::fchmod(&file, Mode::from_raw_mode(mode))
             .and_then(|()| rustix::fs::linkat(&self.folder, &draft, &self.folder, name, AtFlags::empty()));
-        // The error that brought us here is the one to report.
+        // Report the first error, not that of the cleanup.
         let _ = rustix::fs::unlinkat(&self.folder, &draft, AtFlags::empty());
         if made == Err(Errno::EXIST) { Ok(()) } else { made }
     }
 
-    /// Whether a file lies still under its name: one that was taken away in between locks nothing.
+    /// Returns true if a file still has its name. A file that was removed in the meantime locks nothing.
     pub(crate) fn is_still(&self, name: &str, file: &LockFile) -> bool {
         let found = rustix::fs::statat(&self.folder, name, AtFlags::SYMLINK_NOFOLLOW);
         found.is_ok_and(|found| [found.st_dev, found.st_ino] == file.identity)
     }
 
-    /// Tells the files of this user from those of others.
+    /// Returns the part of a file name that identifies the files of this user.
     pub(crate) fn own_mark() -> String {
         rustix::process::geteuid().as_raw().to_string()
     }
@@ -244,7 +252,8 @@ impl LockFolder {
 const AS_FOLDER: OFlags = OFlags::DIRECTORY.union(OFlags::CLOEXEC);
 const AS_FILE: OFlags = OFlags::NOFOLLOW.union(OFlags::NONBLOCK).union(OFlags::CLOEXEC).union(OFlags::NOCTTY);
 
-/// Makes a folder in which each user may make files, and take away his own, unless one comes there first.
+/// Creates a folder in which each user can create files and remove only their own. Succeeds also if another process
+/// creates it first.
 fn make_folder(place: &OwnedFd, name: &str) -> Result<(), Errno> {
     let draft = format!(".{name}-{:016x}", rand::random::<u64>());
     rustix::fs::mkdirat(place, &draft, Mode::from_raw_mode(0o700))?;
@@ -253,7 +262,7 @@ fn make_folder(place: &OwnedFd, name: &str) -> Result<(), Errno> {
         .and_then(|folder| rustix::fs::fchmod(&folder, Mode::from_raw_mode(0o1777)))
         .and_then(|()| rustix::fs::renameat_with(place, &draft, place, name, RenameFlags::NOREPLACE));
     if made.is_err() {
-        // The error that brought us here is the one to report.
+        // Report the first error, not that of the cleanup.
         let _ = rustix::fs::unlinkat(place, &draft, AtFlags::REMOVEDIR);
     }
     if made == Err(Errno::EXIST) { Ok(()) } else { made }
@@ -263,15 +272,15 @@ fn is_trusted(uid: u32) -> bool {
     uid == 0 || uid == rustix::process::geteuid().as_raw()
 }
 
-/// Most bytes that are told beside a lock.
+/// Maximum length of a lock file, in bytes.
 const MOST_TOLD: u64 = 4096;
 
-/// A file to be locked.
+/// File to be locked.
 pub(crate) struct LockFile {
     pub(crate) lock: File,
-    /// The file that tells its holder and the last epoch; none where that may not be written.
+    /// File that stores the holder and the last epoch; `None` if it must not be written.
     pub(crate) told: Option<File>,
-    /// Whether others have given it further names, or more bytes than a lock has.
+    /// True if others have given the file additional names, or more bytes than a lock file has.
     pub(crate) is_spoiled: bool,
     owner: u32,
     /// Device and inode.
@@ -279,7 +288,7 @@ pub(crate) struct LockFile {
 }
 
 impl LockFile {
-    /// Returns which process holds it, and whose that is; none where the system does not tell.
+    /// Returns the process that holds the lock and its user, or `None` if the system does not report it.
     pub(crate) fn holder(&self) -> Option<String> {
         let locks = fs::read_to_string("/proc/locks").ok()?;
         let [device, inode] = self.identity;
@@ -312,7 +321,7 @@ mod tests {
         fs::set_permissions(&shared, fs::Permissions::from_mode(0o2775)).unwrap();
         create_run_folder(&shared.join("a")).unwrap();
         assert_eq!((mode(&shared.join("a")), is_open_to_all(&shared.join("a"))), (0o2750, false));
-        // One that is there stays as it is.
+        // An existing folder keeps its mode.
         let open = home.path().join("open");
         fs::create_dir(&open).unwrap();
         fs::set_permissions(&open, fs::Permissions::from_mode(0o755)).unwrap();

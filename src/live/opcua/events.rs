@@ -1,4 +1,4 @@
-//! What happened to a cell, as events: a cycle that was measured, an alarm that came up, a run that came to its end.
+//! Events of a cell: a measured cycle, a raised alarm, the end of a run.
 
 use opcua_nodes::{BaseEventType, Event};
 use opcua_server::EventField;
@@ -10,14 +10,14 @@ use regrind_control::{CycleRow, Snapshot};
 
 use crate::told::{Now, Told};
 
-/// How urgent an event is, of 1 to 1000.
+/// Severities of events, from 1 to 1000.
 const OF_INTEREST: u16 = 100;
 const TO_BE_SEEN_TO: u16 = 700;
 
-/// What every kind of event is a kind of: who asks for the events of a cell asks for this one.
+/// Base type of all events of a cell. A client subscribes to it to get all events.
 pub(super) const ALL: &str = "CellEventType";
 
-/// A kind of event, and what it says beside the fields of every event.
+/// Type of event, with its fields in addition to the fields of every event.
 pub(super) struct EventKind {
     pub(super) name: &'static str,
     pub(super) fields: &'static [(&'static str, DataTypeId)],
@@ -51,25 +51,25 @@ const RUN_ENDED: EventKind = EventKind {
     fields: &[("Run", DataTypeId::String), ("Verdict", DataTypeId::String), ("Accepted", DataTypeId::Boolean)],
 };
 
-/// All kinds.
+/// All types of events.
 pub(super) const KINDS: [&EventKind; 3] = [&RESULT, &ALARM, &RUN_ENDED];
 
 impl EventKind {
-    /// The node of the kind, in the namespace of the cell.
+    /// Returns the node of the type, in the namespace of the cell.
     pub(super) fn node(&self, own: u16) -> NodeId {
         NodeId::new(own, self.name)
     }
 }
 
-/// Something that happened.
+/// Event of a cell.
 pub(super) struct CellEvent {
     base: BaseEventType,
     own: u16,
     fields: Vec<(&'static str, Variant)>,
 }
 
-/// Returns what happened between two times that the cell was told. `on` is how it was told last that a run was on: one that was left and is
-/// gone on with tells nothing twice.
+/// Returns the events between two published states. `on` is the last published state with an active run, so that a run
+/// that was interrupted and continues repeats no event.
 pub(super) fn happened([before, on]: [&Told; 2], now: &Told, own: u16, cell: &str) -> Vec<CellEvent> {
     let from = |kind: &EventKind, severity, message: String, values: Vec<Variant>| {
         CellEvent::new((kind, own), cell, severity, &message, values)
@@ -119,7 +119,7 @@ fn if_known(name: &str) -> Variant {
     if name.is_empty() { Variant::Empty } else { name.into() }
 }
 
-/// The cycles that were not known before, or came to something else: of a run that was not seen before, all.
+/// Returns the cycles that are new or whose results have changed; for a run not seen before, all its cycles.
 fn new_rows<'a>(earlier: Option<&'a Snapshot>, now: &'a Snapshot) -> impl Iterator<Item = &'a CycleRow> {
     let known = move |row: &CycleRow| earlier.is_some_and(|then| then.cycles.contains(row));
     now.cycles.iter().filter(move |row| !known(row))
@@ -215,7 +215,7 @@ mod tests {
         assert_eq!(cycles(&Told::default(), &on("b", 1)), [Variant::UInt32(1)]);
         let gone = Told { now: Now::Gone { run: "a".into(), machines_within: false }, last: None };
         assert!(cycles_since([&gone, &on("a", 2)], &on("a", 2)).is_empty(), "it was left, and is gone on with");
-        // A cycle that was measured again came to something else.
+        // A cycle that was measured again has other results.
         let mut again = on("a", 1);
         let Now::On { snapshot, .. } = &mut again.now else { unreachable!() };
         snapshot.cycles[0].pv_um = 2.5;

@@ -1,5 +1,6 @@
-//! A cell as a server of OPC UA: the status model of PackML (OPC 30050), every figure as a variable, results and alarms as events. It is only to
-//! be looked at: no node can be written, there is no method, and who tries is told so and heard of.
+//! OPC UA server of a cell: the status model of PackML (OPC 30050), every figure as a variable, results and alarms as
+//! events. The server is read-only: no node can be written, and there is no method. It refuses and reports every
+//! attempt to write.
 
 mod events;
 mod nodes;
@@ -23,19 +24,21 @@ use crate::settings::OpcUaSettings;
 use crate::told::{Now, Told};
 use crate::turn::Turn;
 
-/// Between two tries to have the port.
+/// Time between two attempts to bind the port.
 const BETWEEN_TRIES: Duration = Duration::from_secs(1);
-/// How long clients may take to go when the server does.
+/// Time that clients have to disconnect when the server stops.
 const FAREWELL: Duration = Duration::from_secs(2);
-/// How long a client waits for something new that does not say how long: a cell may stand still for longer than a client may be silent.
+/// Default timeout of a client's publish request, in ms. A cell can be unchanged for longer than a client may be silent,
+/// so the timeout is long.
 const WAITS_MS: u64 = 3_600_000;
-/// How often it is looked whether a client is due. An interval that is over between two looks is over with the second: were they as far
-/// apart as the shortest interval, a sign of life would come twice as late as it was promised, and a client would give it up.
+/// Interval, in ms, at which the server checks whether a publish to a client is due. An interval that ends between two
+/// checks is served at the second. If the checks were as far apart as the shortest publishing interval, a keep-alive
+/// would arrive after twice the promised time, and the client would give the server up.
 const LOOKS_MS: u64 = 20;
-/// Most clients that look at a time.
+/// Maximum number of clients at the same time.
 const CLIENTS: usize = 32;
 
-/// A server of OPC UA that shows a cell.
+/// OPC UA server that shows a cell.
 pub struct UaServer {
     listen: SocketAddr,
     cell: String,
@@ -45,10 +48,10 @@ pub struct UaServer {
 }
 
 impl UaServer {
-    /// A server for the cell of this name. It shows nobody anything yet.
+    /// Creates a server for the cell of this name. It does not listen yet.
     ///
     /// # Errors
-    /// An address that is open to other computers.
+    /// The address is open to other computers.
     pub fn new(
         settings: &OpcUaSettings,
         cell: &str,
@@ -63,10 +66,10 @@ impl UaServer {
         Ok(Self { listen, cell: cell.to_owned(), keeps: turn.folder().join("opcua"), told, notes })
     }
 
-    /// Shows the cell until nobody has anything to show any more.
+    /// Serves the state of the cell until its source closes.
     ///
     /// # Errors
-    /// What the server is made of does not fit together.
+    /// The parts of the server do not fit together.
     pub async fn run(mut self) -> Result<(), LiveError> {
         let Some(listener) = self.listener().await else { return Ok(()) };
         let address = listener.local_addr().unwrap_or(self.listen);
@@ -86,12 +89,12 @@ impl UaServer {
             return why.map_err(server);
         }
         handle.cancel();
-        // Who does not go is left.
+        // Clients that do not disconnect in time are dropped.
         let _ = timeout(FAREWELL, serving.join_next()).await;
         Ok(())
     }
 
-    /// Waits until the port is to be had; none where there is nothing to show any more before.
+    /// Waits until the port can be bound; `None` if the source closes before.
     async fn listener(&mut self) -> Option<TcpListener> {
         loop {
             match TcpListener::bind(self.listen).await {
@@ -132,14 +135,14 @@ impl UaServer {
                 cell: self.cell.clone(),
                 notes: self.notes.clone(),
             }));
-        // As often as a cell tells anything.
+        // The intervals at which a cell publishes.
         let limits = &mut builder.limits_mut().subscriptions;
         (limits.min_publishing_interval_ms, limits.min_sampling_interval_ms) = (100.0, 100.0);
         builder
     }
 }
 
-/// Shows what is told, until nothing is any more.
+/// Writes each new state to the nodes, until the source closes.
 async fn show(told: &mut watch::Receiver<Told>, handle: &ServerHandle, shown: &InMemoryNodeManager<CellNodes>) {
     let Namespaces { own, .. } = shown.inner().namespaces;
     let mut before: Option<Told> = None;

@@ -1,4 +1,5 @@
-//! The nodes of a cell: PackML's (OPC 30050) with its identifiers, and the figures in a namespace of their own.
+//! OPC UA nodes of a cell: those of PackML (OPC 30050) with its identifiers, and the figures in a namespace of their
+//! own.
 //!
 //! ```text
 //!  Objects / PackMLObjects / cell-1      PackMLBaseObjectType; notifies of events
@@ -8,7 +9,7 @@
 //!      Figures, Limits, Job, Alarms ...  a folder for each first word of a figure's name
 //! ```
 //!
-//! What nobody knows has no value and the status BadNoData.
+//! A node with an unknown value has no value and the status BadNoData.
 
 use async_trait::async_trait;
 use opcua_core::sync::RwLock;
@@ -48,23 +49,23 @@ mod packml {
     pub(super) const RUNNING: u32 = 75;
 }
 
-/// The number that OPC 30050 gives the state in which nothing is aborted.
+/// Number of the Cleared state in OPC 30050, in which nothing is aborted.
 const CLEARED_NUMBER: u32 = 18;
 
-/// Where the namespaces stand in the list of the server.
+/// Indices of the namespaces in the list of the server.
 #[derive(Clone, Copy)]
 pub(super) struct Namespaces {
     pub(super) packml: u16,
     pub(super) own: u16,
 }
 
-/// Makes the nodes of a cell.
+/// Builder of the nodes of a cell.
 pub(super) struct CellNodesBuilder {
     pub(super) cell: String,
     pub(super) notes: Notes,
 }
 
-/// The nodes of a cell, which nobody can write.
+/// Nodes of a cell; clients cannot write them.
 pub(super) struct CellNodes {
     pub(super) namespaces: Namespaces,
     metadata: Vec<NamespaceMetadata>,
@@ -82,7 +83,7 @@ impl CellNodes {
     }
 }
 
-/// The node of the cell itself.
+/// Returns the id of the node of the cell itself.
 pub(super) fn cell_node(own: u16) -> NodeId {
     NodeId::new(own, "Cell")
 }
@@ -123,7 +124,7 @@ impl InMemoryNodeManagerImpl for CellNodes {
         self.metadata.clone()
     }
 
-    /// Nothing is written; who wanted to is told so, and it is told here.
+    /// Refuses every write, and reports the attempt.
     async fn write(
         &self,
         context: &RequestContext,
@@ -164,7 +165,7 @@ impl Tree<'_> {
         NodeId::new(self.namespaces.own, path)
     }
 
-    /// The types that the objects have: by their identifiers, without what else the companion specification says of them.
+    /// Adds the types of the objects: only their identifiers, not the other content of the companion specification.
     fn types(&mut self) {
         use packml::*;
         let machine: NodeId = ObjectTypeId::FiniteStateMachineType.into();
@@ -228,7 +229,7 @@ impl Tree<'_> {
         for figure in FIGURES {
             self.figure(figure, &root);
         }
-        // What the specification demands and no cell has: nobody tells it.
+        // Nodes that the specification requires and no cell has; they never get a value.
         let status = self.own("Status");
         for (name, kind) in [
             ("CurMachSpeed", DataTypeId::Float),
@@ -248,7 +249,7 @@ impl Tree<'_> {
             .insert(self.space);
     }
 
-    /// The three state machines, each within a state of the one above it.
+    /// Adds the three state machines, each nested in a state of the one above it.
     fn state_machines(&mut self, root: &NodeId) {
         let mut above = root.clone();
         for machine in MACHINES {
@@ -278,7 +279,7 @@ impl Tree<'_> {
                 .component_of(root.clone())
                 .insert(self.space);
         }
-        // The one that PackML has has its name there.
+        // A node that PackML defines has its name in the namespace of PackML.
         let of_packml = figure.name == "Status/UnitModeCurrent";
         let namespace = if of_packml { self.namespaces.packml } else { self.namespaces.own };
         let node = self.variable(figure.name, (namespace, name), kind_of(figure), &above);
@@ -324,7 +325,7 @@ fn kind_of(figure: &Figure) -> DataTypeId {
     }
 }
 
-/// A unit by its code in UNECE Recommendation 20, the characters of which are its number.
+/// Returns a unit by its code in UNECE Recommendation 20; the unit id is made of the characters of the code.
 fn unit_of(unit: &str) -> EUInformation {
     let (code, name) = match unit {
         "um" => ("4H", "micrometre"),
@@ -342,7 +343,7 @@ fn unit_of(unit: &str) -> EUInformation {
 
 // ---- values -------------------------------------------------------------------------------------------------------------------------
 
-/// Shows what is told otherwise than before.
+/// Writes the values that have changed to the nodes.
 pub(super) fn set(
     shown: &InMemoryNodeManager<CellNodes>,
     subscriptions: &SubscriptionCache,
@@ -365,7 +366,7 @@ pub(super) fn set(
         }
     }
     let all = values.iter().map(|(node, value)| (node, None, value.clone()));
-    // Each of them was made with the tree.
+    // All these nodes were created with the tree, so this cannot fail.
     let _ = shown.set_values(subscriptions, all);
 }
 
@@ -392,7 +393,7 @@ fn unknown(then: DateTime) -> DataValue {
     DataValue { status: Some(StatusCode::BadNoData), ..good(Variant::Empty, then) }
 }
 
-/// The state of the cell; none where nobody knows.
+/// Returns the state of the cell; `None` if it is unknown.
 fn state(told: &Told) -> Option<StateName> {
     match &told.now {
         Now::NoRun => Some(StateName::Idle),
@@ -413,7 +414,8 @@ const MACHINES: [Machine; 3] = [
     Machine { path: "BaseStateMachine/MachineState/ExecuteState", of_type: packml::EXECUTE_STATE_MACHINE_TYPE },
 ];
 
-/// The current state of each machine: name, identifier and number. A machine within a state that is not the current one has none.
+/// Returns the current state of each machine: name, identifier and number. A machine nested in a state that is not the
+/// current one has none.
 fn states(state: Option<StateName>, packml: u16) -> Vec<(String, Option<Variant>)> {
     let own = state.map(|state| (state.to_string(), identifier(state), Some(state_number(state))));
     let cleared = Some(("Cleared".to_owned(), packml::CLEARED, Some(CLEARED_NUMBER)));
@@ -437,7 +439,7 @@ fn states(state: Option<StateName>, packml: u16) -> Vec<(String, Option<Variant>
     values
 }
 
-/// The identifier of a state in the namespace of PackML.
+/// Returns the identifier of a state in the namespace of PackML.
 fn identifier(state: StateName) -> u32 {
     match state {
         StateName::Idle => 28,

@@ -1,4 +1,5 @@
-//! The way to the broker: who signs in, by what it proves itself, and what it publishes when this end has gone.
+//! Connection to the broker: credentials, authentication, and the last will that the broker publishes when this end is
+//! gone.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,12 +10,12 @@ use rumqttc::{LastWill, MqttOptions, QoS, TlsConfiguration, Transport};
 use crate::error::LiveError;
 use crate::settings::SparkplugSettings;
 
-/// A broker that hears nothing for one and a half of it publishes the death.
+/// Keep-alive interval. The broker publishes the death after one and a half intervals of silence.
 const KEEP_ALIVE: Duration = Duration::from_secs(10);
-/// Longest message of somebody else that is looked at.
+/// Maximum size of a received message, in bytes.
 const LONGEST_MESSAGE: usize = 1 << 20;
 
-/// The way to a broker, without what it publishes when this end has gone.
+/// Connection options of a broker, without the last will.
 pub(super) struct Way {
     options: MqttOptions,
     pub(super) place: String,
@@ -39,7 +40,7 @@ impl Way {
         Ok(Self { options, place: format!("{broker}:{port}") })
     }
 
-    /// The options of a connection whose death is published so.
+    /// Returns the options of a connection with this last will.
     pub(super) fn with_death(&self, topic: &str, death: Vec<u8>) -> MqttOptions {
         let mut options = self.options.clone();
         options.set_last_will(LastWill::new(topic, death, QoS::AtLeastOnce, false));

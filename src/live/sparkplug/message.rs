@@ -1,4 +1,4 @@
-//! The messages of an edge node: births, what has changed, deaths; and what a command of a host asks for.
+//! Messages of an edge node: births, changes and deaths; and the requests in a host's command.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -8,10 +8,10 @@ use srad_types::payload::{DataType, Message as _, Metric, Payload, PropertySet, 
 
 use crate::figures::{Figure, FigureKind, FigureValue};
 
-/// What is known of each figure, in the order of the figures.
+/// Values of the figures, in their order.
 pub(super) type Values = Vec<Option<FigureValue>>;
 
-/// Everything there is to tell, with kinds and units; its number in the sequence is 0.
+/// Encodes a birth: all figures with kinds and units. Its sequence number is 0.
 pub(super) fn birth(figures: &[Figure], values: &Values, connection: u8) -> Vec<u8> {
     let rebirth = Metric { value: Some(Value::BooleanValue(false)), ..plain(NODE_CONTROL_REBIRTH, DataType::Boolean) };
     let mut metrics = vec![number_of(connection), rebirth];
@@ -21,7 +21,7 @@ pub(super) fn birth(figures: &[Figure], values: &Values, connection: u8) -> Vec<
     encoded(metrics, Some(0))
 }
 
-/// The figures that are known otherwise than they were told; none where all are as they were.
+/// Encodes the figures whose values differ from the published ones; `None` if all are the same.
 pub(super) fn changes(figures: &[Figure], values: &Values, told: &Values, sequence: u8) -> Option<Vec<u8>> {
     let all = figures.iter().zip(values).zip(told);
     let changed: Vec<_> =
@@ -29,12 +29,12 @@ pub(super) fn changes(figures: &[Figure], values: &Values, told: &Values, sequen
     (!changed.is_empty()).then(|| encoded(changed, Some(sequence)))
 }
 
-/// That what was told by a connection is true no more.
+/// Encodes a death: the values published by this connection are no longer valid.
 pub(super) fn death(connection: u8) -> Vec<u8> {
     encoded(vec![number_of(connection)], None)
 }
 
-/// What a command asks for: whether it wants everything told anew, and what else, in words.
+/// Reads the requests of a command: true if it requests a rebirth; and all other requests, in words.
 pub(super) fn asked(payload: &[u8]) -> (bool, Vec<String>) {
     let Ok(Payload { metrics, .. }) = Payload::decode(payload) else {
         return (false, vec!["what is no command of Sparkplug B".into()]);
@@ -94,7 +94,7 @@ fn plain(name: &str, kind: DataType) -> Metric {
     metric
 }
 
-/// The unit and what it is, under the names by which hosts look for them.
+/// Returns the unit and the description, under the names that hosts look for.
 fn properties(figure: &Figure) -> PropertySet {
     let text = |text: &str| {
         let value = Some(property_value::Value::StringValue(text.to_owned()));

@@ -1,8 +1,9 @@
 //! A cell as an edge node of Sparkplug B.
 //!
-//! It is a node without a device: the program and the cell are alive together, so there is one birth with everything in it and one death, and
-//! nobody has to ask which of two deaths counts. Every connection is a session of its own, with its own number, subscriptions and birth:
-//! nothing is left to a client that restores a session, or sends what belonged to an earlier one.
+//! The node has no device: the program and the cell start and end together. There is therefore one birth with all
+//! figures and one death, and it is always clear which death counts. Every connection is a session of its own, with its
+//! own number, subscriptions and birth. The client does not restore sessions, and does not send messages of an earlier
+//! session.
 
 mod link;
 mod message;
@@ -28,19 +29,19 @@ use crate::settings::SparkplugSettings;
 use crate::told::Told;
 use crate::turn::{Births, Turn};
 
-/// Between two tries to reach the broker.
+/// Limits of the time between two attempts to connect to the broker.
 const SHORTEST_WAIT: Duration = Duration::from_millis(500);
 const LONGEST_WAIT: Duration = Duration::from_secs(30);
-/// Least time between two births, however many hosts ask for one.
+/// Minimum time between two births, however many hosts request one.
 const BETWEEN_BIRTHS: Duration = Duration::from_secs(1);
-/// A broker that takes nothing is offered it again after this time.
+/// Time before a message that the broker did not accept is sent again.
 const OFFERED_AGAIN: Duration = Duration::from_secs(1);
-/// How long a farewell may take.
+/// Timeout of the farewell.
 const FAREWELL: Duration = Duration::from_secs(2);
-/// Messages that wait for the network.
+/// Maximum number of messages queued for the network.
 const WAITING: usize = 16;
 
-/// An edge node that tells a cell to a broker.
+/// Edge node that publishes the state of a cell to a broker.
 pub struct Node {
     way: Way,
     births: Births,
@@ -70,19 +71,20 @@ impl Topics {
     }
 }
 
-/// How a connection came to its end.
+/// Reason for the end of a connection.
 enum Over {
-    /// Nobody has anything to tell any more.
+    /// The source of the state has closed.
     Ended,
-    /// The broker has gone, or was never there; whether the connection stood before.
+    /// The broker is gone or was never reached; `stood` is true if the connection was established before.
     Lost { why: String, stood: bool },
 }
 
 impl Node {
-    /// A node for the cell of this name. It tells nobody anything yet.
+    /// Creates a node for the cell of this name. It does not connect yet.
     ///
     /// # Errors
-    /// Names that no topic can have; a password or certificates that cannot be read; a broker on another computer without certificates.
+    /// A name is not valid in a topic, a password or a certificate cannot be read, or the broker is on another computer
+    /// and no certificates are given.
     pub fn new(
         settings: &SparkplugSettings,
         cell: &str,
@@ -97,10 +99,10 @@ impl Node {
         Ok(Self { way, births: Births::of(turn)?, topics: Topics::of(&settings.group, cell), told, notes })
     }
 
-    /// Tells the cell until nobody has anything to tell any more, whether the broker can be reached or not.
+    /// Publishes the state of the cell until its source closes, whether or not the broker can be reached.
     ///
     /// # Errors
-    /// A number of the connection that cannot be written.
+    /// The number of the connection cannot be written.
     pub async fn run(mut self) -> Result<(), LiveError> {
         let mut wait = SHORTEST_WAIT;
         let mut connection = self.births.next()?;
@@ -111,7 +113,8 @@ impl Node {
             if stood {
                 connection = self.births.next()?;
             }
-            // A connection that lasted ends the waiting; one that ends at once is no better than none.
+            // After a connection that lasted, the next attempt comes soon. After one that ended at once, the wait keeps
+            // growing.
             wait = if began.elapsed() > LONGEST_WAIT { SHORTEST_WAIT } else { wait };
             let until = Instant::now() + wait;
             while Instant::now() < until {
@@ -124,12 +127,12 @@ impl Node {
         }
     }
 
-    /// One connection, from its beginning to its end.
+    /// Runs one connection, from its beginning to its end.
     async fn session(&mut self, connection: u8) -> Over {
         let options = self.way.with_death(&self.topics.death, message::death(connection));
         let (client, mut broker) = AsyncClient::new(options, WAITING);
         broker.network_options.set_tcp_nodelay(true);
-        // In a task of its own: half a message that was given up would be the end of the connection.
+        // Polls in a task of its own: cancelling a poll in the middle of a message would end the connection.
         let (to, mut events) = mpsc::channel(WAITING);
         let mut polling = JoinSet::new();
         polling.spawn(poll(broker, to));
@@ -160,7 +163,7 @@ impl Node {
     }
 }
 
-/// What the broker says, until it says nothing more.
+/// Forwards the events of the broker until there are no more.
 async fn poll(mut broker: EventLoop, to: mpsc::Sender<Result<Event, ConnectionError>>) {
     loop {
         let event = broker.poll().await;
@@ -171,24 +174,24 @@ async fn poll(mut broker: EventLoop, to: mpsc::Sender<Result<Event, ConnectionEr
     }
 }
 
-/// A connection that stands.
+/// Established connection.
 struct Session<'a> {
     node: &'a mut Node,
     client: AsyncClient,
     connection: u8,
-    /// What was told last; none before the birth.
+    /// Values published last; `None` before the birth.
     values: Option<Values>,
     sequence: u8,
-    /// When a birth, or what the broker did not take, is due.
+    /// Time at which a birth, or a message that the broker did not accept, is due.
     due: Option<Instant>,
-    /// When the last birth was.
+    /// Time of the last birth.
     began: Instant,
-    /// Whether the broker let it in.
+    /// True if the broker has accepted the connection.
     stood: bool,
 }
 
 impl Session<'_> {
-    /// Takes what the broker says.
+    /// Handles an event of the broker.
     fn takes(&mut self, event: Option<Result<Event, ConnectionError>>) -> Result<(), Over> {
         self.stood |= matches!(event, Some(Ok(Event::Incoming(Packet::ConnAck(_)))));
         let stood = self.stood;
@@ -201,7 +204,7 @@ impl Session<'_> {
                 let filters = topics.map(|topic| SubscribeFilter::new(topic.clone(), QoS::AtLeastOnce));
                 self.client.try_subscribe_many(filters).or_else(|error| lost(error.to_string()))
             }
-            // Before the birth, so that no command after it is missed.
+            // Subscribes before the birth, so that no later command is missed.
             Some(Ok(Event::Incoming(Packet::SubAck(ack)))) => {
                 let refused = ack.return_codes.contains(&SubscribeReasonCode::Failure);
                 if refused {
@@ -221,7 +224,7 @@ impl Session<'_> {
         }
     }
 
-    /// Tells everything anew.
+    /// Publishes a birth with all values.
     fn birth(&mut self) {
         let values = current(&mut self.node.told);
         let birth = message::birth(FIGURES, &values, self.connection);
@@ -233,7 +236,7 @@ impl Session<'_> {
         (self.values, self.sequence, self.due, self.began) = (Some(values), 0, None, Instant::now());
     }
 
-    /// Tells what has changed since it was told.
+    /// Publishes the values that have changed.
     fn tell(&mut self) -> Result<(), Over> {
         let Some(told) = &self.values else { return Ok(()) };
         let values = current(&mut self.node.told);
@@ -241,13 +244,13 @@ impl Session<'_> {
         let Some(changes) = message::changes(FIGURES, &values, told, next) else { return Ok(()) };
         match self.client.try_publish(&self.node.topics.data, QoS::AtMostOnce, false, changes) {
             Ok(()) => (self.values, self.sequence) = (Some(values), next),
-            // The next one has this too.
+            // The next message contains this change too.
             Err(_) => self.due = Some(self.due.unwrap_or_else(|| Instant::now() + OFFERED_AGAIN)),
         }
         Ok(())
     }
 
-    /// Does what was put off.
+    /// Does the deferred work.
     fn catch_up(&mut self) -> Result<(), Over> {
         self.due = None;
         match self.values {
@@ -257,7 +260,7 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// A host may ask for a birth, and for nothing else.
+    /// Handles a command of a host. A host may request a birth, and nothing else.
     fn hear(&mut self, publish: &Publish) {
         let by = format!("somebody at the broker {}", self.node.way.place);
         let (wants_birth, others) = message::asked(&publish.payload);
@@ -276,7 +279,7 @@ impl Session<'_> {
         }
     }
 
-    /// Tells that what was told is true no more, and goes.
+    /// Publishes the death and disconnects.
     async fn farewell(&mut self, events: &mut mpsc::Receiver<Result<Event, ConnectionError>>) -> Over {
         let said = async {
             let death = message::death(self.connection);
@@ -286,7 +289,7 @@ impl Session<'_> {
             while !matches!(events.recv().await?.ok()?, Event::Outgoing(Outgoing::Disconnect)) {}
             Some(())
         };
-        // Where it cannot be said the broker says it.
+        // If the death cannot be sent in time, the broker publishes it.
         let _ = timeout(FAREWELL, said).await;
         Over::Ended
     }
@@ -297,7 +300,7 @@ fn current(told: &mut watch::Receiver<Told>) -> Values {
     FIGURES.iter().map(|figure| figure.of(&told)).collect()
 }
 
-/// An error of the client with what is behind it.
+/// Returns the message of an error of the client, with its causes.
 fn in_words(error: &ConnectionError) -> String {
     let mut words = error.to_string();
     let mut behind = std::error::Error::source(error);

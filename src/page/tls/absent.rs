@@ -1,4 +1,4 @@
-//! The certificate of a page in a program that was built without TLS: there is none.
+//! Certificate of a page in a program without TLS. It has no value.
 
 use std::io;
 use std::path::Path;
@@ -7,12 +7,12 @@ use tokio::net::TcpStream;
 
 use super::TlsError;
 
-/// The certificate of a page: a program that was built without TLS has none.
+/// Certificate of a page. A program that was built without TLS has none.
 #[derive(Clone)]
 pub enum Tls {}
 
 impl Tls {
-    /// Refuses every certificate.
+    /// Rejects every certificate.
     ///
     /// # Errors
     /// Always [`TlsError::NotBuilt`].

@@ -1,6 +1,6 @@
-//! The certificate by which a page is served to other computers over TLS.
+//! Certificate with which a page is served to other computers over TLS.
 //!
-//! TLS is built where the feature `https` is on. Without it no certificate is ever taken, and [`Tls`] has no value.
+//! TLS needs the feature `https`. Without it every certificate is rejected, and [`Tls`] has no value.
 
 use std::path::PathBuf;
 
@@ -17,7 +17,7 @@ pub use absent::Tls;
 #[cfg(feature = "https")]
 pub use present::Tls;
 
-/// A certificate or a key that a page cannot be served with.
+/// Errors of a certificate or a key that cannot be used for a page.
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the messages tell them")]
 pub enum TlsError {

@@ -1,4 +1,4 @@
-//! The certificate of a page, by rustls.
+//! Certificate of a page, with rustls.
 
 use std::io;
 use std::path::Path;
@@ -17,20 +17,21 @@ use webpki::EndEntityCert;
 
 use super::TlsError;
 
-/// The certificate of a page, ready to be shown.
+/// Certificate of a page, ready for TLS connections.
 #[derive(Clone)]
 pub struct Tls {
     acceptor: TlsAcceptor,
-    /// That of the page itself; those behind it belong to who signed it.
+    /// Certificate of the page itself, without the intermediate certificates of the issuers.
     certificate: CertificateDer<'static>,
 }
 
 impl Tls {
-    /// Reads a certificate (with those of who signed it behind it) and its private key, both in PEM. TLS 1.3 only: every browser since
-    /// 2018 speaks it.
+    /// Reads a certificate (followed by those of its issuers) and its private key, both in PEM. TLS 1.3 only, which all
+    /// browsers have supported since 2018.
     ///
     /// # Errors
-    /// Files that cannot be read or hold none, a key that others may read, and two that do not belong together.
+    /// Fails if a file cannot be read or contains no certificate or key, if others can read the key, or if the
+    /// certificate and the key do not match.
     pub fn read(certificate: &Path, key: &Path) -> Result<Self, TlsError> {
         let unread = |what: String| TlsError::Certificate { path: certificate.to_owned(), what };
         let chain = CertificateDer::pem_file_iter(certificate).and_then(Iterator::collect);
@@ -47,7 +48,7 @@ impl Tls {
         Ok(Self { acceptor: TlsAcceptor::from(Arc::new(config)), certificate: first })
     }
 
-    /// Whether the certificate is for a name or an address: no browser shows the page by another.
+    /// Returns true if the certificate is valid for a name or an address. A browser refuses the page under any other.
     pub(crate) fn is_for(&self, host: &str) -> bool {
         let host = host.trim_start_matches('[').trim_end_matches(']');
         let (Ok(name), Ok(certificate)) = (ServerName::try_from(host), EndEntityCert::try_from(&self.certificate))
@@ -57,7 +58,7 @@ impl Tls {
         certificate.verify_is_valid_for_subject_name(&name).is_ok()
     }
 
-    /// The first name that the certificate is for, unless it is for many at once.
+    /// Returns the first name of the certificate without a wildcard.
     pub(crate) fn name(&self) -> Option<String> {
         let certificate = EndEntityCert::try_from(&self.certificate).ok()?;
         certificate.valid_dns_names().find(|name| !name.contains('*')).map(str::to_owned)
@@ -68,7 +69,7 @@ impl Tls {
     }
 }
 
-/// Reads a private key that nobody else may read.
+/// Reads a private key, and rejects it if other users can read the file.
 fn secret(path: &Path) -> Result<PrivateKeyDer<'static>, TlsError> {
     let unread = |what: String| TlsError::Key { path: path.to_owned(), what };
     if let Some(open) = readable_by_others(path).map_err(|error| unread(error.to_string()))? {

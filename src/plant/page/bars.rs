@@ -1,4 +1,4 @@
-//! Parts per day as bars: accepted at once, accepted after a correction, and what was not.
+//! Bars of parts per day: accepted at the first measurement, accepted after a correction, and not accepted.
 
 use maud::{Markup, html};
 
@@ -8,24 +8,24 @@ const LEFT: f64 = 40.0;
 const TOP: f64 = 14.0;
 const BOTTOM: f64 = 24.0;
 
-/// A day.
+/// Counts of one day.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Day {
-    /// `07-04`
+    /// Month and day, `07-04`.
     pub(super) day: String,
     pub(super) count: Count,
 }
 
-/// Parts that ended.
+/// Counts of parts that ended.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Count {
     pub(super) ended: i64,
     pub(super) accepted: i64,
-    /// At the first measurement.
+    /// Parts accepted at the first measurement.
     pub(super) at_once: i64,
 }
 
-/// Draws them.
+/// Draws the bars.
 pub(super) fn bars(days: &[Day]) -> Markup {
     let most = days.iter().map(|day| day.count.ended).max().unwrap_or(0).max(1);
     let step = (super::control_chart::round_step(most as f64 / 4.0) as i64).max(1);

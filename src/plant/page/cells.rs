@@ -1,4 +1,5 @@
-//! Every cell as it told itself last, and when that was. What was told long ago is not how the cell is.
+//! State of every cell as it last reported it, with the time of that report. An old report does not show the present
+//! state.
 
 use maud::{Markup, html};
 
@@ -7,15 +8,15 @@ use super::super::link::Link;
 use super::super::{Row, ToSql};
 use super::words::{ago, encoded, range, shown};
 
-/// A cell tells every second; one that is silent for so long may do anything.
+/// Time without a report, in s, after which the state of a cell is unknown. A cell reports every second.
 const SILENCE_S: f64 = 60.0;
-/// Most cells on the page.
+/// Maximum number of cells on the page.
 const MOST: i64 = 2000;
 
-/// A cell, as the plant knows it.
+/// State of a cell, as the plant has it.
 pub(super) struct CellNow {
     name: String,
-    /// Seconds since it told; none where it never has.
+    /// Seconds since the last report; `None` if the cell has never reported.
     heard_s: Option<f64>,
     run: Option<String>,
     state: String,
@@ -30,14 +31,14 @@ pub(super) struct CellNow {
     next: String,
 }
 
-/// How a cell looks from two metres.
+/// State of a cell as the page shows it, readable from two metres.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Look {
     Runs,
     Held,
     Alarm,
     Still,
-    /// Nobody knows.
+    /// Unknown state: the cell is silent.
     Silent,
 }
 
@@ -64,7 +65,7 @@ impl Look {
         }
     }
 
-    /// A shape besides the colour.
+    /// Returns a shape, in addition to the colour.
     fn shape(self) -> &'static str {
         match self {
             Self::Runs => "M6 3 L21 12 L6 21 Z",
@@ -76,7 +77,7 @@ impl Look {
     }
 }
 
-/// Reads how the cells are, those that need somebody first.
+/// Reads the states of the cells, those that need attention first.
 pub(super) async fn read(link: &Link) -> Result<Vec<CellNow>, PlantError> {
     let text = "SELECT cell, extract(epoch FROM now() - told_at)::double precision, run, coalesce(state, ''), coalesce(words, ''),
             coalesce(simulation, false), coalesce(part_name, ''), coalesce(serial, ''), cycle, most_cycles, done, total, left_least_s,
@@ -133,7 +134,7 @@ impl CellNow {
     }
 }
 
-/// How many cells there are of each kind, in words.
+/// Returns the number of cells in each state, in words.
 pub(super) fn tally(cells: &[CellNow]) -> String {
     let of = |look: Look| (cells.iter().filter(|cell| cell.look() == look).count(), look);
     let told = Look::ALL.map(of).into_iter().filter(|(count, _)| *count > 0);
@@ -141,7 +142,7 @@ pub(super) fn tally(cells: &[CellNow]) -> String {
     if told.is_empty() { "no cell is enrolled yet: regrind plant enrol".to_owned() } else { told.join(" · ") }
 }
 
-/// A card for each.
+/// Draws a card for each cell.
 pub(super) fn cards(cells: &[CellNow]) -> Markup {
     html! { div .cells { @for cell in cells { (card(cell)) } } }
 }

@@ -1,4 +1,5 @@
-//! `/cells`: the cells beside each other, of one recipe: how their parts came out, and whether a difference is more than chance.
+//! `/cells`: comparison of the cells for one recipe: the results of their parts, and whether a difference is more than
+//! chance.
 
 use axum::Extension;
 use axum::extract::{Query, RawQuery, State};
@@ -14,17 +15,17 @@ use super::selection::{Asked, Selection, mark};
 use super::words::{encoded, interval, share, shown, um};
 use super::{Made, Shared, Unmade, page};
 
-/// Most cells that are compared at once, and most parts of each, the newest.
+/// Maximum number of cells compared at once, and of parts of each cell (the newest).
 const CELLS: usize = 40;
 const PARTS: i64 = 200;
-/// By how rare a chance something is told to be none.
+/// Significance level: a smaller probability is reported as more than chance.
 const CHANCE: f64 = 0.05;
 
-/// The parts of a cell.
+/// Parts of a cell.
 #[derive(Default)]
 struct Cell {
     name: String,
-    /// In order of size.
+    /// PV of the parts, in µm, in ascending order.
     pv_um: Vec<f64>,
     cycles: Vec<i32>,
     ended: i64,
@@ -72,11 +73,11 @@ async fn made(plant: &Shared, asked: &Asked, after: usize) -> Result<Made, Unmad
     Ok(Made { title: "Cells".into(), again_s: None, main })
 }
 
-/// Reads the parts of one more cell than are shown.
+/// Reads the parts of one cell more than the page shows.
 async fn read(link: &Link, selection: &Selection, after: usize) -> Result<Vec<Cell>, PlantError> {
     let (condition, values) = selection.condition();
     let n = values.len();
-    // A cell at a time, each from the end of its own index.
+    // Reads one cell at a time, each from the end of its own index.
     let text = format!(
         "SELECT c.name, p.pv_um, p.cycles, p.result FROM (SELECT name FROM cell WHERE retired_at IS NULL ORDER BY name LIMIT ${} OFFSET ${}) c
             LEFT JOIN LATERAL (SELECT pv_um, cycles, result FROM part_run WHERE cell = c.name AND ended IS NOT NULL AND {condition}
@@ -108,7 +109,8 @@ async fn read(link: &Link, selection: &Selection, after: usize) -> Result<Vec<Ce
     Ok(cells)
 }
 
-/// By what chance each cell would differ so from the others, corrected for all of them.
+/// Returns for each cell the probability that it differs so much from the others by chance, corrected for the number of
+/// cells.
 fn chances(cells: &[Cell]) -> Vec<Option<f64>> {
     let others = |k: usize| -> Vec<f64> {
         cells
@@ -122,7 +124,7 @@ fn chances(cells: &[Cell]) -> Vec<Option<f64>> {
     holm(&found)
 }
 
-/// A value below which a share of sorted values lies, between the two next to it.
+/// Returns a quantile of sorted values, interpolated between the two nearest values.
 fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
     let at = share * (sorted.len().checked_sub(1)?) as f64;
     let (below, above) = (at.floor() as usize, at.ceil() as usize);
@@ -167,7 +169,7 @@ fn probability(p: f64) -> String {
     if p < 0.0001 { "p < 0.0001".to_owned() } else { format!("p = {p:.4}") }
 }
 
-/// The box of sorted values, on a scale of what all cells have.
+/// Draws the box plot of sorted values, on a scale common to all cells.
 fn drawn(sorted: &[f64], [from, to]: [f64; 2]) -> Markup {
     let [Some(least), Some(low), Some(median), Some(high), Some(largest)] =
         [0.0, 0.25, 0.5, 0.75, 1.0].map(|share| quantile(sorted, share))

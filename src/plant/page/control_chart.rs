@@ -1,17 +1,18 @@
-//! Control charts of individuals and their moving ranges (W. A. Shewhart; ISO 7870-2, individuals; NIST/SEMATECH e-Handbook of Statistical
-//! Methods, 6.3.2.2).
+//! Control charts of individuals and their moving ranges (W. A. Shewhart; ISO 7870-2, individuals; NIST/SEMATECH
+//! e-Handbook of Statistical Methods, 6.3.2.2).
 //!
-//! With n values x in the order in which they came, and the moving ranges MR = |x(i) - x(i-1)|: the centre is the mean of x, the limits lie
-//! 2.660 mean MR from it (3 / d2, d2 = 1.128 for two values), and a range is out of control above 3.267 mean MR (D4). Units: micrometres.
+//! With n values x in the order of measurement, and the moving ranges MR = |x(i) - x(i-1)|: the centre is the mean of
+//! x, the limits are at 2.660 mean MR from the centre (3 / d2, d2 = 1.128 for two values), and a range is out of
+//! control above 3.267 mean MR (D4). Units: micrometres.
 
 use maud::{Markup, html};
 
 use super::words::shown;
 
-/// 3 / d2 and D4 for ranges of two values.
+/// Constants 3 / d2 and D4 for ranges of two values.
 const E2: f64 = 2.660;
 const D4: f64 = 3.267;
-/// Fewer values give limits that move a good deal with the next ones.
+/// Minimum number of values for limits. Limits of fewer values change much with the next values.
 pub(super) const ENOUGH: usize = 20;
 
 const WIDTH: f64 = 900.0;
@@ -20,7 +21,7 @@ const RIGHT: f64 = 120.0;
 const TOP: f64 = 12.0;
 const BOTTOM: f64 = 26.0;
 
-/// A figure of a part.
+/// Figure of a part.
 #[derive(Clone, Debug)]
 pub(super) struct Value {
     pub(super) run: i32,
@@ -28,24 +29,24 @@ pub(super) struct Value {
     pub(super) cell: String,
     pub(super) when: String,
     pub(super) um: f64,
-    /// Its expanded uncertainty, and what is allowed.
+    /// Expanded uncertainty of the figure, and its tolerance.
     pub(super) u_um: Option<f64>,
     pub(super) limit_um: Option<f64>,
 }
 
-/// Where values stay that come from one and the same process.
+/// Control limits of values from one process.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Limits {
     pub(super) mean: f64,
     pub(super) mean_range: f64,
     pub(super) upper: f64,
-    /// None where it would lie below 0, where no peak to valley lies.
+    /// Lower limit; `None` if it would be below 0, because a peak-to-valley value is never negative.
     pub(super) lower: Option<f64>,
     pub(super) range_upper: f64,
 }
 
 impl Limits {
-    /// Computes them; none of less than two values.
+    /// Computes the limits; `None` for fewer than two values.
     pub(super) fn of(values: &[f64]) -> Option<Self> {
         let ranges = ranges(values);
         if ranges.is_empty() {
@@ -62,25 +63,25 @@ impl Limits {
         })
     }
 
-    /// Whether a value is out of control.
+    /// Returns true if a value is out of control.
     pub(super) fn is_out(&self, value: f64) -> bool {
         value > self.upper || self.lower.is_some_and(|lower| value < lower)
     }
 }
 
-/// The moving ranges: one less than there are values.
+/// Returns the moving ranges, one fewer than the values.
 pub(super) fn ranges(values: &[f64]) -> Vec<f64> {
     values.windows(2).map(|pair| (pair[1] - pair[0]).abs()).collect()
 }
 
-/// A line across a chart, with what it is called.
+/// Horizontal line of a chart, with its name.
 struct Across {
     class: &'static str,
     name: &'static str,
     at: f64,
 }
 
-/// Draws the values with their limits, and what is allowed as a line that steps with it.
+/// Draws the values with their control limits, and the tolerance of each part as a stepped line.
 pub(super) fn individuals(name: &str, class: &str, values: &[Value], limits: &Limits) -> Markup {
     let all: Vec<f64> = values.iter().map(|value| value.um).collect();
     let mut lines = vec![
@@ -89,12 +90,12 @@ pub(super) fn individuals(name: &str, class: &str, values: &[Value], limits: &Li
     ];
     lines.extend(limits.lower.map(|at| Across { class: "control", name: "lower limit", at }));
     let most = all.iter().fold(limits.upper, |most, value| most.max(*value));
-    // A tolerance that is far above all would press everything else flat.
+    // A tolerance far above all values would flatten the chart, so it is not drawn.
     let tolerance = values.iter().filter_map(|value| value.limit_um).fold(0.0, f64::max);
     let shows = tolerance > 0.0 && tolerance < 4.0 * most;
     let scale = Scale { most: if shows { most.max(tolerance) } else { most }, count: values.len(), height: 280.0 };
     let steps = if shows { tolerance_line(values, &scale) } else { Vec::new() };
-    // Its name stands beside its end; the line itself steps.
+    // The label is next to the end of the line; the line itself is stepped.
     let last = values.last().and_then(|value| value.limit_um).filter(|_| shows);
     lines.extend(last.map(|at| Across { class: "allowed", name: "allowed", at }));
     drawn(&format!("{name}, µm"), class, values, &all, &lines, &scale, |value| limits.is_out(value), &steps)
@@ -114,7 +115,7 @@ pub(super) fn moving_ranges(name: &str, class: &str, values: &[Value], limits: &
     drawn(&format!("Moving range of {name}, µm"), class, &values[1..], &all, &lines, &scale, is_out, &[])
 }
 
-/// What is allowed of each part, as points of a line that steps.
+/// Returns the tolerance of each part as the points of a stepped line.
 fn tolerance_line(values: &[Value], scale: &Scale) -> Vec<String> {
     let half = 0.5 * (scale.x(1) - scale.x(0));
     let mut parts: Vec<String> = vec![String::new()];
@@ -183,13 +184,13 @@ fn drawn(
     }
 }
 
-/// What is told of a point to who rests on it.
+/// Returns the tooltip of a point.
 fn told(value: &Value, um: f64, is_out: bool) -> Markup {
     let out = if is_out { ", OUT OF LIMITS" } else { "" };
     html! { title { (shown(&value.serial)) ", " (shown(&value.cell)) ", " (value.when) ": " (format!("{um:.3}")) " µm" (out) } }
 }
 
-/// Moves labels apart that would stand in each other, the least first.
+/// Moves overlapping labels apart, the lowest first.
 fn apart(mut at: Vec<f64>) -> Vec<f64> {
     let mut order: Vec<usize> = (0..at.len()).collect();
     order.sort_by(|a, b| at[*b].total_cmp(&at[*a]));
@@ -199,7 +200,7 @@ fn apart(mut at: Vec<f64>) -> Vec<f64> {
     at
 }
 
-/// Parts along in their order, micrometres upwards from 0.
+/// Scale of a chart: parts in their order on the x axis, µm from 0 upwards on the y axis.
 struct Scale {
     most: f64,
     count: usize,
@@ -217,16 +218,16 @@ impl Scale {
         self.height - BOTTOM - share * (self.height - TOP - BOTTOM - 8.0)
     }
 
-    /// Round values, four or so.
+    /// Returns the ticks: about four round values.
     fn ticks(&self) -> Vec<f64> {
         let step = round_step(self.most / 4.0);
-        // So that 0.6 is not 0.6000000000000001.
+        // Rounds, so that a tick is 0.6 and not 0.6000000000000001.
         let per_step = 10f64.powf(-step.log10().floor());
         let round = |tick: f64| (tick * per_step).round() / per_step;
         (0..20).map(|k| f64::from(k) * step).take_while(|tick| *tick <= 1.04 * self.most).map(round).collect()
     }
 
-    /// The values whose day is written.
+    /// Returns the indices of the values whose day is written on the axis.
     fn marked(&self) -> Vec<usize> {
         let most = 6.min(self.count);
         let mut marked: Vec<usize> = (0..most).map(|k| k * (self.count - 1) / (most - 1).max(1)).collect();
@@ -235,7 +236,7 @@ impl Scale {
     }
 }
 
-/// The least of 1, 2 and 5 with zeros that is no less.
+/// Returns the smallest of 1, 2 and 5 times a power of ten that is not below `least`.
 pub(super) fn round_step(least: f64) -> f64 {
     if !(least > 0.0 && least.is_finite()) {
         return 1.0;

@@ -1,4 +1,4 @@
-//! What other programs take: the parts of a selection as CSV, and as DFQ.
+//! Exports for other programs: the parts of a selection as CSV and as DFQ.
 
 use std::fmt::Write;
 
@@ -15,10 +15,10 @@ use super::selection::{Asked, Selection};
 use super::trend::parts;
 use super::{PlantPage, Shared, Unmade, unmade, within};
 
-/// Most parts in a file.
+/// Maximum number of parts in a file.
 const MOST: i64 = 20_000;
 
-/// The columns of the file, in their order: those of the view `part_run`.
+/// Columns of the file, in order: those of the view `part_run`.
 const COLUMNS: [&str; 26] = [
     "id",
     "cell",
@@ -47,7 +47,7 @@ const COLUMNS: [&str; 26] = [
     "alarms",
     "head",
 ];
-/// What of them is a number or a word of the program's own; everything else may be any text.
+/// Columns that contain numbers or words of this program. All other columns can contain any text.
 const NUMBERS: [&str; 11] = [
     "id",
     "simulation",
@@ -104,7 +104,8 @@ fn line(file: &mut String, row: &Row) {
     file.push_str("\r\n");
 }
 
-/// A text as a field (RFC 4180). One that a spreadsheet would take for a formula has an apostrophe before it, which makes it a text there.
+/// Quotes a text as a CSV field (RFC 4180). A text that a spreadsheet would read as a formula gets an apostrophe in
+/// front, which makes it a text.
 fn quoted(text: &str) -> String {
     let formula = text.starts_with(['=', '+', '-', '@', '\t', '\r']);
     format!("\"{}{}\"", if formula { "'" } else { "" }, text.replace('"', "\"\""))

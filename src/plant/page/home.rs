@@ -1,4 +1,4 @@
-//! `/`: all cells at a glance, what they made in the last days, what waits, and what should not have been.
+//! `/`: overview of all cells, the parts of the last days, the queue, and the incidents.
 
 use axum::Extension;
 use axum::extract::{Query, State};
@@ -16,13 +16,13 @@ use super::selection::{is_simulated, mark, today};
 use super::words::{encoded, interval, share, shown};
 use super::{Made, Shared, Unmade, cells, page};
 
-/// Days that parts are counted over.
+/// Number of days over which parts are counted.
 const DAYS: i64 = 14;
-/// Most rows of the queue, of the incidents, and of a table that is open from the start.
+/// Maximum number of rows of the queue, of the incidents, and of a table that is open at first.
 const QUEUED: i64 = 40;
 const INCIDENTS: i64 = 15;
 const OPEN: usize = 12;
-/// How soon the page is asked for again.
+/// Seconds until the browser reloads the page.
 const AGAIN_S: u32 = 10;
 
 #[derive(Debug, Default, Deserialize)]
@@ -62,7 +62,7 @@ async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
     Ok(Made { title: "Plant".into(), again_s: Some(AGAIN_S), main })
 }
 
-/// Parts that ended in the last days, by day, recipe and cell.
+/// Counts of the parts that ended in the last days, by day, by recipe and by cell.
 #[derive(Default)]
 struct Counted {
     days: Vec<Day>,
@@ -73,7 +73,8 @@ struct Counted {
 impl Counted {
     async fn read(link: &Link, simulated: bool) -> Result<Self, PlantError> {
         let first = today().checked_sub((DAYS - 1).days()).unwrap_or_default();
-        // In one pass over the days: which of the three a row is of, tells what else is null in it.
+        // One query for all three: `grouping` shows whether a row is a sum by day, by recipe or by cell; the other
+        // columns are null in it.
         let text = "SELECT to_char(day, 'YYYY-MM-DD'), recipe, cell, sum(ended)::bigint, sum(accepted)::bigint, sum(accepted_at_once)::bigint,
                 grouping(day, recipe, cell)
             FROM parts_by_day WHERE day >= $1::text::date AND simulation = $2
@@ -89,7 +90,7 @@ impl Counted {
                 _ => counted.cells.push((name(2), count)),
             }
         }
-        // A day on which nothing ended is a day too.
+        // Days on which no part ended are included too.
         counted.days = (0..DAYS)
             .filter_map(|k| first.checked_add(k.days()).ok())
             .map(|day| {

@@ -1,4 +1,4 @@
-//! `/maps`: error maps of runs side by side, on one scale of colours.
+//! `/maps`: error maps of runs side by side, on one colour scale.
 
 use std::path::Path;
 
@@ -17,21 +17,21 @@ use super::selection::mark;
 use super::words::{shown, um};
 use super::{Made, Shared, Unmade, page};
 
-/// Most maps at once.
+/// Maximum number of maps on the page.
 const MOST: usize = 4;
-/// Largest map, in pixels of the page.
+/// Maximum size of a map, in pixels of the page.
 const LARGEST: [f64; 2] = [400.0, 400.0];
-/// A title is cut where it would be wider than the picture.
+/// Maximum length of a title, in characters. A longer title would be wider than the picture.
 const TITLE: usize = 52;
 
-/// A map that is asked for: of a run, and of its last cycle where none is named.
+/// Requested map: a run and a cycle; without a cycle, the last cycle of the run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Asked {
     run: i32,
     cycle: Option<i32>,
 }
 
-/// A map, with what it is of.
+/// Map with its run.
 struct Map {
     run: i32,
     cycle: i32,
@@ -41,7 +41,7 @@ struct Map {
     simulation: bool,
     pv_um: Option<f64>,
     rms_um: Option<f64>,
-    /// Samples (x, y, error), millimetres and micrometres; in words why there are none.
+    /// Samples (x, y, error), in mm, mm and µm; in words, why there are none.
     samples: Result<Vec<[f64; 3]>, String>,
 }
 
@@ -54,7 +54,7 @@ pub(super) async fn maps(
     page(&session, made(&plant, &asked)).await
 }
 
-/// `run=17&run=18:2`: runs by their numbers, and cycles behind a colon.
+/// Parses a query such as `run=17&run=18:2`: ids of runs, each with an optional cycle after a colon.
 fn asked(query: &str) -> Vec<Asked> {
     let named = query.split('&').filter_map(|pair| pair.strip_prefix("run="));
     let one = |text: &str| {
@@ -108,7 +108,7 @@ async fn read(plant: &Shared, link: &Link, asked: Asked) -> Result<Map, Unmade> 
     })
 }
 
-/// A run that has none, beside others that have.
+/// Returns the entry of a run that has no map, for display next to runs that have one.
 async fn without(link: &Link, asked: Asked) -> Result<Map, Unmade> {
     let text = "SELECT serial, cell, recipe, simulation, pv_um, rms_um FROM part_run WHERE id = $1";
     let rows = link.ask(text, &[&asked.run]).await?;
@@ -128,7 +128,7 @@ async fn without(link: &Link, asked: Asked) -> Result<Map, Unmade> {
     })
 }
 
-/// Reads a map from among the files of a run; in words why there is none.
+/// Reads a map from the files of a run; in words, why there is none.
 async fn samples(plant: &Shared, link: &Link, run: i32, name: &str) -> Result<Result<Vec<[f64; 3]>, String>, Unmade> {
     let rows = link.ask("SELECT sha256 FROM run_artefact WHERE run = $1 AND name = $2", &[&run, &name]).await?;
     let [row] = &rows[..] else { return Ok(Err("its file is not on record, or more than one is by that name".into())) };
@@ -148,7 +148,7 @@ async fn samples(plant: &Shared, link: &Link, run: i32, name: &str) -> Result<Re
     Ok(parsed.await.unwrap_or_else(|_| Err("it could not be read".into())))
 }
 
-/// Draws maps from minus to plus the largest error of all of them.
+/// Draws the maps on one scale, from minus to plus the largest absolute error of all maps.
 fn side_by_side(maps: &[Map]) -> Markup {
     let all = maps.iter().filter_map(|map| map.samples.as_ref().ok()).flatten();
     let limit = all.fold(0.0_f64, |most, sample| most.max(sample[2].abs()));
@@ -181,7 +181,7 @@ fn drawn(map: &Map, limit_um: f64) -> Markup {
         heat.and_then(|heat| heat.to_svg()).map_err(|error| error.to_string())
     });
     match svg {
-        // The page takes no style from within itself; the same is said without one.
+        // The content policy of the page forbids inline styles, so the style becomes an attribute with the same effect.
         Ok(svg) => PreEscaped(
             svg.replace(" style=\"image-rendering:pixelated\"", " image-rendering=\"pixelated\"")
                 .replace(" style=\"image-rendering:auto\"", ""),

@@ -1,11 +1,13 @@
-//! The page of a plant: all its cells, what they made, and how it came out. It looks and orders nothing.
+//! Web page of a plant: all its cells, the parts that they made, and the results. The page only reads; it commands
+//! nothing.
 //!
 //! ```text
 //!  browser --GET--> door of regrind-page --> a question each page --> pool --> views of migrations/, as a reader
 //!                                        --> proofs: a run brought back, proven, and its report made of it
 //! ```
 //!
-//! Everything that it says stands in the views, which Grafana reads too. What comes from a cell is words and never HTML.
+//! All figures of the page are in the views, which Grafana reads too. Texts from a cell are shown as text, never as
+//! HTML.
 
 mod bars;
 mod cells;
@@ -39,30 +41,30 @@ use super::settings::{ArtefactSettings, DatabaseSettings};
 use pool::{Lease, Pool};
 use proof::Proofs;
 
-/// The look of what the page of a cell does not have.
+/// Path of the style sheet for the parts that the page of a cell does not have.
 const STYLE: &str = "/plant.css";
-/// Longest time that a page is worked on.
+/// Time limit for making a page.
 const PATIENCE: Duration = Duration::from_secs(15);
-/// How soon a page is asked for again that could not be made.
+/// Seconds until the browser retries a page that could not be made.
 const AGAIN_S: u32 = 5;
 
-/// What the page of a plant is made of.
+/// State of the page of a plant.
 pub struct PlantPage {
     pool: Pool,
     proofs: Proofs,
     artefacts: Option<ArtefactSettings>,
 }
 
-/// Shared by everything that answers.
+/// Page state shared by all handlers.
 type Shared = Arc<PlantPage>;
 
 impl PlantPage {
-    /// Makes ready to show the plant whose database this is. It need not be there yet.
+    /// Creates the page for the plant in this database. The database does not have to be reachable yet.
     pub fn new(database: DatabaseSettings, artefacts: Option<ArtefactSettings>) -> Self {
         Self { pool: Pool::new(database), proofs: Proofs::default(), artefacts }
     }
 
-    /// What is there for who is let in.
+    /// Returns the routes for a person who has signed in.
     pub fn routes(self) -> Router {
         Router::new()
             .route("/", get(home::home))
@@ -81,7 +83,7 @@ impl PlantPage {
             .with_state(Arc::new(self))
     }
 
-    /// A connection for a few questions.
+    /// Takes a connection from the pool for a few queries.
     async fn lease(&self) -> Result<Lease<'_>, PlantError> {
         self.pool.lease().await
     }
@@ -92,20 +94,20 @@ async fn style() -> Response {
         .into_response()
 }
 
-/// A page, or why there is none.
+/// Finished page.
 struct Made {
     title: String,
     again_s: Option<u32>,
     main: Markup,
 }
 
-/// Why a page is not made.
+/// Reason why a page is not made.
 enum Unmade {
-    /// The database is not there, or says no.
+    /// The database cannot be reached, or refuses.
     Plant(Box<PlantError>),
     /// There is nothing of that name.
     NotHere(String),
-    /// What was asked makes no sense.
+    /// The request is invalid.
     Nonsense(String),
 }
 
@@ -115,7 +117,7 @@ impl From<PlantError> for Unmade {
     }
 }
 
-/// Answers with a page, within the time that there is.
+/// Answers with a page, within the time limit.
 async fn page(session: &Session, making: impl Future<Output = Result<Made, Unmade>>) -> Response {
     match within(making).await {
         Ok(Made { title, again_s, main }) => plant_document(&title, session, again_s, STYLE, main),
@@ -123,7 +125,7 @@ async fn page(session: &Session, making: impl Future<Output = Result<Made, Unmad
     }
 }
 
-/// Gives what is made within the time that there is.
+/// Runs a future within the time limit.
 async fn within<T>(making: impl Future<Output = Result<T, Unmade>>) -> Result<T, Unmade> {
     let late = || {
         let what = format!("nothing came within {} s", PATIENCE.as_secs());
@@ -132,7 +134,7 @@ async fn within<T>(making: impl Future<Output = Result<T, Unmade>>) -> Result<T,
     tokio::time::timeout(PATIENCE, making).await.unwrap_or_else(|_| Err(late()))
 }
 
-/// Says why there is no page. One that may be there again is asked for again by itself.
+/// Renders the reason why there is no page. If the reason can pass, the browser retries.
 fn unmade(session: &Session, why: &Unmade) -> Response {
     let (status, again_s, title, words) = match why {
         Unmade::Plant(error) if error.may_pass() => {

@@ -1,4 +1,4 @@
-//! `/parts`: parts by how their serial numbers begin; without one, the newest.
+//! `/parts`: parts whose serial numbers begin with a text; without a text, the newest parts.
 
 use axum::Extension;
 use axum::extract::{Query, State};
@@ -13,16 +13,16 @@ use super::super::{Row, ToSql};
 use super::words::{encoded, shown, um};
 use super::{Made, Shared, Unmade, page};
 
-/// Most parts on a page.
+/// Maximum number of parts on a page.
 const MOST: usize = 100;
-/// What comes behind every text that begins with another: the last character there is.
+/// Upper bound of all texts with a given beginning: the last character of Unicode.
 const LAST: char = char::MAX;
 
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub(super) struct Asked {
     serial: String,
-    /// Goes on behind this run.
+    /// Id of the run after which this page begins.
     after: Option<i32>,
 }
 
@@ -60,7 +60,8 @@ async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
 
 const COLUMNS: &str = "id, serial, part_name, recipe, cell, run, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), cycles, pv_um, rms_um, result, simulation";
 
-/// Reads one more than are shown, in the order of an index: nothing is sorted, however many begin so.
+/// Reads one row more than a page shows, in the order of an index. The database sorts nothing, however many serial
+/// numbers match.
 async fn read(link: &Link, serial: &str, after: Option<i32>) -> Result<Vec<Row>, PlantError> {
     let most = MOST as i64 + 1;
     let (place, mut values): (_, Vec<&(dyn ToSql + Sync)>) = (after, vec![&most]);
@@ -75,7 +76,7 @@ async fn read(link: &Link, serial: &str, after: Option<i32>) -> Result<Vec<Row>,
         let n = values.len();
         text += &match serial.is_empty() {
             true => format!(" AND (began, id) < (SELECT began, id FROM part_run WHERE id = ${n})"),
-            // The rest of the same part, or a later serial number.
+            // Continues with the other runs of the same part, or with a later serial number.
             false => format!(
                 " AND serial ~>=~ (SELECT serial FROM part_run WHERE id = ${n}) AND (serial <> (SELECT serial FROM part_run WHERE id = ${n})
                     OR (began, id) < (SELECT began, id FROM part_run WHERE id = ${n}))"

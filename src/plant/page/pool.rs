@@ -1,4 +1,4 @@
-//! A few connections to the database, kept between questions. They read only, and no question of theirs takes long.
+//! Pool of connections to the database. The connections are read-only and limit the time of each query.
 
 use std::ops::Deref;
 use std::sync::{Mutex, PoisonError};
@@ -11,12 +11,12 @@ use super::super::link::Link;
 use super::super::schema::is_known;
 use super::super::settings::DatabaseSettings;
 
-/// How many there are at most.
+/// Maximum number of connections.
 const LINKS: usize = 4;
-/// How long somebody waits for one that another has, and for a sign of life of one that was kept.
+/// Time limit to wait for a free connection, and time limit for a pooled connection to answer a check.
 const TURN: Duration = Duration::from_secs(5);
 const SIGN_OF_LIFE: Duration = Duration::from_secs(2);
-/// What the server keeps to for each of them. Compiling a question would take longer than answering it.
+/// Settings of each connection, in SQL. JIT is off because compiling a query would take longer than running it.
 const RULES: &str = "SET statement_timeout = '5s'; SET default_transaction_read_only = on; SET jit = off";
 
 pub(super) struct Pool {
@@ -25,7 +25,7 @@ pub(super) struct Pool {
     idle: Mutex<Vec<Link>>,
 }
 
-/// A connection that goes back when nobody needs it any more, if it can still be asked something.
+/// Connection that returns to the pool when it is dropped, if it is still usable.
 pub(super) struct Lease<'p> {
     link: Option<Link>,
     pool: &'p Pool,
@@ -37,7 +37,7 @@ impl Pool {
         Self { database, places: Semaphore::new(LINKS), idle: Mutex::default() }
     }
 
-    /// Takes a connection that answers: one that was kept, or a new one.
+    /// Takes a connection that answers: one from the pool, or a new one.
     pub(super) async fn lease(&self) -> Result<Lease<'_>, PlantError> {
         let busy = || PlantError::Unreachable {
             place: "the other end".into(),
@@ -59,7 +59,7 @@ impl Pool {
         self.idle.lock().unwrap_or_else(PoisonError::into_inner).pop()
     }
 
-    /// Opens one more, to a database that is laid out as this program knows it.
+    /// Opens a new connection and checks that the layout of the database is the one this program knows.
     pub(super) async fn open(&self) -> Result<Link, PlantError> {
         let link = Link::open(&self.database).await?;
         is_known(link.client()).await?;

@@ -1,4 +1,5 @@
-//! The plant's copy of a run, brought back into a folder that nobody keeps, proven there, and what is made of it.
+//! Proof of a run: the plant's copy of the run is fetched into a temporary folder, verified there, and its report and
+//! QIF results are made.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -16,22 +17,23 @@ use super::super::copy::PlantRun;
 use super::super::error::{PlantError, refused};
 use super::PlantPage;
 
-/// How long a proof is taken for one: the copy may be changed at any time.
+/// Time for which a proof stays valid. The copy in the database can change at any time.
 const LASTS: Duration = Duration::from_secs(60);
-/// How many are kept.
+/// Maximum number of proofs in the cache.
 const KEPT: usize = 16;
-/// Whole runs are brought back one at a time, and a question for one may take so long.
+/// Time limit of a query, set in SQL. A whole run is fetched here, so the limit is longer than for other pages. Only
+/// one run is fetched at a time.
 const ANSWER: &str = "SET statement_timeout = '60s'";
 
-/// What came of a proof.
+/// Result of a proof.
 pub(super) struct Proof {
-    /// When it was made, UTC.
+    /// Time of the proof, UTC.
     pub(super) at: String,
-    /// What was proven, and by what; in words why it cannot be believed.
+    /// Result of the verification; in words, why the copy cannot be believed.
     pub(super) found: Result<Verified, String>,
-    /// The keys that the plant knows of the cell.
+    /// Number of keys that the plant has for the cell.
     pub(super) keys: usize,
-    /// The report of the run and its results, or why there are none.
+    /// Report of the run and its QIF results; in words, why there are none.
     pub(super) report: Result<String, String>,
     pub(super) qif: Result<String, String>,
     pub(super) dfq: Result<String, String>,
@@ -39,7 +41,7 @@ pub(super) struct Proof {
 
 type Known = HashMap<i32, (Instant, String, Arc<Proof>)>;
 
-/// Proofs that were made not long ago.
+/// Cache of recent proofs.
 pub(super) struct Proofs {
     known: Mutex<Known>,
     turn: Semaphore,
@@ -52,7 +54,7 @@ impl Default for Proofs {
 }
 
 impl Proofs {
-    /// A proof of what the plant had of a run up to this head, if it was made not long ago.
+    /// Returns the recent proof of a run for this head hash; `None` if there is no such proof.
     pub(super) fn known(&self, id: i32, head: &str) -> Option<Arc<Proof>> {
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         known.retain(|_, (since, ..)| since.elapsed() < LASTS);
@@ -69,10 +71,10 @@ impl Proofs {
     }
 }
 
-/// Proves the plant's copy of a run, unless that was just done.
+/// Verifies the plant's copy of a run, or returns the recent proof from the cache.
 ///
 /// # Errors
-/// A plant that cannot be reached, or has no such run. What is wrong with the copy is told in the proof.
+/// The plant cannot be reached, or has no such run. Faults of the copy are in the proof, not an error.
 pub(super) async fn proven(
     plant: &PlantPage,
     id: i32,
@@ -85,7 +87,7 @@ pub(super) async fn proven(
     }
     let gone = || PlantError::Unreachable { place: "the other end".into(), what: "the page is being ended".into() };
     let _turn = plant.proofs.turn.acquire().await.map_err(|_| gone())?;
-    // Somebody else may have waited for the same.
+    // Another request may have made the proof while this one waited for the lock.
     if let Some(known) = plant.proofs.known(id, head) {
         return Ok(known);
     }
@@ -99,7 +101,7 @@ async fn prove(plant: &PlantPage, cell: &str, name: &str) -> Result<Proof, Plant
     link.client().batch_execute(ANSWER).await.map_err(refused("to wait longer"))?;
     let run = PlantRun::find(&link, Some(cell), name).await?;
     let scratch = Arc::new(ScratchFolder::at(std::env::temp_dir().join(format!("regrind-page-{}", random_word()?)))?);
-    // What a run is called is a cell's word: no folder is called so.
+    // The name of a run comes from a cell, so it is not used as the name of a folder.
     let folder = scratch.path().join("run");
     match run.fetch(&link, plant.artefacts.as_ref(), &folder).await {
         Ok(()) => {}
@@ -131,7 +133,7 @@ impl Proof {
     }
 }
 
-/// What is wrong, without the name of a folder that nobody can look into.
+/// Replaces the path of the temporary folder in a message by "the copy": a reader cannot open that folder.
 fn without(folder: &Path, words: &str) -> String {
     words.replace(&folder.display().to_string(), "the copy")
 }
@@ -140,7 +142,7 @@ fn now() -> String {
     Timestamp::now().strftime("%Y-%m-%d %H:%M:%S").to_string()
 }
 
-/// A word that nobody guesses: a folder of that name is nobody else's.
+/// Returns a random word. Nobody can guess it, so a folder of that name belongs to this program only.
 fn random_word() -> Result<String, PlantError> {
     let mut bytes = [0; 16];
     let failed = |error: getrandom::Error| FormatError::Unwritable {

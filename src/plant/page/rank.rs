@@ -1,13 +1,14 @@
-//! Whether one cell differs from the others by more than chance: the rank sum of Mann and Whitney, and Holm's correction for many cells.
+//! Test whether one cell differs from the others by more than chance: the rank-sum test of Mann and Whitney, with
+//! Holm's correction for several cells.
 //!
-//! Ranks ask of figures nothing but their order: no normal distribution, and one outlier weighs no more than being the largest. H. B. Mann,
-//! D. R. Whitney, Ann. Math. Stat. 18 (1947); S. Holm, Scand. J. Stat. 6 (1979).
+//! The test uses only the order of the figures. It assumes no normal distribution, and the size of an outlier has no
+//! effect beyond its rank. H. B. Mann, D. R. Whitney, Ann. Math. Stat. 18 (1947); S. Holm, Scand. J. Stat. 6 (1979).
 
-/// Fewer figures on either side are not compared: the normal approximation needs them.
+/// Minimum number of figures on each side; the normal approximation needs them.
 pub(super) const ENOUGH: usize = 8;
 
-/// The probability of a rank sum that lies so far out if both come from one process, two-sided, with the correction for ties and for
-/// continuity; none where there are too few, or all are alike.
+/// Returns the two-sided probability of a rank sum at least this extreme if both samples come from one process, with
+/// the corrections for ties and for continuity. `None` if there are too few figures, or if all are equal.
 pub(super) fn rank_sum(one: &[f64], other: &[f64]) -> Option<f64> {
     if one.len() < ENOUGH || other.len() < ENOUGH {
         return None;
@@ -19,7 +20,7 @@ pub(super) fn rank_sum(one: &[f64], other: &[f64]) -> Option<f64> {
     let mut from = 0;
     while from < all.len() {
         let alike = all[from..].iter().take_while(|(value, _)| *value == all[from].0).count();
-        // The ranks from + 1 to from + alike are shared.
+        // Tied figures share the mean of the ranks from + 1 to from + alike.
         let rank = from as f64 + 0.5 * (alike as f64 + 1.0);
         sum += rank * all[from..from + alike].iter().filter(|(_, is_one)| *is_one).count() as f64;
         ties += (alike as f64).powi(3) - alike as f64;
@@ -36,7 +37,7 @@ pub(super) fn rank_sum(one: &[f64], other: &[f64]) -> Option<f64> {
     Some(erfc(z / std::f64::consts::SQRT_2).min(1.0))
 }
 
-/// Corrects probabilities for how many of them are looked at.
+/// Corrects the probabilities for the number of tests (Holm).
 pub(super) fn holm(found: &[Option<f64>]) -> Vec<Option<f64>> {
     let mut order: Vec<usize> = (0..found.len()).filter(|k| found[*k].is_some()).collect();
     order.sort_by(|a, b| found[*a].partial_cmp(&found[*b]).unwrap_or(std::cmp::Ordering::Equal));
@@ -49,7 +50,8 @@ pub(super) fn holm(found: &[Option<f64>]) -> Vec<Option<f64>> {
     corrected
 }
 
-/// What is left of the normal distribution beyond x, to 1.2e-7 of it (W. H. Press et al., Numerical Recipes, erfcc), for x of 0 and above.
+/// Computes the complementary error function erfc(x) for x >= 0, with a relative error below 1.2e-7 (W. H. Press et
+/// al., Numerical Recipes, erfcc).
 fn erfc(x: f64) -> f64 {
     const COEFFICIENTS: [f64; 10] = [
         -1.265_512_23,

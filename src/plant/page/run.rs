@@ -1,4 +1,5 @@
-//! `/runs/{id}`: a run with the figures of each cycle, whether the plant's copy of it is proven, and what is made of that copy.
+//! `/runs/{id}`: page of a run, with the figures of each cycle, the proof of the plant's copy, and the documents made
+//! from that copy.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,11 +21,11 @@ use super::selection::mark;
 use super::words::{encoded, shown, um};
 use super::{Made, PlantPage, Shared, Unmade, page, unmade};
 
-/// How long the page of a run waits for its proof before it is shown without, and how soon it is asked for again then.
+/// Time that the page waits for the proof before it is shown without it, and seconds until the browser then retries.
 const WAITS: Duration = Duration::from_secs(3);
 const AGAIN_S: u32 = 3;
 
-/// What the plant has of a run at a glance.
+/// Summary of a run, as the plant has it.
 struct Run {
     id: i32,
     cell: String,
@@ -44,7 +45,7 @@ impl Run {
         Ok(Self { id: row.get(0), cell: row.get(1), name: row.get(2), head: row.get(3), row })
     }
 
-    /// A text of it by its place among the columns.
+    /// Returns a text of the row by the index of its column.
     fn text(&self, k: usize) -> &str {
         self.row.get::<_, Option<&str>>(k).unwrap_or_default()
     }
@@ -54,7 +55,7 @@ impl Run {
     }
 }
 
-/// The number of a run in an address.
+/// Parses the id of a run in an address.
 fn number(id: &str) -> Result<i32, Unmade> {
     id.parse().map_err(|_| Unmade::NotHere("runs go by their numbers here, as in /runs/17".into()))
 }
@@ -98,7 +99,7 @@ async fn made(plant: &Shared, id: i32) -> Result<Made, Unmade> {
         let run = Run::read(&link, id).await?;
         (run, cycles(&link, id).await?, maps_of(&link, id).await?)
     };
-    // It goes on when this page has been shown without it.
+    // The proof continues in its own task after this page is shown without it.
     let (shared, cell, name, head) = (Arc::clone(plant), run.cell.clone(), run.name.clone(), run.head.clone());
     let proving = tokio::spawn(async move { proven(&shared, id, &cell, &name, &head).await });
     let proof = match tokio::time::timeout(WAITS, proving).await {
@@ -128,7 +129,7 @@ async fn made(plant: &Shared, id: i32) -> Result<Made, Unmade> {
 
 fn about(run: &Run) -> Markup {
     let result = run.text(12);
-    // The words of the record begin with the same word.
+    // The verdict in the record begins with the word of the result.
     let verdict = run.text(13);
     let reason = verdict.split_once(": ").filter(|(word, _)| word.chars().all(|c| !c.is_lowercase()));
     let verdict = reason.map_or(verdict, |(_, reason)| reason);
@@ -149,7 +150,7 @@ fn about(run: &Run) -> Markup {
     }
 }
 
-/// What the proof says, in words.
+/// Describes the proof in words.
 fn told(proof: Option<&Proof>) -> Markup {
     let Some(proof) = proof else {
         return html! { p role="status" { "It is being brought together and proven; this page shows what comes of it by itself." } };
@@ -215,7 +216,7 @@ async fn cycles(link: &Link, id: i32) -> Result<Markup, PlantError> {
     })
 }
 
-/// The cycles of which there is a map.
+/// Returns the cycles that have an error map.
 async fn maps_of(link: &Link, id: i32) -> Result<Vec<i32>, PlantError> {
     let rows = link
         .ask("SELECT cycle FROM cycle_figure WHERE run_id = $1 AND map IS NOT NULL ORDER BY cycle LIMIT 1000", &[&id])
@@ -223,7 +224,7 @@ async fn maps_of(link: &Link, id: i32) -> Result<Vec<i32>, PlantError> {
     Ok(rows.iter().map(|row| row.get(0)).collect())
 }
 
-/// The proof of a run, however long it takes.
+/// Returns the proof of a run, however long it takes.
 async fn proof_of(plant: &PlantPage, id: &str) -> Result<(Run, Arc<Proof>), Unmade> {
     let run = {
         let link = plant.lease().await?;
@@ -241,7 +242,7 @@ pub(super) async fn report(
     match proof_of(&plant, &id).await {
         Ok((_, proof)) => match &proof.report {
             Ok(html) => {
-                // Its style stands in it; nothing in it may run, and nothing may be fetched.
+                // The report contains its own style. Scripts in it must not run, and nothing may be fetched.
                 let policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'";
                 let headers = [
                     (CONTENT_TYPE, "text/html; charset=utf-8"),
@@ -288,13 +289,13 @@ async fn results(
     }
 }
 
-/// A file to be kept by a browser. Its name is of letters and digits alone.
+/// Returns a file for download. Its name consists of letters and digits only.
 pub(super) fn file(name: &str, kind: &'static str, content: String) -> Response {
     ([(CONTENT_TYPE, kind.to_owned()), (CONTENT_DISPOSITION, format!("attachment; filename=\"{name}\""))], content)
         .into_response()
 }
 
-/// What is said of a copy of which nothing is made: one that cannot be believed.
+/// Returns the answer for a copy that cannot be believed, from which no document is made.
 fn not_made(session: &Session, why: &str) -> Response {
     let mut response = unmade(session, &Unmade::NotHere(why.to_owned()));
     *response.status_mut() = StatusCode::UNPROCESSABLE_ENTITY;

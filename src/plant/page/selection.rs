@@ -1,4 +1,4 @@
-//! Which parts are looked at: what an address narrows them to, as a condition of the views and as a form.
+//! Selection of parts: the filters in an address, as a condition on the views and as a form.
 
 use jiff::civil::Date;
 use jiff::tz::TimeZone;
@@ -11,7 +11,7 @@ use super::super::link::Link;
 use super::Unmade;
 use super::words::{encoded, shown};
 
-/// By what parts are told apart: the column of the views, which is the word in an address too, and what people call it.
+/// Filters of parts: the column of the views, which is also the word in an address, and the label for people.
 const KINDS: [(&str, &str); 6] = [
     ("recipe", "Recipe"),
     ("cell", "Cell"),
@@ -20,9 +20,9 @@ const KINDS: [(&str, &str); 6] = [
     ("wheel", "Wheel"),
     ("probe", "Probe"),
 ];
-/// Days that are looked back where nothing else is said.
+/// Number of days in the default period.
 const DAYS: i64 = 90;
-/// Most names in a form.
+/// Maximum number of names in a form.
 const NAMES: i64 = 5000;
 
 /// What an address says; what it does not say is chosen.
@@ -44,20 +44,21 @@ pub(super) struct Asked {
     at: String,
 }
 
-/// What is looked at.
+/// Selection of parts.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Selection {
-    /// In the order of [`KINDS`]; empty is any.
+    /// Names in the order of [`KINDS`]; an empty name matches any.
     names: [String; 6],
     since: Date,
     until: Date,
-    /// Simulated parts and real ones are never counted together.
+    /// True for simulated parts. Simulated and real parts are never counted together.
     pub(super) simulated: bool,
     pub(super) first: bool,
 }
 
 impl Selection {
-    /// Makes out what is looked at. Where nothing is said: real parts if there are any, the recipe of the newest, and the last days.
+    /// Builds the selection from an address. Defaults: real parts if there are any, the recipe of the newest part, and
+    /// the last days.
     pub(super) async fn of(link: &Link, asked: &Asked) -> Result<Self, Unmade> {
         let simulated = is_simulated(link, &asked.parts).await?;
         let recipe = match &asked.recipe {
@@ -68,12 +69,12 @@ impl Selection {
         let today = today();
         let until = day(&until)?.unwrap_or(today);
         let before = until.checked_sub(DAYS.days()).unwrap_or(Date::MIN);
-        // No text in the database has a zero: such a name is no name there.
+        // No text in the database contains a zero character, so a name with one matches nothing.
         let names = [recipe, cell, grinder, cmm, wheel, probe].map(|name| name.replace('\0', ""));
         Ok(Self { names, since: day(&since)?.unwrap_or(before), until, simulated, first: at == "first" })
     }
 
-    /// The condition on the columns of a view, and its values, `$1` and on.
+    /// Returns the condition on the columns of a view, and its values, from `$1` on.
     pub(super) fn condition(&self) -> (String, Vec<String>) {
         let end = self.until.checked_add(1.day()).unwrap_or(Date::MAX);
         let mut values = vec![format!("{} 00:00Z", self.since), format!("{end} 00:00Z")];
@@ -86,12 +87,12 @@ impl Selection {
         (text, values)
     }
 
-    /// The recipe; empty is any.
+    /// Returns the recipe; empty means any.
     pub(super) fn recipe(&self) -> &str {
         &self.names[0]
     }
 
-    /// What is said in an address, so that it says the same tomorrow but for the days.
+    /// Returns the query of an address for this selection. The query means the same tomorrow, except for the days.
     pub(super) fn query(&self) -> String {
         let named = KINDS.iter().zip(&self.names).filter(|((kind, _), name)| *kind == "recipe" || !name.is_empty());
         let mut query: Vec<String> = named.map(|((kind, _), name)| format!("{kind}={}", encoded(name))).collect();
@@ -101,7 +102,7 @@ impl Selection {
         query.join("&")
     }
 
-    /// What is looked at, in a sentence.
+    /// Describes the selection in a sentence.
     pub(super) fn words(&self) -> String {
         let named = KINDS.iter().zip(&self.names).filter(|(_, name)| !name.is_empty());
         let named: Vec<String> =
@@ -110,7 +111,7 @@ impl Selection {
         format!("{named}, begun {} to {}", self.since, self.until)
     }
 
-    /// The form that chooses it.
+    /// Renders the form that sets the selection.
     pub(super) async fn form(&self, link: &Link, action: &str, kinds: &[&str]) -> Result<Markup, PlantError> {
         let rows = link.ask("SELECT kind, name FROM choice ORDER BY kind, name LIMIT $1", &[&NAMES]).await?;
         let names: Vec<(&str, &str)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
@@ -149,10 +150,10 @@ impl Selection {
     }
 }
 
-/// All kinds of names that a form may have.
+/// Keys of all filters that a form can have.
 pub(super) const ALL_KINDS: [&str; 6] = [KINDS[0].0, KINDS[1].0, KINDS[2].0, KINDS[3].0, KINDS[4].0, KINDS[5].0];
 
-/// Whether simulated parts are looked at: as is asked, or else where no real part was ever made.
+/// Returns true if the selection is of simulated parts: as requested, or by default if no real part exists.
 pub(super) async fn is_simulated(link: &Link, asked: &str) -> Result<bool, PlantError> {
     match asked {
         "real" => Ok(false),
@@ -171,7 +172,7 @@ async fn newest_recipe(link: &Link, simulated: bool) -> Result<String, PlantErro
     Ok(rows.first().map_or_else(String::new, |row| row.get(0)))
 }
 
-/// The mark of what is simulated.
+/// Renders the mark of simulated parts.
 pub(super) fn mark(simulated: bool) -> Markup {
     html! { @if simulated { span .simulation { "SIMULATION" } } }
 }
@@ -180,13 +181,13 @@ pub(super) fn today() -> Date {
     Timestamp::now().to_zoned(TimeZone::UTC).date()
 }
 
-/// A day as a person writes it; none where nothing is written.
+/// Parses a day that a person wrote; `None` for an empty text.
 fn day(text: &str) -> Result<Option<Date>, Unmade> {
     let text = text.trim();
     if text.is_empty() {
         return Ok(None);
     }
-    // What the database has no day for, it is not asked for.
+    // Accepts only days that the database can represent.
     let found = text.parse::<Date>().ok().filter(|day| (1970..=9000).contains(&day.year()));
     let bad = || Unmade::Nonsense(format!("{text:?} is no day; write it as 2026-07-04"));
     found.map(Some).ok_or_else(bad)

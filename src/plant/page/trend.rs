@@ -1,4 +1,4 @@
-//! `/trend`: PV and RMS of part after part, with control limits and what is allowed.
+//! `/trend`: PV and RMS of consecutive parts, with control limits and tolerance.
 
 use axum::Extension;
 use axum::extract::{Query, State};
@@ -13,11 +13,11 @@ use super::selection::{ALL_KINDS, Asked, Selection, mark};
 use super::words::{shown, um};
 use super::{Made, Shared, Unmade, page};
 
-/// Most parts in a chart, and most of those that are listed as out of limits.
+/// Maximum number of parts in a chart, and of parts in the list of those out of limits.
 const MOST: i64 = 250;
 const LISTED: usize = 20;
 
-/// A part with its two figures.
+/// Part with its two figures.
 pub(super) struct Part {
     pub(super) pv: Value,
     pub(super) rms: Option<Value>,
@@ -54,10 +54,10 @@ async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
     Ok(Made { title: "Trend".into(), again_s: None, main })
 }
 
-/// Reads the newest parts of a selection, the oldest of them first.
+/// Reads the newest parts of a selection, in order from the oldest to the newest.
 pub(super) async fn parts(link: &Link, selection: &Selection, most: i64) -> Result<Vec<Part>, PlantError> {
     let (condition, values) = selection.condition();
-    // The names of the two views differ in what is the run's number.
+    // The two views have different names for the id of the run.
     let (view, id) = if selection.first { ("cycle_figure", "run_id") } else { ("part_run", "id") };
     let first = if selection.first { "cycle = 1 AND " } else { "" };
     let text = format!(

@@ -1,15 +1,16 @@
-//! How the page says things: texts of cells, times, figures, addresses.
+//! Formatting of the page: texts of cells, times, figures, addresses.
 
 use std::fmt::Write;
 
 use regrind_document::visible;
 
-/// A text that a cell or a person gave, with what turns or hides letters shown by its number. Maud escapes the rest.
+/// Returns a text from a cell or a person, with characters that reorder or hide letters replaced by their number. Maud
+/// escapes the rest.
 pub(super) fn shown(text: &str) -> String {
     visible(text)
 }
 
-/// A value in an address.
+/// Encodes a value for an address.
 pub(super) fn encoded(text: &str) -> String {
     text.bytes().fold(String::new(), |mut out, byte| {
         match byte {
@@ -20,7 +21,7 @@ pub(super) fn encoded(text: &str) -> String {
     })
 }
 
-/// How long ago something was, as nobody wants it closer.
+/// Formats how long ago something was, rounded as a reader needs it.
 pub(super) fn ago(seconds: f64) -> String {
     match seconds {
         s if s < 90.0 => format!("{:.0} s", s.max(0.0)),
@@ -30,7 +31,7 @@ pub(super) fn ago(seconds: f64) -> String {
     }
 }
 
-/// A range of seconds.
+/// Formats a range of seconds.
 pub(super) fn range([least, most]: [f64; 2]) -> String {
     let (unit, per) = match most {
         most if most < 90.0 => ("s", 1.0),
@@ -42,12 +43,12 @@ pub(super) fn range([least, most]: [f64; 2]) -> String {
     if least == most { format!("{most} {unit}") } else { format!("{least} – {most} {unit}") }
 }
 
-/// A figure in micrometres; a dash where there is none.
+/// Formats a figure in µm; a dash if there is none.
 pub(super) fn um(value: Option<f64>, digits: usize) -> String {
     value.filter(|value| value.is_finite()).map_or("–".to_owned(), |value| format!("{value:.digits$}"))
 }
 
-/// A share as a percentage; a dash where it is one of nothing.
+/// Formats a share as a percentage; a dash if the total is zero.
 pub(super) fn share(of: i64, all: i64) -> String {
     if all <= 0 {
         return "–".to_owned();
@@ -55,7 +56,7 @@ pub(super) fn share(of: i64, all: i64) -> String {
     format!("{:.0} %", 100.0 * of as f64 / all as f64)
 }
 
-/// The Wilson score interval of 95 % around a share, in words.
+/// Formats the 95 % Wilson score interval of a share.
 pub(super) fn interval(of: i64, all: i64) -> String {
     if all <= 0 {
         return String::new();
@@ -64,7 +65,7 @@ pub(super) fn interval(of: i64, all: i64) -> String {
     format!("{:.0} – {:.0} %", 100.0 * low, 100.0 * high)
 }
 
-/// The Wilson score interval of 95 % around a share (E. B. Wilson, JASA 22, 1927).
+/// Computes the 95 % Wilson score interval of a share (E. B. Wilson, JASA 22, 1927).
 fn wilson(of: f64, all: f64) -> [f64; 2] {
     const Z: f64 = 1.959_964;
     let (p, z2) = (of / all, Z * Z);
@@ -84,7 +85,7 @@ mod tests {
 
     #[test]
     fn the_interval_of_a_share_is_that_of_wilson() {
-        // 8 of 10: 0.4902 to 0.9433, as tables have it.
+        // 8 of 10: 0.4902 to 0.9433, as in published tables.
         let [low, high] = wilson(8.0, 10.0);
         assert!((low - 0.4902).abs() < 1e-4 && (high - 0.9433).abs() < 1e-4, "{low} {high}");
         assert_eq!((share(2, 3), share(0, 0), interval(0, 0)), ("67 %".into(), "–".into(), String::new()));

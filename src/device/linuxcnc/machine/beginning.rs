@@ -1,4 +1,4 @@
-//! From a program to one that runs: what must hold before, the record that is opened for it, and the one line that starts it.
+//! Preparation and start of a program: the preconditions, its record, and the one line that starts it.
 
 use std::sync::Arc;
 
@@ -41,7 +41,7 @@ impl LinuxcncGrinder {
         Ok(Armed { job, start_sequence: sequence, token, boot_id: 0 })
     }
 
-    /// Refuses what must not be begun with: nothing here makes the machine ready but a person at it.
+    /// Checks that the machine is ready. Only a person at the machine can make it ready.
     pub(super) fn check_ready(&self, seen: &Seen) -> Answered<()> {
         match () {
             () if seen.stopped || !seen.on => {
@@ -61,8 +61,8 @@ impl LinuxcncGrinder {
         DeviceError::Unready { machine: self.machine(), why }
     }
 
-    /// Has the controller open the record, and reads there what it was told to write: so both see one folder, the controller can write
-    /// in it, and what is found in the record later is of this preparation.
+    /// Has the controller open the record and reads the token in it. This proves that both see one folder, that the
+    /// controller can write in it, and that later lines of the record are of this preparation.
     async fn open_record(&mut self, program: &Program, token: u32) -> Answered<()> {
         let record = path(&self.folders.there, &program.name, RECORD);
         self.controller.enter(Mode::Mdi, Command::Prepare).await?;
@@ -89,7 +89,7 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Sends the one line that begins it, and waits until that shows.
+    /// Sends the start and waits until its effect is seen.
     pub(super) async fn run(&mut self) -> Answered<Status> {
         let heard = self.controller.order(Set::Run, Command::Start).await;
         let refused = match heard {
@@ -112,7 +112,7 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Whether the program of the job is seen to run, or has written that it began.
+    /// Returns the status if the program of the job is seen to run, or has recorded that it began.
     async fn has_begun(&mut self) -> Answered<Option<Status>> {
         let (seen, status) = self.look().await?;
         let Some(work) = self.work.clone() else { return Ok(None) };

@@ -1,4 +1,4 @@
-//! How the grinder stands, by what its controller shows and its program wrote.
+//! State of the grinder, from its controller and the record of its program.
 
 use std::time::Duration;
 
@@ -11,11 +11,11 @@ use crate::linuxcnc::protocol::Mode;
 use crate::linuxcnc::work::{Stage, Verdict, Work};
 use crate::words::{Fault, Outcome, State, Status};
 
-/// A program that runs moves; one that does not for so long is told of.
+/// Time without a change after which a running program that does not move is noted.
 const STANDS_AFTER: Duration = Duration::from_secs(5);
 
 impl LinuxcncGrinder {
-    /// Looks at the controller, and at the record where a job may be over.
+    /// Reads the state of the controller, and the record if a job may be over.
     pub(super) async fn look(&mut self) -> Answered<(Seen, Status)> {
         let owned = self.controller.owned;
         let seen = self.controller.look(owned).await?;
@@ -35,7 +35,8 @@ impl LinuxcncGrinder {
         Ok((seen, status))
     }
 
-    /// A controller whose task has died goes on telling what it told last. It has no beat by which that could be known for sure.
+    /// Notes a running program that does not move. A controller whose task has died keeps reporting its last state, and
+    /// it has no heartbeat that would prove it.
     fn see_it_move(&mut self, seen: &Seen) {
         match &self.moved {
             Some((line, at, since)) if (*line, at) == (seen.line, &seen.at) => {
@@ -56,7 +57,7 @@ impl LinuxcncGrinder {
         self.notes.drain(..more);
     }
 
-    /// Brings the job to where it stands by what is seen.
+    /// Updates the job from the observed state.
     async fn judge(&mut self, seen: &Seen) -> Answered<()> {
         let Some(mut work) = self.work.take() else { return Ok(()) };
         let begun = self.judged(&mut work, seen).await;
@@ -68,7 +69,7 @@ impl LinuxcncGrinder {
         if matches!(work.stage, Stage::Ended(..)) {
             return Ok(());
         }
-        // Begun at the machine's own panel it is begun all the same.
+        // A program started at the machine's own panel has begun too.
         let is_ours = seen.program.as_deref() == Some(&work.path);
         if work.stage == Stage::Prepared && seen.interpreter != Interpreter::Idle && is_ours {
             work.stage = Stage::Begun;
@@ -101,7 +102,7 @@ impl LinuxcncGrinder {
         Ok(())
     }
 
-    /// How it stands, in the words of every machine.
+    /// Returns the status in the words common to all machines.
     fn told(&mut self, seen: &Seen) -> Status {
         let is_clear = seen.interpreter == Interpreter::Idle && self.clear_at.as_ref() == Some(&seen.at);
         if !is_clear {
@@ -120,7 +121,7 @@ impl LinuxcncGrinder {
             Stage::Begun => match work.judge(seen, None, still, settles) {
                 Verdict::Foreign(state) => Status { state, ..blank },
                 Verdict::At(state) => Status { state, progress: work.progress(seen.line), ..status },
-                // Nobody knows that it stands still before the record was read, or a person has said so.
+                // Its standstill is not known until the record is read or a person has confirmed it.
                 _ => Status { state: State::Execute, ..status },
             },
             Stage::Prepared if seen.interpreter != Interpreter::Idle => blank,
@@ -130,7 +131,7 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Where it stands when no job of ours is at work.
+    /// Returns the state when no job of ours is active.
     fn free(&self, seen: &Seen) -> State {
         match seen.interpreter {
             Interpreter::Running => State::Execute,
@@ -141,7 +142,7 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Whether the controller stands and only a person can tell what became of the job.
+    /// Returns true if the controller is idle and only a person can say how the job ended.
     pub(super) async fn is_untold(&mut self) -> Answered<bool> {
         let (seen, _) = self.look().await?;
         let Some(work) = self.work.clone().filter(|work| work.stage == Stage::Begun) else { return Ok(false) };
@@ -151,7 +152,7 @@ impl LinuxcncGrinder {
     }
 }
 
-/// What stands in the way of a machine at which no job is.
+/// Returns the fault that blocks a machine without a job.
 pub(super) fn standing_fault(seen: &Seen) -> Option<Fault> {
     match (seen.stopped, seen.on) {
         (true, _) => Some(Fault::StopCircuit),

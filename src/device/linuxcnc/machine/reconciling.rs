@@ -1,4 +1,4 @@
-//! What became of a job of which nothing was heard, or that an earlier run had begun.
+//! Fate of a job after a lost connection, or of one that an earlier process had begun.
 
 use std::sync::Arc;
 
@@ -12,7 +12,7 @@ use crate::linuxcnc::work::Stage;
 use crate::words::{Armed, Reconciled};
 
 impl LinuxcncGrinder {
-    /// What became of a job, if that can be told now.
+    /// Returns what became of a job, if that is known now.
     pub(super) async fn what_became(&mut self) -> Answered<Option<Reconciled>> {
         let (seen, status) = self.look().await?;
         let Some(work) = &self.work else { return Ok(None) };
@@ -29,8 +29,9 @@ impl LinuxcncGrinder {
         })
     }
 
-    /// Behind a new claim no line of an older connection can begin anything. What was not begun over more than a second then, and has its
-    /// record as it was when it was prepared, was not begun.
+    /// Finds out if the job was never begun. After a new claim, no line of an older connection can begin anything. The
+    /// job was not begun if it is then not seen to run for more than a second, and its record has neither a begin nor
+    /// an end.
     pub(super) async fn was_not_begun(&mut self) -> Answered<Reconciled> {
         self.claim_again().await?;
         let fenced = Instant::now();
@@ -52,7 +53,7 @@ impl LinuxcncGrinder {
         }
     }
 
-    /// Finds again what was prepared before this program began.
+    /// Finds the program that was prepared before this process started.
     pub(super) async fn find_again(&mut self, intended: &Armed) -> Answered<()> {
         let (cycle, token) = (intended.job.number().cycle.saturating_sub(1), intended.token);
         if let Some(program) = self.in_folders(move |folders| folders.prepared(cycle, token)).await? {
@@ -64,7 +65,8 @@ impl LinuxcncGrinder {
         Ok(())
     }
 
-    /// A job that was taken in before anything was connected is looked for at once, so that what runs is known for it.
+    /// Finds the program of a job that was restored before the connection existed, so that a running program is
+    /// recognised as that of the job.
     pub(super) async fn find_what_was_restored(&mut self) {
         let Some(work) = self.work.as_ref().filter(|work| work.program.is_none()) else { return };
         let intended = Armed { job: work.job, start_sequence: work.sequence, token: work.token, boot_id: 0 };

@@ -16,7 +16,7 @@ use unix::is_there;
 #[cfg(windows)]
 use windows::is_there;
 
-/// Opens a port; while it is open no other program can.
+/// Opens a port. While it is open, no other program can open it.
 pub(super) fn open(device: &str, baud: u32, parity: Parity, stop_bits: u8) -> io::Result<SerialStream> {
     let parity = match parity {
         Parity::None => tokio_serial::Parity::None,
@@ -27,7 +27,8 @@ pub(super) fn open(device: &str, baud: u32, parity: Parity, stop_bits: u8) -> io
     Ok(tokio_serial::new(device, baud).parity(parity).stop_bits(stop_bits).open_native_async()?)
 }
 
-/// Says that a port is not on this computer, and which are; nothing where it is there.
+/// Returns in words that a port is not on this computer, and which ports are. Returns `None` if it is there or has no
+/// name.
 pub(crate) fn missing(device: &str) -> Option<String> {
     if device.is_empty() || is_there(device) {
         return None;
@@ -37,7 +38,7 @@ pub(crate) fn missing(device: &str) -> Option<String> {
     Some(format!("{device} is not on this computer; the serial ports here: {there}"))
 }
 
-/// The names of the ports that the system knows.
+/// Returns the names of the ports that the system knows.
 fn names() -> Vec<String> {
     let ports = serialport::available_ports().unwrap_or_default();
     ports.into_iter().map(|port| port.port_name).collect()
