@@ -436,7 +436,7 @@ impl FittedModel {
             Some(_) => self.posterior(&ModelInputs { priors: None, ..*inputs }).mean_hyperparameters(),
         };
         Form {
-            hyperparameters: hyperparameters,
+            hyperparameters,
             hyperparameters_without_prior: is_seen.then_some(alone),
             frame_covariance: self.motions.to_twist(&covariance),
             points: drawn.points(),
