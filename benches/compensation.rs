@@ -1,7 +1,8 @@
-//! How long it takes from deviations to an error map, stage by stage, in this process and without reading a file.
+//! Time from deviations to an error map, stage by stage, in one process and without reading a file.
 //!
-//! `cargo bench --bench compensation`; a name after `--` chooses some. The part is the free form of the trials with 28,476 measured
-//! points over 100 x 60 mm, ground to a few micrometres with 0.3 um of noise and 1 % of spikes; the cut-off is 5 mm.
+//! `cargo bench --bench compensation` runs all; a name after `--` selects some. The part is the free form of the trials
+//! with 28,476 measured points over 100 x 60 mm, ground to a few micrometres, with 0.3 um of noise and 1 % of spikes.
+//! The cut-off is 5 mm.
 
 use std::sync::LazyLock;
 
@@ -18,7 +19,7 @@ use regrind_sim::shape::{FreeForm, Shape};
 const CUTOFF_MM: f64 = 5.0;
 /// Columns and rows of the measurement of the trials: 28,476 points.
 const SCAN: (usize, usize) = (226, 126);
-/// Distance of the nodes of a map.
+/// Node spacings of the maps, in mm.
 const SPACINGS_MM: [f64; 2] = [1.0, 0.5];
 
 static CONTACTS: LazyLock<Vec<Contact>> = LazyLock::new(measured);
@@ -40,7 +41,7 @@ fn measured() -> Vec<Contact> {
         .map(|k| {
             let at = |i: usize, n: usize, size: f64| (size - 2.0) * (i as f64 / (n - 1) as f64 - 0.5);
             let (x, y) = (at(k % SCAN.0, SCAN.0, FreeForm::WIDTH_MM), at(k / SCAN.0, SCAN.1, FreeForm::DEPTH_MM));
-            // Four even numbers between -1/2 and 1/2 have a standard deviation of 0.577.
+            // Four uniform numbers between -1/2 and 1/2 have a sum with a standard deviation of 0.577.
             let noise = 3e-4 / 0.577 * (0..4).map(|_| random()).sum::<f64>();
             let spike = if random() > 0.49 { 8e-3 } else { 0.0 };
             let normal = Vector::from(shape.normal(x, y));
@@ -55,28 +56,28 @@ fn plain(spacing_mm: f64) -> MapOptions {
     MapOptions { outlier_limit: None, ..MapOptions::new(CUTOFF_MM, spacing_mm) }
 }
 
-/// The distance of neighbouring points, which every map begins with.
+/// Measures the search for the spacing of neighbouring points, the first step of every map.
 #[divan::bench]
 fn spacing_of_points(bencher: Bencher) {
     let readings = &*READINGS;
     bencher.bench(|| point_spacing_mm(black_box(readings)));
 }
 
-/// The Gaussian filter alone.
+/// Measures the Gaussian filter alone.
 #[divan::bench(args = SPACINGS_MM)]
 fn filter(bencher: Bencher, spacing_mm: f64) {
     let readings = &*READINGS;
     bencher.bench(|| error_map(black_box(readings), &plain(spacing_mm)));
 }
 
-/// The filter after outliers are found and left out: what a cycle runs.
+/// Measures outlier rejection and then the filter, as in a cycle.
 #[divan::bench(args = SPACINGS_MM)]
 fn outliers_and_filter(bencher: Bencher, spacing_mm: f64) {
     let readings = &*READINGS;
     bencher.bench(|| error_map(black_box(readings), &MapOptions::new(CUTOFF_MM, spacing_mm)));
 }
 
-/// The robust filter alone.
+/// Measures the robust filter alone.
 #[divan::bench(args = SPACINGS_MM)]
 fn robust_filter(bencher: Bencher, spacing_mm: f64) {
     let readings = &*READINGS;
@@ -84,7 +85,7 @@ fn robust_filter(bencher: Bencher, spacing_mm: f64) {
     bencher.bench(|| error_map(black_box(readings), &options));
 }
 
-/// A filter as long as a third of the part.
+/// Measures a filter whose cut-off is a third of the part.
 #[divan::bench(args = SPACINGS_MM)]
 fn long_filter(bencher: Bencher, spacing_mm: f64) {
     let readings = &*READINGS;
@@ -92,7 +93,7 @@ fn long_filter(bencher: Bencher, spacing_mm: f64) {
     bencher.bench(|| error_map(black_box(readings), &options));
 }
 
-/// The smoothing spline with its uncertainty, and the filter that tells what was measured.
+/// Measures the smoothing spline with its uncertainty, and the filter that finds which nodes were measured.
 #[divan::bench(args = SPACINGS_MM)]
 fn spline(bencher: Bencher, spacing_mm: f64) {
     let readings = &*READINGS;
@@ -100,7 +101,7 @@ fn spline(bencher: Bencher, spacing_mm: f64) {
     bencher.bench(|| error_map(black_box(readings), &options));
 }
 
-/// What a second pass tells, by octaves, and the correction of the third.
+/// Measures the learning from a second pass, by octaves, and the correction for the third.
 #[divan::bench(args = SPACINGS_MM)]
 fn correction(bencher: Bencher, spacing_mm: f64) {
     let options = MapOptions::new(CUTOFF_MM, spacing_mm);
@@ -120,7 +121,7 @@ fn correction(bencher: Bencher, spacing_mm: f64) {
     bencher.bench(|| now.next(&error, &black_box(&known).after(&seen), None, &limits).expect("a correction"));
 }
 
-/// Wheel, setting and wear told from form.
+/// Measures the separation of wheel, setting and wear from form.
 #[divan::bench]
 fn separation_of_parameters(bencher: Bencher) {
     let contacts = &*CONTACTS;

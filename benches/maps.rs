@@ -1,4 +1,4 @@
-//! What a cycle takes to say what is left on the part: figures, and its map as X3P and picture.
+//! Time that a cycle needs to report the residual error of the part: figures, and the map as X3P and picture.
 //!
 //! ```text
 //! cargo bench --bench maps
@@ -17,7 +17,7 @@ fn main() {
     divan::main();
 }
 
-/// A rough surface over the free form's aperture.
+/// Returns samples of a rough surface over the free form's aperture.
 fn samples(points: usize) -> Vec<Sample> {
     let columns = (points as f64 * 102.0 / 62.0).sqrt().round() as usize;
     let rows = points.div_ceil(columns);

@@ -1,4 +1,4 @@
-//! How long the model of the form takes: a batch of touches more, a whole measurement, a scan.
+//! Time of the model of the form: one more batch of touches, a whole measurement, a scan.
 //!
 //! ```text
 //! cargo bench --bench model
@@ -21,7 +21,7 @@ fn main() {
 const HYPER: Hyperparameters =
     Hyperparameters { field: Field::new(5e-3, 30.0), noise_sigma_mm: 3e-4, noise_autocorrelation: 0.0 };
 
-/// Points of a part of 102 x 62 mm with form, scatter, and the six motions of a part as effects.
+/// Returns points of a part of 102 x 62 mm with form, noise, and the six motions of a part as effects.
 fn measured(count: u32) -> Observed {
     let places: Vec<[f64; 2]> = (0..count)
         .map(|k| f64::from(k) + 0.5)
@@ -34,7 +34,7 @@ fn measured(count: u32) -> Observed {
     Observed { fixed_effects: effects, ..Observed::without_effects(places, deviations_mm) }
 }
 
-/// What the six motions of a part that is bent both ways add at each place.
+/// Returns the displacement at each place by each of the six motions of a part that is curved in both directions.
 fn motions(places: &[[f64; 2]]) -> DMatrix<f64> {
     let row = |[x, y]: [f64; 2]| {
         let (x, y) = (x - 51.0, y - 31.0);
@@ -54,14 +54,14 @@ fn nodes(columns: u32, rows: u32) -> Vec<[f64; 2]> {
     (0..columns * rows).map(at).collect()
 }
 
-/// What is told after 20 touches more, of 400: everything anew, the parameters kept.
+/// Measures the posterior after 20 more touches, in addition to 400: all recomputed, with the hyperparameters fixed.
 #[divan::bench]
 fn a_batch_after_400_points(bencher: Bencher) {
     let (all, map) = (measured(420), nodes(40, 25));
     bencher.bench(|| DensePosterior::fit(&all, HYPER).unwrap().predict(&map));
 }
 
-/// The same in place, beside 6,000 nodes: what is known of every one is brought up to date.
+/// Measures the same update in place, with 6,000 nodes: the posterior of every node is updated.
 #[divan::bench]
 fn a_batch_after_400_points_in_place(bencher: Bencher) {
     let (all, map) = (measured(420), nodes(100, 60));
@@ -82,7 +82,8 @@ fn a_batch_after_400_points_in_place(bencher: Bencher) {
     });
 }
 
-/// Everything that is said of a measurement: fields laid over the pattern, 1,000 forms drawn from them, figures, slopes and budget.
+/// Measures the complete evaluation of a measurement: fields fitted over the pattern, 1,000 forms drawn from them,
+/// figures, slopes and budget.
 #[divan::bench(sample_count = 10)]
 fn a_measurement_of_1800_points(bencher: Bencher) {
     let found = registered(52, 35);
@@ -95,7 +96,7 @@ fn a_scan_of_28476_points(bencher: Bencher) {
     bencher.bench(|| Form::estimate(&found, &ModelInputs::default()).unwrap());
 }
 
-/// A free form with an error of 1 um, touched in rows.
+/// Returns the registration of a free form with an error of 1 um, touched in rows.
 fn registered(columns: usize, rows: usize) -> Registration {
     const RADIUS_MM: f64 = 1.5;
     let shape = FreeForm::default();
@@ -112,14 +113,15 @@ fn registered(columns: usize, rows: usize) -> Registration {
     register(&nominal, &points(centres), &options).unwrap()
 }
 
-/// The search for parameters: all fields are laid over the points, and the middle of the possible ones is told.
+/// Measures the search for hyperparameters: all fields are fitted to the points, and the mean over the plausible ones
+/// is returned.
 #[divan::bench(sample_count = 5)]
 fn the_parameters_of_1800_points(bencher: Bencher) {
     let all = measured(1800);
     bencher.bench(|| Hyperparameters::estimate(&all, None).unwrap());
 }
 
-/// The same of points that were measured along a path, whose drift is searched too.
+/// Measures the same for points that were measured along a path, for which the drift is searched too.
 #[divan::bench(sample_count = 5)]
 fn the_parameters_of_1800_points_along_a_path(bencher: Bencher) {
     let all = measured(1800);

@@ -1,12 +1,12 @@
-//! How long an order from another terminal takes to the wire: HOLD, RESUME and ABORT at every phase, 200 tries.
+//! Latency of an order from another terminal to the machine: HOLD, RESUME and ABORT in every phase, 200 tries.
 //!
 //! ```text
 //! cargo bench --bench orders [TRIES]
 //! cargo bench --features plant --bench orders -- TRIES PLANT.toml
 //! ```
-//! The time runs from before the order is written to the control socket to the command at the simulated machine. With the plant file of a cell
-//! every second round is made while `regrind ship` ships the record and, where the file says to whom, `regrind tell` tells live values; what the
-//! others took stands beside it.
+//! The time runs from before the order is written to the control socket until the command reaches the simulated
+//! machine. With the plant file of a cell, every second round runs while `regrind ship` replicates the record and, if
+//! the file names a broker, `regrind tell` publishes live values. The times of the other rounds are printed next to it.
 
 #[path = "../tests/common/keep.rs"]
 mod keep;
@@ -31,7 +31,7 @@ fn main() {
     runtime.block_on(measure(tries, plant.as_deref()));
 }
 
-/// What goes on for a plant beside the runs below a folder; it ends with this.
+/// Plant processes that run in parallel with the runs below a folder. They end when this value is dropped.
 struct Beside(Vec<Child>);
 
 impl Beside {
@@ -51,7 +51,7 @@ impl Beside {
 impl Drop for Beside {
     fn drop(&mut self) {
         for child in &mut self.0 {
-            // It may have ended.
+            // The process has possibly ended already.
             let _ = child.kill();
             let _ = child.wait();
         }
@@ -71,7 +71,7 @@ async fn measure(tries: usize, plant: Option<&str>) {
         if k % MOMENTS.len() == 0 {
             beside = ships.map(|plant| Beside::begin(plant, rig.home.path()));
         }
-        // With and without a plant alike.
+        // The same with and without a plant.
         let holds = if plant.is_some() { round / 2 } else { round }.is_multiple_of(2);
         let (tried, _) = attempt(&mut rig, moment, holds).await;
         let aborts = tried.abort.iter().zip(["abort, CMM", "abort, grinder"]);

@@ -1,9 +1,10 @@
-//! How long a registration takes, in this process and without reading a file.
+//! Time of a registration, in one process and without reading a file.
 //!
-//! `cargo bench --bench registration` runs them all in about a minute; a name after `--` chooses some, and
-//! `REGRIND_BENCH_LARGE=1` adds the nominal surface of ten million points. What a user waits for is the nominal surface and the
-//! registration together, so a surface is made anew for every sample: normals worked out in the first registration are kept
-//! in it, and a second one would look faster than it is. Inputs are made and copied, and results dropped, off the clock.
+//! `cargo bench --bench registration` runs all in about a minute. A name after `--` selects some, and
+//! `REGRIND_BENCH_LARGE=1` adds the nominal surface of ten million points. A user waits for the nominal surface and the
+//! registration together, so every sample builds a new surface: the first registration caches the normals in it, and a
+//! second one would look faster than it is. The creation and copying of inputs and the dropping of results are not
+//! timed.
 
 use std::sync::LazyLock;
 
@@ -22,12 +23,12 @@ const NOISE_MM: f64 = 2e-4;
 
 /// Columns and rows of the measurement of the trials: 28,476 points.
 const SCAN: (usize, usize) = (226, 126);
-/// As many points measured as there are in the nominal surface: 451,401.
+/// Columns and rows of a measurement with as many points as the nominal surface: 451,401.
 const DENSE: (usize, usize) = FreeForm::PAPER_GRID;
 
-/// Off by what a fixture repeats to.
+/// Misalignment within the repeatability of a fixture: shifts in mm, rotations in degrees.
 const NEAR: ([f64; 3], [f64; 3]) = ([0.05, 0.02, -0.03], [0.01, 0.02, 0.03]);
-/// Off by what a part laid down by hand is.
+/// Misalignment of a part that was laid down by hand: shifts in mm, rotations in degrees.
 const FAR: ([f64; 3], [f64; 3]) = ([20.0, 10.0, 20.0], [20.0, 20.0, 10.0]);
 
 static NOMINAL: LazyLock<Vec<Point>> = LazyLock::new(|| grid(DENSE));
@@ -44,17 +45,17 @@ fn placement((translation_mm, angles_deg): ([f64; 3], [f64; 3])) -> Placement {
     Placement::new(translation_mm, angles_deg)
 }
 
-/// The nominal points of the free form, row by row.
+/// Returns the nominal points of the free form, row by row.
 fn grid((columns, rows): (usize, usize)) -> Vec<Point> {
     let points = FreeForm::default().grid(FreeForm::WIDTH_MM, FreeForm::DEPTH_MM, columns, rows);
     points.into_iter().map(Point::from).collect()
 }
 
-/// Centres of a probe on the ground part, with noise, in the frame of the measuring machine.
+/// Returns the centres of a probe on the ground part, with noise, in the frame of the measuring machine.
 fn measured((columns, rows): (usize, usize), place: &Placement) -> Vec<Point> {
     let shape = FreeForm::default();
     let form = FormError::new(5, 30.0, FORM_PV_MM, FreeForm::WIDTH_MM, FreeForm::DEPTH_MM);
-    // A millimetre inside the edge, where the ball touches the part wherever it leans.
+    // A millimetre inside the edge, so that the ball touches the part at any slope.
     let at = |i: usize, n: usize, size: f64| (size - 2.0) * (i as f64 / (n - 1) as f64 - 0.5);
     let mut centres: Vec<[f64; 3]> = (0..columns * rows)
         .map(|k| {
@@ -129,7 +130,7 @@ mod far {
         time(bencher, &DENSE_FAR, Start::Search);
     }
 
-    /// 28,476 of them.
+    /// Registers 28,476 of the points.
     #[divan::bench(sample_count = 20)]
     fn a_scan_from_identity(bencher: Bencher) {
         time(bencher, &SCAN_FAR, AT_IDENTITY());
@@ -146,7 +147,8 @@ mod far {
 mod without_a_grid {
     use super::*;
 
-    /// As many points as the grid has, evenly strewn without any order (the R2 sequence): no four of them on one circle.
+    /// Returns as many points as the grid has, evenly distributed without any order (the R2 sequence): no four of them
+    /// on one circle.
     fn strewn() -> Vec<Point> {
         let place = |k: usize, step: f64, size: f64| size * ((0.5 + k as f64 * step).fract() - 0.5);
         (0..NOMINAL.len())
@@ -177,7 +179,7 @@ mod without_a_grid {
     }
 }
 
-/// 2,000 points in any pose: the argument is the seed that the pose is drawn with.
+/// Registers 2,000 points in any pose. The argument is the seed of the pose.
 #[divan::bench(sample_count = 10, sample_size = 1, args = [1, 2, 3])]
 fn search_of_any_pose(bencher: Bencher, seed: u64) {
     let place = Placement::random(&mut regrind_sim::rng(seed), 100.0);
@@ -186,13 +188,13 @@ fn search_of_any_pose(bencher: Bencher, seed: u64) {
     bencher.with_inputs(fresh).bench_refs(|nominal| found(nominal, &measured, Start::Search));
 }
 
-/// Columns and rows of nominal grids, each ten times as large as the one before.
+/// Returns the columns and rows of nominal grids, each ten times as large as the one before.
 fn grids() -> Vec<usize> {
     let large = std::env::var_os("REGRIND_BENCH_LARGE").is_some_and(|v| v == "1");
     [10_000, 100_000, 1_000_000].into_iter().chain(large.then_some(10_000_000)).collect()
 }
 
-/// A nominal grid that grows, and 28,476 points close by: together.
+/// Measures a growing nominal grid and 28,476 points close by, built and registered together.
 #[divan::bench(sample_count = 8, sample_size = 1, args = grids())]
 fn growth_with_nominal_points(bencher: Bencher, count: usize) {
     let columns = [(10_000, 125), (100_000, 400), (1_000_000, 1250), (10_000_000, 4000)]
@@ -207,18 +209,19 @@ fn growth_with_nominal_points(bencher: Bencher, count: usize) {
     });
 }
 
-/// What one point costs in one pass once the iteration has settled; the argument is how far off it starts, in micrometres.
+/// Measures the time of one point in one pass after the iteration has settled. The argument is the distance of the
+/// start, in micrometres.
 ///
-/// An item is one point in one pass, so 1000 over the Mitem/s printed is the time in ns. The checks before the iteration, the
-/// side of the probe and the verdict after it are in that time, so it is an upper limit of the pass; the farther start takes
-/// more passes and the same rest, and the difference of the two is the pass itself.
+/// An item is one point in one pass, so 1000 divided by the printed Mitem/s is the time in ns. This time includes the
+/// checks before the iteration, the side of the probe and the verdict after it, so it is an upper limit of the pass.
+/// The farther start takes more passes and the same rest. The difference of the two is the time of the passes alone.
 #[divan::bench(sample_count = 10, sample_size = 1, args = [0, 5])]
 fn settled_pass(bencher: Bencher, off_um: u32) {
     let nominal = gridded(NOMINAL.clone());
     let fitted = found(&nominal, &DENSE_NEAR, AT_IDENTITY()).cmm_from_model;
     let off_mm = f64::from(off_um) * 1e-3;
     let start = Start::Pose(fitted * Pose::exp(&[off_mm, off_mm, off_mm, 0.0, 0.0, 0.0].into()));
-    // The pose of the start is a pass too.
+    // The evaluation at the start pose is a pass too.
     let passes = 1 + found(&nominal, &DENSE_NEAR, start).trace.len();
     bencher.counter(ItemsCount::new(DENSE_NEAR.len() * passes)).bench(|| found(&nominal, &DENSE_NEAR, start));
 }

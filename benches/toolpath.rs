@@ -1,7 +1,7 @@
-//! Speed of the path and of its program, by the number of points; `REGRIND_BENCH_LARGE=1` adds ten million.
+//! Speed of the tool path and of its program, by the number of points; `REGRIND_BENCH_LARGE=1` adds ten million.
 //!
-//! The part is a free form of 100 x 60 mm with a correction on a grid of 1 mm. How many points there are is set by the distance of the
-//! tracks; the chord error is 0.1 um. Growth in time is linear, and nothing but one chunk of text is held in memory.
+//! The part is a free form of 100 x 60 mm with a correction on a grid of 1 mm. The distance of the tracks sets the
+//! number of points. The chord error is 0.1 um. The time grows linearly, and memory holds only one chunk of text.
 
 use std::path::Path;
 
@@ -17,7 +17,7 @@ fn main() {
     divan::main();
 }
 
-/// Numbers of points that are asked for.
+/// Returns the numbers of points to request.
 fn sizes() -> Vec<u64> {
     let mut sizes = vec![100_000, 1_000_000];
     if std::env::var_os("REGRIND_BENCH_LARGE").is_some() {
@@ -26,14 +26,14 @@ fn sizes() -> Vec<u64> {
     sizes
 }
 
-/// A path of about so many points.
+/// Returns a path of about this number of points.
 fn path(points: u64) -> ToolPath {
     let grid = Grid { columns: 101, rows: 61, first_mm: [-50.0, -30.0], spacing_mm: [1.0, 1.0] };
     let values_mm = (0..grid.len()).map(|k| error_mm(grid.place_mm(k))).collect();
     path_of(nominal(), &Correction { grid, values_mm, cycle: 2, level_mm: 0.02, set: None }, points)
 }
 
-/// What the grinder left, in millimetres.
+/// Returns the error that the grinder left, in millimetres.
 fn error_mm([x, y]: [f64; 2]) -> f64 {
     5e-3 * (0.3 * x).sin() * (0.25 * y).cos()
 }
@@ -52,27 +52,27 @@ fn nominal() -> Field {
 
 fn path_of(nominal: Field, correction: &Correction, points: u64) -> ToolPath {
     let wanted = Wanted::new(nominal, correction, 12.5).expect("finite");
-    // A track of 104 mm has some 450 points at 0.1 um.
+    // A track of 104 mm has about 450 points at 0.1 um.
     let track_mm = 60.0 * 450.0 / points as f64;
     let options = PathOptions::new(Wheel::Sphere { radius_mm: 12.5 }, track_mm, 1000.0);
     let outline = Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 100.0, height_mm: 60.0 };
     ToolPath::new(wanted, outline, options).expect("the wheel fits")
 }
 
-/// Lays the tracks and holds the wheel against the surface.
+/// Measures laying the tracks and placing the wheel against the surface.
 #[divan::bench(sample_count = 10)]
 fn lay(bencher: Bencher) {
     bencher.bench(|| path(black_box(1_000_000)));
 }
 
-/// Walks all tracks at once: largest and least of everything.
+/// Measures a walk over all tracks in parallel, for the maximum and minimum of every quantity.
 #[divan::bench(args = sizes(), sample_count = 5)]
 fn summary(bencher: Bencher, points: u64) {
     let path = path(points);
     bencher.counter(ItemsCount::new(points)).bench(|| path.summary());
 }
 
-/// The points one after the other, on one core.
+/// Measures the generation of the points in sequence, on one core.
 #[divan::bench(args = sizes(), sample_count = 5)]
 fn points(bencher: Bencher, points: u64) {
     let path = path(points);
@@ -84,7 +84,7 @@ fn points(bencher: Bencher, points: u64) {
     });
 }
 
-/// The points and their text, into a file.
+/// Measures the points and their text, written into a file.
 #[divan::bench(args = sizes(), sample_count = 3)]
 fn program(bencher: Bencher, points: u64) {
     let (path, folder) = (path(points), tempfile::tempdir().expect("a folder"));
@@ -120,7 +120,8 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
     write_program(file, &header, &dialect, summary, path).expect("a program");
 }
 
-/// All together: 28,476 deviations, their map, what they tell, the correction, the path and its program of a million points.
+/// Measures the whole chain: 28,476 deviations, their map, what the learning takes from them, the correction, the path
+/// and its program of a million points.
 #[divan::bench(sample_count = 5)]
 fn from_deviations_to_a_program(bencher: Bencher) {
     let folder = tempfile::tempdir().expect("a folder");

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use regrind::surface::DefinedSurface;
 
-/// The formula and the outline; recipes/biconic.toml states the same numbers for the simulator.
+/// Formula and outline of the surface. recipes/biconic.toml has the same numbers for the simulator.
 const SURFACE: &str = "\
 [surface]
 kind = 'biconic'

@@ -1,11 +1,13 @@
-//! How fast cycles come down to what the grinder cannot repeat, and how far: by gain, for every recipe.
+//! Convergence of the cycles to the repeatability floor of the grinder: how fast and how far, by gain, for every
+//! recipe.
 //!
 //! ```text
 //! cargo run --release --example convergence [SEEDS [PASSES [WAY]]]
 //! ```
-//! SEEDS (50) worlds are drawn for each recipe that ships with a truth, and PASSES (4) ground in each. Everything between the surfaces is as in a run: a ball that
-//! touches the true surface, registration, map, correction; only the wires are left out. WAY is the beginning of a line's name, where not all are wanted. The figure is written to
-//! `target/convergence/convergence.svg`.
+//! The program draws SEEDS (50) worlds for each recipe that ships with a truth, and grinds PASSES (4) passes in each.
+//! Everything between the surfaces is as in a run: a ball that touches the true surface, registration, map, correction.
+//! Only the communication with the machines is left out. WAY selects the lines whose names begin with it. The figure is
+//! written to `target/convergence/convergence.svg`.
 
 #[path = "../tests/run/study.rs"]
 mod study;
@@ -66,7 +68,7 @@ fn main() {
     plot.save_svg("target/convergence/convergence.svg".as_ref()).expect("the figure can be drawn and saved");
 }
 
-/// Root of the mean square over all runs of a part, over that of the floor, pass by pass.
+/// Returns, pass by pass, the root mean square over all runs of a part, divided by that of the floor.
 fn ratios(runs: &[Vec<Vec<After>>], part: usize) -> Vec<f64> {
     let mean = |pass: usize, of: fn(&After) -> f64| {
         (runs.iter().map(|run| of(&run[part][pass]).powi(2)).sum::<f64>() / runs.len() as f64).sqrt()
@@ -74,13 +76,15 @@ fn ratios(runs: &[Vec<Vec<After>>], part: usize) -> Vec<f64> {
     (0..runs[0][part].len()).map(|pass| mean(pass, |a| a.rms_um) / mean(pass, |a| a.floor_um)).collect()
 }
 
-/// The largest error of any end over that of its own beginning: above 1 a run would have ended worse than it began.
+/// Returns the largest ratio of the error at the end of a run to the error at its beginning. Above 1, a run ended worse
+/// than it began.
 fn worst_end(runs: &[Vec<Vec<After>>]) -> f64 {
     let ends = runs.iter().map(|run| run[0].last().expect("passes").rms_um / run[0][0].rms_um);
     ends.fold(0.0, f64::max)
 }
 
-/// By what factor one correction lowers what comes back: over all together, and in the worst run.
+/// Returns the factor by which one correction lowers the reproducible error: over all runs together, and in the worst
+/// run.
 fn taken_back(runs: &[Vec<Vec<After>>]) -> (f64, f64) {
     let sum = |pass: usize| runs.iter().map(|run| run[0][pass].repeatable_um.powi(2)).sum::<f64>();
     let each = runs.iter().map(|run| run[0][0].repeatable_um / run[0][1].repeatable_um);

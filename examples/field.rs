@@ -1,10 +1,11 @@
-//! What the model of the error says at some places, for other programs to compare with: benches/peers/model.py.
+//! Posterior of the error model at given places, as a reference for other programs: benches/peers/model.py.
 //!
 //! ```text
 //! cargo run --release --example field FILE
 //! ```
-//! FILE is JSON: `places`, `deviations_mm`, `effects` (a row a point, maybe empty), `asked`, `sigma_mm`, `range_mm`, `scatter_mm`. What is printed is JSON: means and
-//! standard uncertainties at the places asked for, the effects, and the milliseconds that it took.
+//! FILE is JSON: `places`, `deviations_mm`, `effects` (one row per point, possibly empty), `asked`, `sigma_mm`,
+//! `range_mm`, `scatter_mm`. The output is JSON: means and standard uncertainties at the places in `asked`, the
+//! effects, and the computing time in milliseconds.
 
 use nalgebra::DMatrix;
 use regrind::model::{DensePosterior, Field, Hyperparameters, Observed};

@@ -1,12 +1,14 @@
-//! How often what is said of a form is true: figures of simulated measurements, held against what was planted.
+//! Coverage of the intervals for form figures: simulated measurements compared with the planted truth.
 //!
 //! ```text
 //! cargo run --release --example intervals [PARTS [POINTS [WORD]]]
 //! ```
-//! PARTS (400) parts a line, each with a form, a place and a scatter of its own, touched at POINTS (400) of a free form of 60 x 40 mm with a scatter
-//! of 0.3 um. WORD chooses the lines that have it in their names. The figures are the RMS and the PV of the touched points and the PV 99.8 % of the
-//! aperture. Of 100 intervals of 95 % so many hold the truth, and so many lie below it; behind them stands the median of their widths,
-//! in the median of the true figures. The last two columns are the limits that are 5 % too low by which a part was accepted all the same, at a risk of 2.5 %.
+//! Each line simulates PARTS (400) parts, each with its own form, pose and noise. Each part is touched at POINTS (400)
+//! of a free form of 60 x 40 mm, with noise of 0.3 um. WORD selects the lines whose names contain it. The figures are
+//! the RMS and the PV of the touched points and the PV 99.8 % of the aperture. For each figure, the table gives the
+//! percentage of 95 % intervals that contain the truth and the percentage of intervals that lie below it.
+//! Then follows the median width of the intervals, relative to the median of the true figures. The last two columns
+//! give how often a part was accepted, at a risk of 2.5 %, against a limit that is 5 % below its true figure.
 
 use std::f64::consts::{PI, TAU};
 
@@ -25,20 +27,20 @@ const RADIUS_MM: f64 = 1.5;
 const SCATTER_MM: f64 = 3e-4;
 const HALF_MM: [f64; 2] = [30.0, 20.0];
 
-/// The planted form, with an RMS of 1.
+/// Planted form, with an RMS of 1.
 #[derive(Clone, Copy)]
 enum Truth {
-    /// Gaussian correlation of 20 mm.
+    /// Random field with a Gaussian correlation of 20 mm.
     Field,
     /// Zernike polynomials 4 to 15 over the circle around the part.
     Zernike,
-    /// One bump of 8 mm.
+    /// One bump, 8 mm wide.
     Bump,
-    /// Exponential correlation of 20 mm.
+    /// Random field with an exponential correlation of 20 mm.
     Exponential,
-    /// Waves of so many millimetres in any direction.
+    /// Waves in any direction, with this length in mm.
     Waves(f64),
-    /// Ridges of 4 mm.
+    /// Ridges, 4 mm wide.
     Ridges,
 }
 
@@ -58,7 +60,8 @@ enum Noise {
     Drift,
     Laplace,
     Student,
-    /// Two touches of a hundred are off by 10 to 100 times the scatter; those that are left out are made once more, with the same chance.
+    /// Two touches of a hundred are off by 10 to 100 times the noise. Each rejected touch
+    /// is repeated once, with the same chance.
     Outliers,
 }
 
@@ -145,7 +148,7 @@ fn nominal() -> Nominal {
     Nominal::from_points(grid.into_iter().map(Point::from).collect(), Projection::Auto).expect("a surface")
 }
 
-/// The true figures of a part and what was said of them.
+/// Returns the true figures of a part and the intervals that were estimated for them.
 fn told(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64, Interval); 3]> {
     let mut rng = regrind_sim::rng(1_000_000 + seed);
     let shape = FreeForm::default();
@@ -169,7 +172,8 @@ fn told(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64
         found = register(nominal, &cloud, &options).ok()?;
     }
     let told = Form::estimate(&found, &ModelInputs::default()).ok()?;
-    // The same part without scatter, where the registration found it: a tilt moves the feet, and over strong forms that is no effect of first order.
+    // The same part without noise, at the registered pose: a tilt moves the projections, and on strong forms this
+    // effect is not of first order.
     let held = Options { start: Start::Pose(found.cmm_from_model), locked: [true; 6], ..options };
     let true_at = |places: &[[f64; 2]]| {
         let cloud: Vec<Point> = places.iter().map(|place| touch((place, &[0.0; 3]))).collect();
@@ -183,7 +187,7 @@ fn told(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64
     let after_best_fit = |of: &[Deviation]| heights(of) - motions(of) * &moved;
     let left = after_best_fit(&touched);
     let rms = (left.norm_squared() / left.len() as f64).sqrt();
-    // The aperture: all that the points lie around.
+    // The aperture: the whole area that the points enclose.
     const ACROSS: usize = 160;
     let step_mm = 2.0 * HALF_MM[0] / ACROSS as f64;
     let reach_mm = (4.0 * HALF_MM[0] * HALF_MM[1] / places.len() as f64).sqrt();
@@ -266,7 +270,7 @@ fn uniforms(rng: &mut Rng, count: usize) -> Vec<f64> {
     (0..count).map(|k| (z[2 * k].atan2(z[2 * k + 1]) / TAU).rem_euclid(1.0)).collect()
 }
 
-/// Adds to each of the coordinates of a touch.
+/// Returns the noise that is added to each coordinate of a touch.
 fn scatter(noise: Noise, count: usize, rng: &mut Rng) -> Vec<Vec3> {
     const DRIFT: f64 = 0.7;
     let mut last = [0.0; 3];
@@ -279,9 +283,9 @@ fn scatter(noise: Noise, count: usize, rng: &mut Rng) -> Vec<Vec3> {
         let of = |k: usize| match noise {
             Noise::Normal => z[k],
             Noise::Drift => DRIFT * last[k] + (1.0 - DRIFT * DRIFT).sqrt() * z[k],
-            // A normal number times the root of an exponential one, and one over that of chi-squared.
+            // A normal number times the root of an exponential one, or divided by the root of a chi-squared one.
             Noise::Laplace => z[k] * ((z[k + 3].powi(2) + z[k + 6].powi(2)) / 2.0).sqrt(),
-            // Along the way of the touch.
+            // Along the direction of the touch.
             Noise::Outliers => z[k] + if k == 2 { off * z[3].signum() } else { 0.0 },
             Noise::Student => z[k] / (z[k + 3].powi(2) + z[k + 6].powi(2) + z[k + 9].powi(2)).sqrt(),
         };
@@ -291,7 +295,7 @@ fn scatter(noise: Noise, count: usize, rng: &mut Rng) -> Vec<Vec3> {
     (0..count).map(|_| one()).collect()
 }
 
-/// A form whose RMS at the places, after its mean is taken off, is given.
+/// Returns a form with the given RMS at the places, after its mean is subtracted.
 fn planted(truth: Truth, places: &[[f64; 2]], rms_mm: f64, rng: &mut Rng) -> Box<dyn Fn(f64, f64) -> f64> {
     if rms_mm == 0.0 {
         return Box::new(|_, _| 0.0);
@@ -330,7 +334,8 @@ fn planted(truth: Truth, places: &[[f64; 2]], rms_mm: f64, rng: &mut Rng) -> Box
             Box::new(move |x, y| (-(2.0f64.ln()) * ((x - at[0]).powi(2) + (y - at[1]).powi(2)) / 16.0).exp())
         }
         Truth::Exponential => {
-            // Plane waves whose numbers have the density of exp(-r / 20): the direction of three normal numbers.
+            // Plane waves whose wave numbers follow the spectral density of exp(-r / 20): the direction of three normal
+            // numbers.
             let waves: Vec<[f64; 3]> = (0..400)
                 .map(|_| {
                     let (z, u) = (normals(rng, 3), uniforms(rng, 1));
@@ -347,7 +352,7 @@ fn planted(truth: Truth, places: &[[f64; 2]], rms_mm: f64, rng: &mut Rng) -> Box
             Box::new(move |x, y| (c * x + s * y + phase).cos())
         }
         Truth::Ridges => {
-            // Three, each 4 mm wide at half of its height and as long as the part.
+            // Three ridges, each 4 mm wide at half of its height and as long as the part.
             let u = uniforms(rng, 6);
             let of: Vec<[f64; 3]> = (0..3)
                 .map(|k| {
@@ -366,7 +371,7 @@ fn planted(truth: Truth, places: &[[f64; 2]], rms_mm: f64, rng: &mut Rng) -> Box
     Box::new(move |x, y| form(x, y) * rms_mm / rms)
 }
 
-/// What a unit of each coordinate of the twist adds to the distance of each point from the surface.
+/// Returns the change in each point's distance from the surface per unit of each coordinate of the twist.
 fn motions(of: &[Deviation]) -> DMatrix<f64> {
     let rows: Vec<[f64; 6]> = of
         .iter()

@@ -1,8 +1,9 @@
-//! Makes a nominal surface and a measurement of a ground part to try the program on: target/example/nominal.csv and
-//! target/example/measured.csv.
+//! Makes a nominal surface and a measurement of a ground part as test input for the program: target/example/nominal.csv
+//! and target/example/measured.csv.
 //!
-//! The free form of 102 x 62 mm is 451,401 nominal points; its ground surface is off by 6.657 um PV; 28,476 centres of a probe of
-//! 1.5 mm radius are measured with 0.2 um of noise, the part placed 20, 10, 20 mm and 20, 20, 10 degrees off. Always the same.
+//! The free form of 102 x 62 mm has 451,401 nominal points. Its ground surface deviates by 6.657 um PV. The measurement
+//! has 28,476 centres of a probe with a radius of 1.5 mm and noise of 0.2 um. The part is displaced by 20, 10, 20 mm
+//! and 20, 20, 10 degrees. The output is the same every time.
 
 use std::error::Error;
 use std::path::Path;
@@ -34,11 +35,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Probe centres on the ground part, in the frame of the measuring machine.
+/// Returns the probe centres on the ground part, in the frame of the measuring machine.
 fn measure() -> Vec<Point> {
     let shape = FreeForm::default();
     let form = FormError::new(1, 30.0, FORM_PV_MM, FreeForm::WIDTH_MM, FreeForm::DEPTH_MM);
-    // A millimetre inside the edge, where the ball touches the part wherever it leans.
+    // A millimetre inside the edge, so that the ball touches the part at any slope.
     let at = |i: usize, n: usize, size: f64| (size - 2.0) * (i as f64 / (n - 1) as f64 - 0.5);
     let place = Placement::new([20.0, 10.0, 20.0], [20.0, 20.0, 10.0]);
     let mut centres: Vec<[f64; 3]> = (0..SCAN.0 * SCAN.1)

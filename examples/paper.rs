@@ -4,11 +4,12 @@
 //! cargo run --release --example paper
 //! ```
 //!
-//! The figures go to `target/paper/`. The picture in docs/figures.md was made by this and
-//! `cp target/paper/fig11b.svg docs/error-map.svg`.
+//! The figures are written to `target/paper/`. The picture in docs/figures.md was made by this program and `cp
+//! target/paper/fig11b.svg docs/error-map.svg`.
 //!
-//! The surface, its normals, the form errors and the contact of the probe come from `regrind-sim` in closed form, which shares
-//! no code with the registration. The paper's own part is not published; this one has its size, slopes and sampling.
+//! The surface, its normals, the form errors and the contact of the probe come from `regrind-sim` in closed form. That
+//! crate shares no code with the registration. The paper's own part is not published. The simulated part has its size,
+//! slopes and sampling.
 
 use std::error::Error;
 use std::f64::consts::TAU;
@@ -33,7 +34,8 @@ type Outcome<T = ()> = Result<T, Box<dyn Error>>;
 
 const PROBE_RADIUS_MM: f64 = 1.5;
 const CORRELATION_LENGTH_MM: f64 = 30.0;
-/// The measured area ends a probe's lateral offset inside the part's edge, so that form error cannot push a foot off it.
+/// Measured area, in mm. It ends inside the part's edge by the lateral offset of a probe, so that form error cannot
+/// push a projection over the edge.
 const MEASURED_MM: [f64; 2] = [101.9, 61.9];
 
 fn main() -> Outcome {
@@ -70,7 +72,7 @@ fn nominal((columns, rows): (usize, usize)) -> Outcome<Nominal> {
     Ok(Nominal::from_points(points.into_iter().map(Point::from).collect(), Projection::Auto)?)
 }
 
-/// The nodes of a grid over a rectangle centred on the origin, row by row, x fastest.
+/// Returns the nodes of a grid over a rectangle centred on the origin, row by row, x fastest.
 fn nodes(columns: usize, rows: usize, [width, depth]: [f64; 2]) -> Vec<[f64; 2]> {
     let at = |i: usize, n: usize, size: f64| size * (i as f64 / (n - 1) as f64 - 0.5);
     (0..rows).flat_map(|j| (0..columns).map(move |i| [at(i, columns, width), at(j, rows, depth)])).collect()
@@ -86,7 +88,7 @@ fn rms(values: impl Iterator<Item = f64>) -> f64 {
     (sum / count).sqrt()
 }
 
-/// Figures 4 and 5: the surface, its slope and its Gaussian curvature.
+/// Draws figures 4 and 5: the surface, its slope and its Gaussian curvature.
 fn shape_of_the_surface(figures: &Path) -> Outcome {
     heading("section 3: the surface");
     let shape = FreeForm::default();
@@ -122,9 +124,9 @@ fn shape_of_the_surface(figures: &Path) -> Outcome {
     Ok(())
 }
 
-/// One place in each cell of a grid over the part, evenly spread over all positions within a cell.
+/// Returns one place in each cell of a grid over the part, evenly distributed over all positions within a cell.
 fn places_in_cells(columns: usize, rows: usize) -> Vec<[f64; 2]> {
-    // Steps of the plastic number: the most even sequence known in two dimensions.
+    // Steps of the plastic number (R2 sequence): the most even sequence known in two dimensions.
     let within = |k: usize, step: f64| (0.5 + k as f64 * step).fract();
     let at = |i: usize, t: f64, n: usize, size: f64| size * ((i as f64 + t) / n as f64 - 0.5);
     (0..columns * rows)
@@ -135,11 +137,11 @@ fn places_in_cells(columns: usize, rows: usize) -> Vec<[f64; 2]> {
         .collect()
 }
 
-/// Section 3.1, figure 6: the distance of points whose distance is known.
+/// Repeats section 3.1 and figure 6: computes the distance of points whose distance is known.
 ///
-/// The points stand anywhere within the cells of the grid, one in each; on its nodes every distance would be exact.
-/// What flat triangles miss grows with the curvature and the square of the spacing, and depends on where in a cell a point
-/// stands, which the paper does not say of its own.
+/// There is one point in each cell of the grid, at any position within it. On the nodes of the grid every distance
+/// would be exact. The error of flat triangles grows with the curvature and with the square of the spacing. It depends
+/// on the position of a point in its cell, which the paper does not give for its own points.
 fn validity_of_the_distance(figures: &Path) -> Outcome {
     heading("section 3.1: validity of the distance, grid of 1021 x 1241 points");
     let shape = FreeForm::default();
@@ -184,7 +186,7 @@ fn validity_of_the_distance(figures: &Path) -> Outcome {
     Ok(())
 }
 
-/// A misalignment of section 3.2: name, shifts in millimetres, rotations in degrees.
+/// Misalignment of section 3.2: name, shifts in millimetres, rotations in degrees.
 type Misalignment = (&'static str, [f64; 3], [f64; 3]);
 
 const MISALIGNMENTS: [Misalignment; 8] = [
@@ -198,7 +200,7 @@ const MISALIGNMENTS: [Misalignment; 8] = [
     ("all, negated", [-20.0, -10.0, -20.0], [-20.0, -20.0, -10.0]),
 ];
 
-/// The method as it stands in the paper: from the identity, on a known side, every point counted.
+/// Returns the options of the method as the paper describes it: start from the identity, known side, every point used.
 fn as_in_the_paper(distance: Distance) -> Options {
     Options {
         start: Start::Pose(Pose::identity()),
@@ -209,7 +211,7 @@ fn as_in_the_paper(distance: Distance) -> Options {
     }
 }
 
-/// Section 3.2, figures 7 and 8: every fourth point of both directions of the offset surface, misaligned.
+/// Repeats section 3.2 and figures 7 and 8: every fourth point, in both directions, of the offset surface, misaligned.
 fn robustness(nominal: &Nominal, figures: &Path) -> Outcome {
     heading("section 3.2: robustness against misalignment, from the identity");
     let places = nodes(226, 126, [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM]);
@@ -253,27 +255,27 @@ fn in_short(found: &Registration) -> String {
     format!("{:.1e} ({}, {rises})", 1e6 * found.verdict.pv_mm, found.verdict.iterations)
 }
 
-/// The objective before any step: eq. (7) at the identity.
+/// Returns the objective before any step, in mm²: eq. (7) at the identity.
 fn objective_mm2(nominal: &Nominal, measured: &[Point], distance: Distance) -> Outcome<f64> {
     let surface = OffsetSurface::new(nominal, PROBE_RADIUS_MM, Side::Normal)?.with_distance(distance);
     Ok(measured.iter().map(|p| surface.foot(p, Place::UNKNOWN).distance_mm.powi(2)).sum())
 }
 
-/// A ground part on the machine: what was planted, and what the probe reports.
+/// Simulated measurement of a ground part on the machine: the planted truth, and the points that the probe reports.
 struct Measurement {
-    /// Where it was touched, in the model frame.
+    /// Touched places, in the model frame.
     places: Vec<[f64; 2]>,
-    /// The form error there, in millimetres.
+    /// Form error at these places, in millimetres.
     planted_mm: Vec<f64>,
-    /// The planted pose.
+    /// Planted pose.
     cmm_from_model: Pose,
     /// Probe centres in the frame of the machine.
     centres: Vec<Point>,
-    /// Where the probe's axis met the ground surface, S + e n, in the frame of the machine.
+    /// Points where the probe's axis met the ground surface, S + e n, in the frame of the machine.
     contacts: Vec<Point>,
 }
 
-/// The rotation and translation of eq. (17), as angles about x, y and z.
+/// Returns the rotation and translation of eq. (17), as angles about x, y and z, and as a pose.
 fn misaligned() -> (Placement, Pose) {
     let translation_mm = [-0.068_855_10, 0.065_761_94, 0.195_463_77];
     let angles_deg = [-8.0055, 1.1274, -0.1656].map(|mrad: f64| mrad * 360.0 / (1e3 * TAU));
@@ -296,10 +298,12 @@ fn measure(error: &FormError) -> Measurement {
     Measurement { places, planted_mm, cmm_from_model, centres, contacts }
 }
 
-/// What the best fit must find, from the planted error alone: the rigid motion in it, and the map that is left.
+/// Computes the result that the best fit must find, from the planted error alone: the rigid motion in it, and the
+/// remaining map.
 ///
-/// A fit cannot tell a shift or a tilt of the error from one of the part. The motion is the least-squares twist of the linear
-/// model n.(v + w x s) on the exact normals; at a few micrometres its second order is below a nanometre.
+/// A fit cannot distinguish a shift or a tilt of the error from one of the part. The motion is the least-squares twist
+/// of the linear model n.(v + w x s) on the exact normals. At a few micrometres its second-order terms are below a
+/// nanometre.
 fn best_fit(measured: &Measurement) -> Option<(Twist, Vec<f64>)> {
     let shape = FreeForm::default();
     let rows: Vec<Vector6<f64>> = measured
@@ -321,10 +325,11 @@ fn best_fit(measured: &Measurement) -> Option<(Twist, Vec<f64>)> {
     Some((twist, left))
 }
 
-/// Section 4, figure 11: the first grinding and the compensated one, each measured and registered.
+/// Repeats section 4 and figure 11: measures and registers the first grinding and the compensated one.
 fn corrective_grinding(nominal: &Nominal, figures: &Path) -> Outcome<(Measurement, Registration)> {
     heading("section 4: corrective grinding, misaligned as in eq. (17)");
-    // Shorter waves are left after the correction: it takes away what it can follow.
+    // The planted error has no shorter waves: those would remain after the correction, which removes only what it can
+    // follow.
     let before = measure(&ground(11, CORRELATION_LENGTH_MM, 27.3e-3)?);
     let first = registered(nominal, &before, "before correction", ["27.3", "-"])?;
     let after = measure(&ground(3, 10.0, 6.9e-3)?);
@@ -338,8 +343,8 @@ fn corrective_grinding(nominal: &Nominal, figures: &Path) -> Outcome<(Measuremen
     Ok((after, second))
 }
 
-/// A form error of which the best fit leaves a given peak to valley; the rest is shift and tilt, which no fit can tell from
-/// those of the part.
+/// Returns a form error that has the given peak to valley after the best fit. The rest is shift and tilt, which no fit
+/// can distinguish from those of the part.
 fn ground(seed: u64, correlation_length_mm: f64, pv_left_mm: f64) -> Outcome<FormError> {
     let of = |pv_mm| FormError::new(seed, correlation_length_mm, pv_mm, FreeForm::WIDTH_MM, FreeForm::DEPTH_MM);
     let (_, left) = best_fit(&measure(&of(pv_left_mm))).ok_or("the part has a symmetry")?;
@@ -378,8 +383,8 @@ fn shift_and_turn(twist: &Twist) -> String {
     format!("{shift_um:.4}, {turn_urad:.4}")
 }
 
-/// What section 1 advises against: centres drawn to the closest points of the offset cloud (Besl and McKay, 1992). The two
-/// sampling grids slide along each other.
+/// Repeats the method that section 1 advises against: pairs the centres with the closest points of the offset cloud
+/// (Besl and McKay, 1992). The two sampling grids slide along each other.
 fn closest_points(nominal: &Nominal, (measured, after): &(Measurement, Registration)) -> Outcome {
     const MOST_TURNS: usize = 500;
     heading("section 1: centres to the closest points of the offset cloud");
@@ -414,7 +419,7 @@ fn closest_points(nominal: &Nominal, (measured, after): &(Measurement, Registrat
     Ok(())
 }
 
-/// A point in the form that the tree of closest points takes.
+/// Point in the form that the tree of closest points requires.
 #[derive(Default)]
 struct Entry([NotNan<f64>; 3]);
 
@@ -436,7 +441,7 @@ impl nabo::Point<f64> for Entry {
     }
 }
 
-/// Eq. (18), figure 12a: the contact points found are already at rest on the nominal surface.
+/// Repeats eq. (18) and figure 12a: the contact points found are already aligned with the nominal surface.
 fn equivalence(nominal: &Nominal, (measured, after): &(Measurement, Registration), figures: &Path) -> Outcome {
     heading("eq. (18): contact points, registered to the nominal surface");
     let contacts: Vec<Point> = after.deviations.iter().map(|d| d.point).collect();
@@ -455,7 +460,7 @@ fn equivalence(nominal: &Nominal, (measured, after): &(Measurement, Registration
         format!("{:.1e}", 1e6 * maps_apart(&found, after)),
     );
     row("length of the one step tried / rad and cloud sizes (taken)", "-", steps(&found));
-    // What eq. (6) calls the second-order error shows against the contact points that only the simulation knows.
+    // The second-order error of eq. (6) is visible only against the true contact points, which only the simulation has.
     let truly = register(nominal, &measured.contacts, &options)?;
     row(
         "true contact points: map against that of the centres, PV / nm",
@@ -474,14 +479,14 @@ fn steps(found: &Registration) -> String {
     if steps.is_empty() { "none to try".into() } else { steps.join(", ") }
 }
 
-/// PV of the difference of two maps, over the points that both used.
+/// Returns the PV of the difference of two maps, over the points that both used.
 fn maps_apart(a: &Registration, b: &Registration) -> f64 {
     let used = |(a, b): &(&Deviation, &Deviation)| a.status == PointStatus::Used && b.status == PointStatus::Used;
     pv(a.deviations.iter().zip(&b.deviations).filter(used).map(|(a, b)| a.deviation_mm - b.deviation_mm))
 }
 
-/// Figure 12b: the radius subtracted from distances to the nominal surface (Xiong and Li), the triangle looked up below the
-/// centre.
+/// Repeats figure 12b: subtracts the radius from distances to the nominal surface (Xiong and Li), with the triangle
+/// looked up below the centre.
 fn subtracting_the_radius(
     nominal: &Nominal,
     (measured, after): &(Measurement, Registration),

@@ -1,11 +1,13 @@
-//! Parameters of the machine in many worlds: how often they are told within their uncertainty, and what it saves to take them back.
+//! Machine parameters in many worlds: how often their estimates are right within their uncertainty, and how much it
+//! saves to compensate them.
 //!
 //! ```text
 //! cargo run --release --example parameters [WORLDS [FIRST [RECIPE]]]
 //! ```
-//! WORLDS (200) worlds from seed FIRST (1) on, of RECIPE (freeform-mirror), whose wheel, setting and part are off as `tests/run/told_apart.rs` states: by free
-//! registration, by a datum that holds x, y and z, and by one that holds the tilts. Every part is made twice from the same blank on the same machines, with parameters and by the
-//! map alone.
+//! The program runs WORLDS (200) worlds from seed FIRST (1) on, of RECIPE (freeform-mirror). Wheel, setting and part
+//! have the errors that `tests/run/told_apart.rs` states. There are three registrations: free, with x, y and z locked,
+//! and with the tilts locked. Every part is made twice from the same blank on the same machines: with parameters, and
+//! by the map alone.
 
 #[path = "../tests/run/study.rs"]
 mod study;

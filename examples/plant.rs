@@ -1,15 +1,18 @@
-//! How a plant of many cells holds up: how fast records are shipped, what a thousand cells leave, and how long its page asks.
+//! Load test of a plant of many cells: speed of replicating records, size of the data of a thousand cells, and duration
+//! of the page's queries.
 //!
 //! ```text
 //! cargo run --release --features plant --example plant -- ship OWNER.toml RUN [CELLS [RUNS]]
 //! cargo run --release --features plant --example plant -- fill OWNER.toml RUN [CELLS [RUNS [WITH_RECORDS [REPEATED]]]]
 //! ```
-//! OWNER.toml is the plant file of the owner of a database that `regrind plant init` has laid out; it is for this alone, and stays full.
-//! RUN is the folder of a finished run, whose records every run here repeats: chained anew, under another name, for another part and day.
-//! `ship` lays RUNS runs (20) into the folders of CELLS cells (8), and ships all of them at once by the roles of these cells. `fill` puts
-//! RUNS runs (518,000: 10^8 records of the shipped free-form mirror) of CELLS cells (1,000) into the tables of runs and cycles, and the
-//! records of the first WITH_RECORDS (50,000) of them into theirs. The server puts those of the first run into the REPEATED (0) runs that
-//! follow, with other hashes: as many bytes, in a tenth of the time, and no chain.
+//! OWNER.toml is the plant file of the owner of a database that `regrind plant init` has laid out. Use a database for
+//! this test only: the data remain in it. RUN is the folder of a finished run. Every run here repeats its records, in a
+//! new hash chain, under another name, for another part and day. `ship` writes RUNS runs (20) into the folders of CELLS
+//! cells (8), and ships all of them at once by the roles of these cells. `fill` writes RUNS runs (518,000: 10^8 records
+//! of the shipped free-form mirror) of CELLS cells (1,000) into the tables of runs and cycles, and the records of the
+//! first WITH_RECORDS (50,000) of them into the table of records. The server copies the records of the first run into
+//! the REPEATED (0) runs that follow, with other hashes: the same number of bytes in a tenth of the time, but no valid
+//! chain.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -37,7 +40,7 @@ async fn main() {
     }
 }
 
-/// A finished run, which others are made like.
+/// Finished run, the pattern for the other runs.
 struct Like {
     folder: PathBuf,
     records: Vec<Record>,
@@ -49,7 +52,7 @@ impl Like {
         Self { folder: folder.to_owned(), records: reader.records(1).map(Result::unwrap).collect() }
     }
 
-    /// The same records of a run of another name, part and day, in a chain of their own; nobody has signed it.
+    /// Returns the same records for a run with another name, part and day, in their own chain and without signatures.
     fn again(&self, name: &str, part: &str, days: usize) -> Vec<Record> {
         let mut head = "0".repeat(64);
         let day = |utc: &str| {
@@ -78,7 +81,7 @@ impl Like {
         again.collect()
     }
 
-    /// Lays such a run into a folder of runs, with its files.
+    /// Writes a run with this name into a folder of runs, with its files.
     fn lay(&self, runs: &Path, name: &str, part: &str) -> usize {
         let records = self.again(name, part, 0);
         let folder = runs.join(name);
@@ -143,7 +146,7 @@ async fn fill(
     let text = "INSERT INTO cell (name, role) SELECT 'cell-' || n, 'cell_' || n FROM generate_series(1, $1) n ON CONFLICT DO NOTHING";
     link.ask(text, &[&(cells as i32)]).await.unwrap();
     let first = link.ask("SELECT coalesce(max(id), 0) FROM run", &[]).await.unwrap()[0].get::<_, i32>(0);
-    // Some 500 parts of a thousand cells in an hour; a fifth of the recipes is made much more often than the others.
+    // About 500 parts of a thousand cells in an hour. A fifth of the recipes is made much more often than the others.
     let text = "WITH made AS (
             INSERT INTO run (cell, name, part, part_name, recipe, recipe_sha256, operator, simulation, began, ended, result, verdict, pv_limit_um,
                 rms_limit_um, grinder, cmm, wheel, probe, alarms, cycles, pv_um, pv_u_um, rms_um, rms_u_um, records)

@@ -1,12 +1,12 @@
-//! What one machine has learned of a recipe, for another's first part of it: how near the floor its first pass comes, and whether it is ever the worse
-//! for it.
+//! Transfer of learning between machines: how near the floor the first pass of a second machine comes with the
+//! knowledge of a first one, and whether that knowledge ever makes it worse.
 //!
 //! ```text
 //! cargo run --release --example shared [WORLDS [FIRST [PARTS [DIFFER]]]]
 //! ```
-//! WORLDS (200) worlds from number FIRST (1) are drawn for each way in which machines differ, in turn for each recipe that ships with a truth. Both machines know
-//! one other recipe, the next of the list. The first machine has made PARTS (2) of the recipe. DIFFER is the beginning of a line's name, where not all are
-//! wanted.
+//! The program draws WORLDS (200) worlds from number FIRST (1) on for each way in which machines differ, in turn for
+//! each recipe that ships with a truth. Both machines have experience with one other recipe, the next of the list. The
+//! first machine has made PARTS (2) of the recipe. DIFFER selects the lines whose names begin with it.
 
 #[path = "../tests/run/study.rs"]
 mod study;
@@ -15,7 +15,7 @@ use rayon::prelude::*;
 use study::others::{Differ, Pair, TAUGHT_BY, Taught};
 use study::{After, Bench, RECIPES};
 
-/// The first pass is to come within this factor of the floor.
+/// Maximum ratio of the first pass to the floor.
 const MOST: f64 = 1.3;
 
 fn main() {
@@ -91,13 +91,14 @@ fn print_line(name: &str, all: &[Taught]) {
     println!();
 }
 
-/// Root of the mean square over all worlds, over that of the floor.
+/// Returns the root mean square over all worlds, divided by that of the floor.
 fn together(all: &[Taught], after: impl Fn(&Taught) -> &After) -> f64 {
     let sum = |of: fn(&After) -> f64| all.iter().map(|world| of(after(world)).powi(2)).sum::<f64>();
     (sum(|a| a.rms_um) / sum(|a| a.floor_um)).sqrt()
 }
 
-/// What the first pass would come to where everything were known of the first machine, and that is taken for the second.
+/// Returns the ratio that the first pass would have if everything about the first machine were known and used for the
+/// second.
 fn apart(all: &[Taught]) -> f64 {
     let floor2: f64 = all.iter().map(|world| world.with[0].floor_um.powi(2)).sum();
     let apart2: f64 = all.iter().map(|world| world.apart_um.powi(2)).sum();

@@ -1,11 +1,12 @@
-//! What touches that are chosen see of what nobody expects: a step, a scratch, a chip and a lump, planted on good parts.
+//! Detection of unexpected defects by chosen touches: a step, a scratch, a chip and a lump, planted on good parts.
 //!
 //! ```text
 //! cargo run --release --example surprises [WORLDS [FIRST [LIMITS]]]
 //! ```
-//! WORLDS (200) parts of the shipped free-form recipe from seed FIRST (1) on, each with one of them and limits that are LIMITS (1.0) times those
-//! of the recipe, measured batch by batch until enough is known. Found is
-//! what the map has at least half of, or what every target is touched for.
+//! The program plants one defect on each of WORLDS (200) parts of the shipped free-form recipe, from seed FIRST (1) on,
+//! with limits that are LIMITS (1.0) times those of the recipe. It measures batch by batch until the stopping rule ends
+//! the measurement. A defect counts as found if the map has at least half of it, or if every target is touched because
+//! of it.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -22,12 +23,12 @@ use regrind_sim::shape::{FreeForm, Shape};
 
 const RADIUS_MM: f64 = 1.5;
 const SCATTER_MM: f64 = 3e-4;
-/// What a good pass of the recipe leaves, and how wide it is.
+/// RMS and correlation length of the form that a good pass of the recipe leaves, in mm.
 const FORM_MM: [f64; 2] = [4e-4, 15.0];
 const HALF_MM: [f64; 2] = [50.5, 30.5];
 const PATTERN: [usize; 2] = [60, 30];
 
-/// Something narrow that stands on a part, or is missing of it: where, as it is turned there, how large, how high.
+/// Narrow defect of a part, raised or missing: position, orientation, size and height.
 struct Surprise {
     at_mm: [f64; 2],
     turned_rad: f64,
@@ -43,7 +44,7 @@ impl Surprise {
     }
 }
 
-/// How each kind is planted by four numbers from 0 to 1.
+/// Function that plants a kind of defect from four numbers from 0 to 1.
 type Planted = fn([f64; 4]) -> Surprise;
 
 const KINDS: [(&str, Planted); 4] = [
@@ -73,14 +74,14 @@ const KINDS: [(&str, Planted); 4] = [
     }),
 ];
 
-/// What was seen of one part.
+/// Result of the measurement of one part.
 struct Seen {
     touches: usize,
-    /// Targets of the pattern that the surprise covers, and touches of them.
+    /// Targets of the pattern that the defect covers, and touches of them.
     covered: usize,
     hit: usize,
     found: bool,
-    /// Whether the part is within its limits with it, and whether it was taken for that though it is not.
+    /// True if the part with the defect is within its limits; true if it was accepted although it is not.
     conforms: bool,
     is_wrong: bool,
 }
@@ -127,7 +128,7 @@ fn targets(shape: &FreeForm) -> Vec<(Point, Vector)> {
     (0..columns * rows).map(place).map(target).collect()
 }
 
-/// Plants, and measures batch by batch until enough is known.
+/// Plants a defect, and measures batch by batch until the stopping rule ends the measurement.
 fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, seed: u64) -> Seen {
     let mut rng = regrind_sim::rng(seed);
     let form = FormError::with_rms(&mut rng, FORM_MM[1], FORM_MM[0]);
@@ -155,7 +156,7 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
         ModelInputs { look_risk: adaptive.look_risk(), probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() };
     let mut tried = vec![None; targets.len()];
     let mut touched: Vec<usize> = Vec::new();
-    // As in a run: ten for the gates, then so many that a look says something.
+    // As in a run: ten for the gates, then enough for a first stopping decision.
     let fewest = farthest_points(&targets, MIN_TOUCHES);
     let mut next = fewest[FIRST_BATCH..].to_vec();
     fewest[..FIRST_BATCH].iter().for_each(|&k| tried[k] = Some(0));
@@ -171,7 +172,7 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
         if decision.next.is_empty() {
             let all: Vec<usize> = (0..targets.len()).filter(|&k| covers(k)).collect();
             let hit = touched.iter().filter(|&&k| covers(k)).count();
-            // What would be seen of it by the whole pattern without scatter, and of the part without it.
+            // The defect as the whole pattern without noise would show it, and the part without it.
             let planted = after_best_fit(&targets, |k| if covers(k) { surprise.height_mm } else { 0.0 });
             let without = after_best_fit(&targets, |k| form.height(targets[k].0.x, targets[k].0.y));
             let mean = |of: &dyn Fn(usize) -> f64| all.iter().map(|&k| of(k)).sum::<f64>() / all.len().max(1) as f64;
@@ -194,7 +195,7 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
     unreachable!()
 }
 
-/// RMS, and PV without the outermost 0.1 % at either end.
+/// Returns the RMS, and the PV without the outermost 0.1 % at either end.
 fn figures_mm(form: &DVector<f64>) -> (f64, f64) {
     let mut sorted: Vec<f64> = form.iter().copied().collect();
     sorted.sort_by(f64::total_cmp);
@@ -202,7 +203,7 @@ fn figures_mm(form: &DVector<f64>) -> (f64, f64) {
     ((form.norm_squared() / n as f64).sqrt(), sorted[n - 1 - left_out] - sorted[left_out])
 }
 
-/// Heights at all targets after their own best fit.
+/// Returns the heights at all targets after their own best fit.
 fn after_best_fit(targets: &[(Point, Vector)], height_mm: impl Fn(usize) -> f64) -> DVector<f64> {
     let motions = DMatrix::from_fn(targets.len(), 6, |r, c| {
         let (at, n) = targets[r];

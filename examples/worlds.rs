@@ -1,10 +1,10 @@
-//! What it takes to make a part, in many worlds: touches, hours and what comes of them, by the whole pattern and by touches that are chosen.
+//! Cost of making a part in many worlds: touches, hours and results, with the whole pattern and with chosen touches.
 //!
 //! ```text
 //! cargo run --release --example worlds [WORLDS [FIRST [LIMITS [RECIPE]]]]
 //! ```
-//! WORLDS (50) worlds for each recipe that ships with one, from seed FIRST (1) on, with limits that are LIMITS (1.0) times those
-//! of the recipe; every part is made twice, from the same blank on the same machines.
+//! The program runs WORLDS (50) worlds for each recipe that ships with one, from seed FIRST (1) on, with limits that
+//! are LIMITS (1.0) times those of the recipe. Every part is made twice, from the same blank on the same machines.
 
 #[path = "../tests/run/study.rs"]
 mod study;

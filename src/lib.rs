@@ -1,7 +1,7 @@
 //! Regrind closes the loop of a precision grinding cell: a free-form part is ground, measured, registered to the offset of
 //! its nominal surface, corrected and ground again until it is accepted.
 //!
-//! A pure machine decides, thin drivers act, a pure numerical core computes, and everything that happened is in one journal.
+//! A pure state machine decides, thin drivers act, a pure numerical core computes, and one journal records every event.
 //!
 //! ```text
 //!  recipe.toml -> recipe --+                                             +-> formats, report
@@ -15,12 +15,13 @@
 //!  pure: geometry, surface, measuring, registration, compensation, form, cell: no file, no clock, no randomness, no logging
 //! ```
 //!
-//! Each room knows as little as it can: `cell` knows no point, `registration` no machine, `device` no recipe; `sim`, a crate
-//! of its own at the far end of the wires, knows no type of this one. Only `cli` prints or exits; only `journal`, `formats` and
-//! `report` write files.
+//! Each module knows as little as possible: `cell` knows no points, `registration` no machines, `device` no recipes.
+//! `sim` is a separate crate at the far end of the wires and knows no type of this crate. Only `cli` prints or exits.
+//! Only `journal`, `formats` and `report` write files.
 //!
-//! Conventions: millimetres, radians, seconds. Frames are the model's {M} and the CMM's {W}; a pose is named for what it does,
-//! `cmm_from_model`. A deviation is positive where material stands proud, along the outward normal, the probe's side.
+//! Conventions: millimetres, radians, seconds. Frames are the model frame {M} and the CMM frame {W}. The name of a pose
+//! states its mapping: `cmm_from_model`. A deviation is positive where there is too much material, along the outward
+//! normal, towards the probe.
 
 pub use regrind_cell as cell;
 pub use regrind_core::{compensation, form, geometry, measuring, model, registration, surface};
@@ -35,7 +36,7 @@ pub mod drive;
 pub mod recipe;
 pub mod setup;
 
-/// The example of the README is run as a test.
+/// Runs the example of the README as a doc test.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]
 struct Readme;

@@ -1,4 +1,4 @@
-//! The program `regrind`: arguments -> a command -> an exit code.
+//! Program `regrind`: parses arguments, runs a command, returns an exit code.
 
 mod cli;
 

@@ -1,6 +1,7 @@
-//! From a recipe and a cell file to what a run needs: the nominal surface, the targets, the limits, the settings of the wires.
+//! Builds what a run needs from a recipe and a cell file: the nominal surface, the targets, the limits, the settings of
+//! the wires.
 //!
-//! Recipe and cell file are checked each by itself; what only shows when both are seen together is found here.
+//! Recipe and cell file are each checked separately. This module finds the errors that only the two together show.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -27,7 +28,7 @@ use crate::recipe::{Leaning, Mode, NominalSource, Pattern, Recipe, SpindleAxis, 
 use crate::registration::{Coordinate, MapLimits};
 use crate::surface::{DefinedSurface, DefinitionError, Nominal, Projection, Side, SurfaceError};
 
-/// Why a recipe and a cell do not make a run.
+/// Reason why a recipe and a cell cannot make a run.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
 #[non_exhaustive]
@@ -84,26 +85,28 @@ pub enum SetupError {
     Machine { cell: PathBuf, source: MakingError },
 }
 
-/// How long a machine without a wire may take, with the person who serves it.
+/// Timeout of a job of a machine that a person serves without a wire.
 const WAIT_FOR_PEOPLE: Duration = Duration::from_secs(7 * 86_400);
-/// How long a person may take to hold or to stop a machine and to come back and say so.
+/// Timeout for a person to hold or to stop a machine and to confirm it.
 const WAIT_FOR_STILL: Duration = Duration::from_secs(600);
-/// What stands for such a machine, perhaps a folder on another computer, answers within this, a large file read included.
+/// Timeout of the stand-in for a machine without a wire, for example a folder on another computer. It includes the
+/// reading of a large file.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(90);
-/// Registers of a target in a plan, in bytes; a point of a result takes less.
+/// Size of one target in the registers of a plan, in bytes. A point of a result is smaller.
 const LARGEST_TARGET: usize = 56;
-/// A transfer may take so many times what it takes when nothing goes wrong.
+/// Factor between the timeout of a transfer and its duration without faults.
 const TRANSFER_ROOM: f64 = 3.0;
-/// And is looked at no more often than this.
+/// Minimum time between two polls during a slow transfer.
 const SLOW_POLL: Duration = Duration::from_millis(250);
-/// Share of the tolerances, of RMS and of PV, that scallops take at most where the distance of the tracks is chosen by them, and above which
-/// they are warned of. Of an RMS a fifth in quadrature is 2 %; of a PV it is a fifth.
+/// Maximum share of the tolerances, of RMS and of PV, that scallops take if they determine the track distance. A larger
+/// share causes a warning. A fifth of an RMS adds 2 % in quadrature; a fifth of a PV adds a fifth.
 pub const SCALLOP_SHARE: f64 = 0.2;
 
-/// Makes what a run computes from, and what its cell decides by.
+/// Builds the task, from which a run computes, and the plan, by which its cell decides.
 ///
 /// # Errors
-/// A nominal surface or a pattern that cannot be had, and limits of the cell that the recipe goes beyond.
+/// Returns an error if the nominal surface or the pattern is not available, or if the recipe exceeds the limits of the
+/// cell.
 pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), SetupError> {
     let (nominal, nominal_file, part_identity) = nominal(recipe)?;
     let side = recipe.measure.side.given().unwrap_or_default();
@@ -180,7 +183,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
     Ok((task, plan))
 }
 
-/// Which parameters of the machine are taken back, with the surface under the nodes of a correction.
+/// Returns the machine parameters that are compensated, with the contact points under the nodes of a correction.
 fn taken_back(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -193,13 +196,14 @@ fn taken_back(
         .map_err(|source| SetupError::Tracks { recipe: recipe.path().to_owned(), source: source.clone() })?;
     let Pass { x_mm, y_mm, .. } = pass(recipe, nominal, [0; 32], 1.0);
     let grid = correction_grid([x_mm, y_mm], recipe.compensation.spacing_mm);
-    // A program moves the centre of the wheel along the normals; a grinder with a path of its own is guided in height.
+    // A program moves the centre of the wheel along the normals. A grinder with its own path is guided in height.
     let is_program = cell.grinder.link.wire.works_from_run();
     let wheel_term = if is_program { WheelTerm::AlongNormal } else { WheelTerm::InHeight };
     Ok(Some(TakenBack { tolerances: parameters.tolerances(), wheel_term, nodes: Contact::under(field, &grid) }))
 }
 
-/// Standard uncertainty of where the fixture holds the part, and of how it is turned: as much at its edge.
+/// Returns the standard uncertainty of the fixture's position in mm, and of its rotation in rad. The rotation moves the
+/// edge of the part by the same amount. The recipe states the expanded uncertainty (k = 2).
 fn datum(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
     let Pass { x_mm, y_mm, .. } = pass(recipe, nominal, [0; 32], 1.0);
     let half_mm = [x_mm, y_mm].map(|[low, high]| 0.5 * (high - low));
@@ -207,20 +211,20 @@ fn datum(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
     Some([shift_mm, shift_mm / half_mm[0].max(half_mm[1])])
 }
 
-/// What a measurement goes by whose touches are chosen.
+/// Returns the settings of a measurement with chosen touches.
 fn adaptive(recipe: &Recipe) -> Option<Adaptive> {
     let accepted_risk = recipe.measuring.accepted_risk.filter(|_| recipe.measuring.mode == Mode::Adaptive)?;
     Some(Adaptive { tolerance: tolerance(recipe), accepted_risk, most_cycles: u32::from(recipe.cycle.most_cycles) })
 }
 
-/// The share of a plan's targets that must be found.
+/// Returns the minimum share of a plan's targets that must be found.
 fn least_found(recipe: &Recipe) -> f64 {
-    // One of the first touches may miss; the gate that counts them all is the task's.
+    // One of the first touches can miss. The task checks the share of all touches.
     let share = if recipe.measuring.mode == Mode::Adaptive { Adaptive::ONE_MAY_MISS } else { 1.0 };
     share * recipe.measure.minimum_coverage
 }
 
-/// What is accepted.
+/// Returns the acceptance limits.
 fn tolerance(recipe: &Recipe) -> Tolerance {
     let limit = |um: Option<Um>| um.map_or(f64::INFINITY, Um::mm);
     Tolerance {
@@ -232,10 +236,10 @@ fn tolerance(recipe: &Recipe) -> Tolerance {
     }
 }
 
-/// Returns how long so many bytes may take over the line of a machine, with room for it to be sent anew.
+/// Returns the timeout for the transfer of `bytes` over the line of a machine, with a margin for retries.
 fn transfer_within(link: &Link, bytes: usize) -> Duration {
     let Some((Line::Rtu { baud, .. }, _)) = link.wire.line() else { return Duration::ZERO };
-    // A page has 224 bytes of data in a frame of 249, is answered by 8, and the machine takes some time for it.
+    // A page has 224 bytes of data in a frame of 249 and a response of 8. The machine needs some time for each page.
     let pages = bytes.div_ceil(224) as f64;
     let page_s = (249.0 + 8.0) * 11.0 / f64::from(baud.max(1)) + 0.05;
     Duration::from_secs_f64(TRANSFER_ROOM * pages * page_s)
@@ -253,17 +257,19 @@ fn map_options(recipe: &Recipe) -> MapOptions {
     }
 }
 
-/// Says what a run has to have in common with another to learn from it: the cell, the part, and how it is ground, looked at and corrected.
+/// Returns the text of all settings that two runs must share so that one can learn from the other: the cell, the part,
+/// and the settings of grinding, measuring and compensation.
 fn setting(recipe: &Recipe, cell: &CellConfig, kind: &str) -> String {
     let mut said = format!("cell {:?}, {kind}", cell.name);
-    // Another simulated world is another grinder.
+    // Another simulated world counts as another grinder.
     if let Some(world) = recipe.simulation.as_ref().filter(|_| cell.simulated) {
         let _ = write!(said, "; simulation {}", serde_json::json!(world));
     }
     said
 }
 
-/// Says the same without the cell: what a run of another has to have in common with one to begin with what it found.
+/// Returns the same text without the cell: the settings that runs of two cells must share so that one can start from
+/// the results of the other.
 fn kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize) -> String {
     let part = hex(part);
     let (grinding, measure, map) = (&recipe.grinding, &recipe.measure, &recipe.compensation);
@@ -284,14 +290,15 @@ fn kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize) -> Stri
     if let Some(Tilt { lean, angle_deg }) = grinding.tilt {
         let _ = write!(said, "; tilt {lean:?} by {angle_deg} degrees");
     }
-    // What stands as it always did is not said, so that what was learned before still counts.
+    // Default values are omitted, so that results learned before these keys existed stay valid.
     if (map.filter_order, map.roughness) != Default::default() {
         let _ = write!(said, "; order {:?}, {:?}", map.filter_order, map.roughness);
     }
     said
 }
 
-/// Reads or samples the nominal surface, and names the part by the SHA-256 of what it came from.
+/// Reads or samples the nominal surface. Returns it with its path and with the SHA-256 of its source, which identifies
+/// the part.
 fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> {
     match &recipe.nominal {
         NominalSource::Surface(surface) => {
@@ -316,18 +323,18 @@ fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> 
     }
 }
 
-/// Reads what a recipe says of its table of nominal points.
+/// Parses the format of a recipe's table of nominal points.
 ///
 /// # Errors
-/// The key whose words cannot be understood, and why.
+/// Returns the key with an invalid value, and the reason.
 pub fn nominal_table(words: &TableWords) -> Result<formats::Table, (&'static str, String)> {
     table(words, ["nominal.columns", "nominal.unit", "nominal.height_unit"])
 }
 
-/// Reads what a recipe says of its table of places that are measured.
+/// Parses the format of a recipe's table of points to measure.
 ///
 /// # Errors
-/// The key whose words cannot be understood, and why.
+/// Returns the key with an invalid value, and the reason.
 pub fn plan_table(words: &TableWords) -> Result<formats::Table, (&'static str, String)> {
     table(words, ["measure.file_columns", "measure.file_unit", "measure.file_height_unit"])
 }
@@ -341,10 +348,10 @@ fn table(words: &TableWords, keys: [&'static str; 3]) -> Result<formats::Table, 
     })
 }
 
-/// Makes the nominal surface of what a file holds; only points are projected.
+/// Builds the nominal surface from the content of a file. Only points are projected.
 ///
 /// # Errors
-/// What makes no surface, with the path of the file.
+/// Returns an error with the path of the file if its content does not make a surface.
 pub fn surface(path: &Path, file: NominalFile, projection: Projection) -> Result<Nominal, SetupError> {
     let of_surface = |source| SetupError::Nominal { path: path.to_owned(), source };
     match file {
@@ -370,7 +377,8 @@ fn sampled(path: &Path, surface: &DefinedSurface) -> Result<Nominal, SetupError>
         .map_err(|source| SetupError::Nominal { path: path.to_owned(), source })
 }
 
-/// Names a formula by the nodes that it gives: the same surface has the same name however it is written.
+/// Returns the identity of a formula, computed from its nodes. The same surface has the same identity in every
+/// notation.
 fn identity_of(nominal: &Nominal) -> [u8; 32] {
     let mut hash = Sha256::new();
     for point in nominal.points() {
@@ -408,7 +416,8 @@ fn sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Sphere>, SetupErr
     }
 }
 
-/// Sees that the probe does not look for the reference sphere in the part: the part fills the box under its surface, where the fixture holds it.
+/// Checks that the probe does not search for the reference sphere inside the part. The part fills the box under its
+/// surface, in the pose of the fixture.
 fn check_sphere(recipe: &Recipe, cell: &CellConfig, nominal: &Nominal, sphere: &Sphere) -> Result<(), SetupError> {
     let centre = cell.cmm.fixture_cmm_from_model.inverse().point(&sphere.centre);
     let mut nearest = Point::from([f64::INFINITY; 3]);
@@ -419,7 +428,7 @@ fn check_sphere(recipe: &Recipe, cell: &CellConfig, nominal: &Nominal, sphere: &
     let beside = |at: f64, low: f64, high: f64| (low - at).max(at - high).max(0.0);
     let [x, y] = [0, 1].map(|k| beside(centre[k], nearest[k], farthest[k]));
     let gap_mm = x.hypot(y).hypot((centre.z - farthest.z).max(0.0)) - sphere.radius_mm;
-    // The stylus goes round it with its ball.
+    // The stylus moves around the sphere with its ball.
     let needed_mm = 2.0 * recipe.measure.probe_radius_mm + recipe.measure.approach_mm;
     if gap_mm >= needed_mm {
         return Ok(());
@@ -444,7 +453,7 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     beyond("grinding.wheel.radius_mm", recipe.grinding.wheel.radius_mm(), least, most, "grinder.limits")?;
     let feed = recipe.grinding.feed_mm_min;
     beyond("grinding.feed_mm_min", feed, 0.0, limits.largest_feed_mm_min, "grinder.limits.largest_feed_mm_min")?;
-    // Both as they are written: the recipe in micrometres, the cell file in millimetres.
+    // Each value keeps its own unit in the message: micrometres in the recipe, millimetres in the cell file.
     let (depth_um, most_um) = (recipe.compensation.depth_of_cut_um.0, 1e3 * limits.largest_depth_mm);
     beyond("compensation.depth_of_cut_um", depth_um, 0.0, most_um, "1000 times grinder.limits.largest_depth_mm")?;
     if targets.is_empty() && !cell.cmm.link.wire.is_by_person() {
@@ -454,7 +463,7 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
         ("part.expansion_um_m_k", recipe.part.expansion_um_m_k.is_some()),
         ("measure.temperature_c", recipe.measure.temperature_c.is_some()),
     ];
-    // Found out here, and not at the first measurement, when the part has been ground.
+    // Checked here, because the first measurement comes after the first grinding.
     if let Some((key, _)) = of_temperature.into_iter().find(|(_, is_there)| *is_there)
         && !cell.cmm.link.wire.tells_temperature()
     {
@@ -501,21 +510,21 @@ fn pass(recipe: &Recipe, nominal: &Nominal, part_identity: [u8; 32], track_spaci
     }
 }
 
-/// The surface that paths are laid over, and the outline of the part.
+/// Surface under the paths, and outline of the part.
 type Ground = (Field, Aperture);
 
 fn ground(recipe: &Recipe, nominal: &Nominal) -> Result<Ground, PathError> {
     let (field, outline) = Programs::ground(nominal)?;
-    // Seen from where the wheel comes from.
+    // The surface as seen from the side of the wheel.
     Ok((if from_below(recipe) { field.mirrored() } else { field }, outline))
 }
 
-/// Whether the part is worked on from the side of -z: it is measured there.
+/// Returns true if the part is machined from the side of -z. It is then also measured from that side.
 fn from_below(recipe: &Recipe) -> bool {
     recipe.measure.side.given() == Some(Side::Opposite)
 }
 
-/// Returns the distance of the tracks, as the recipe has it or as the scallops allow it, and what they leave between them.
+/// Returns the track distance, from the recipe or from the allowed scallops, and the scallops between the tracks.
 fn tracks(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -539,7 +548,7 @@ fn tracks(
         tilted(recipe, cell, PathOptions::new(path_wheel(&grinding.wheel, nominal), 1.0, grinding.feed_mm_min));
     let wheel_at = |contact: &PathContact| options.wheel_at(contact);
     let unit = Scallops::between(&wanted, outline, wheel_at, grinding.pattern, 1.0);
-    // Tracks overlap, and there is more than one.
+    // Tracks must overlap, and there must be more than one.
     let widest_mm = grinding.wheel.radius_mm().min(0.5 * size_mm[0].min(size_mm[1]));
     let track_mm = match (grinding.track_mm, grinding.scallop_nm) {
         (Some(track_mm), None) => track_mm,
@@ -549,7 +558,8 @@ fn tracks(
     Ok((track_mm, Some(unit.at_mm(track_mm))))
 }
 
-/// Returns the widest distance of tracks whose scallops take no more than their share of the tolerances of a recipe, cut down to two digits.
+/// Returns the maximum track distance, in mm, at which the scallops stay within their share of the tolerances of a
+/// recipe. The result is rounded down to two digits.
 pub fn track_for_tolerance_mm(recipe: &Recipe, scallops: &Scallops) -> f64 {
     let share = |limit: Option<Um>| limit.map_or(f64::INFINITY, |um| SCALLOP_SHARE * um.mm());
     let most_mm = scallops.track_for_mm(share(recipe.acceptance.pv_um), share(recipe.acceptance.rms_um));
@@ -560,7 +570,7 @@ pub fn track_for_tolerance_mm(recipe: &Recipe, scallops: &Scallops) -> f64 {
     (most_mm * per_mm).floor() / per_mm
 }
 
-/// How the programs of a part are made.
+/// Returns the settings for the programs of a part.
 fn programs(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -571,7 +581,7 @@ fn programs(
     let (grinding, limits) = (&recipe.grinding, &cell.grinder.limits);
     let plain = PathOptions::new(path_wheel(&grinding.wheel, nominal), track_mm, grinding.feed_mm_min);
     let plain = tilted(recipe, cell, plain);
-    // The wheel comes up to its feed before it meets the part.
+    // The wheel reaches its feed before it touches the part.
     let machine = Limits {
         travel_mm: limits.travel.map(|travel| [travel.least_mm, travel.most_mm]),
         speed_mm_s: limits.largest_speed_mm_s,
@@ -584,7 +594,7 @@ fn programs(
         pattern: grinding.pattern,
         one_way: grinding.one_way,
         spacing: match grinding.scallop_nm {
-            // A correction may bend the surface a little more than the nominal one.
+            // A correction can bend the surface a little more than the nominal surface is bent.
             Some(nm) => TrackSpacing::Scallop { height_mm: 1e-6 * nm, widest_mm: track_mm },
             None => TrackSpacing::Distance(track_mm),
         },
@@ -612,7 +622,7 @@ fn programs(
     }
 }
 
-/// The same path with the head of the cell's grinder, and the wheel tilted by it as the recipe has it.
+/// Returns the same path options with the rotary axis of the cell's grinder and the tilt of the wheel from the recipe.
 fn tilted(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions {
     let step_rad = 10f64.powi(-i32::from(cell.grinder.program.dialect.numbers.angle_decimals)).to_radians();
     let rotary = cell.grinder.rotary.map(|head| {
@@ -637,7 +647,8 @@ fn tilted(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions
     PathOptions { rotary, lean, ..plain }
 }
 
-/// The wheel of a recipe as paths have it; a cup is tilted further than the part slopes unless the recipe says by how much.
+/// Returns the wheel of a recipe in the form that paths use. A cup is tilted by more than the slope of the part, unless
+/// the recipe sets the angle.
 fn path_wheel(wheel: &Wheel, nominal: &Nominal) -> PathWheel {
     const BEYOND_THE_SLOPE_RAD: f64 = 0.0873;
     match *wheel {
@@ -657,7 +668,7 @@ fn path_wheel(wheel: &Wheel, nominal: &Nominal) -> PathWheel {
     }
 }
 
-/// How part and scales grow, where the recipe tells it of the part.
+/// Returns the thermal expansion of part and scales, if the recipe states that of the part.
 fn expansion(recipe: &Recipe, cell: &CellConfig) -> Option<Expansion> {
     const MILLIONTH: f64 = 1e-6;
     let of_part = recipe.part.expansion_um_m_k?;
@@ -671,7 +682,7 @@ fn expansion(recipe: &Recipe, cell: &CellConfig) -> Option<Expansion> {
 }
 
 fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
-    // What a person brings may take days, and then the cell is held and still waits.
+    // A job by a person can take days. During a hold the cell keeps waiting.
     let mut deadlines = Deadlines::default();
     let by_person = [&cell.cmm.link, &cell.grinder.link].map(|link| link.wire.is_by_person());
     for k in (0..2).filter(|k| by_person[*k]) {
@@ -703,11 +714,12 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
     }
 }
 
-/// Makes the drivers of both machines; nothing is asked of a machine yet. `part` is what the part is called in files, `folder` the folder
-/// of the run, `owner` and `epoch` name this client to machines that more than one can reach; the epoch rises with each start.
+/// Builds the drivers of both machines. Sends nothing to a machine. `part` is the name of the part in files, `folder`
+/// the folder of the run. `owner` and `epoch` identify this client to machines that several clients can reach. The
+/// epoch increases with each start.
 ///
 /// # Errors
-/// A wire that cannot be opened, a folder that is not there, reference points that cannot be read.
+/// Returns an error if a wire cannot be opened, a folder does not exist, or reference points cannot be read.
 pub fn machines(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -737,13 +749,13 @@ pub fn machines(
 
 /// Returns the settings of a machine on Modbus; `None` for any other.
 ///
-/// `simulated` says whether the cell's machines are simulations: one that says otherwise is refused.
+/// `simulated` states whether the cell's machines are simulated. A machine that reports the opposite is refused.
 pub fn modbus(link: &Link, simulated: bool, owner: u32, epoch: u32) -> Option<ModbusSettings> {
     let (line, unit) = link.wire.line()?;
     Some(ModbusSettings::of(line, unit, &making(link, simulated, [owner, epoch])))
 }
 
-/// Tells whether what a machine is made of is there, such as the folders that it gives and takes files in. Nothing is asked of the machine.
+/// Checks that the resources of a machine exist, such as its exchange folders. Sends nothing to the machine.
 ///
 /// # Errors
 /// Those of [`machines`].
@@ -760,7 +772,7 @@ pub fn is_there(cell: &CellConfig, device: Device) -> Result<(), MakingError> {
     }
 }
 
-/// Makes the driver of the measuring machine for no part yet: to look at it. Nothing is asked of the machine.
+/// Builds the driver of the measuring machine without a part, for inspection only. Sends nothing to the machine.
 ///
 /// # Errors
 /// Those of [`machines`].
@@ -770,7 +782,7 @@ pub fn cmm(cell: &CellConfig) -> Result<AnyCmm, MakingError> {
     link.wire.cmm(&Making { cell_folder, volume_mm: volume_mm(cell), ..making(link, cell.simulated, [1, 1]) })
 }
 
-/// Makes the driver of the grinder for no part yet: to look at it. Nothing is asked of the machine.
+/// Builds the driver of the grinder without a part, for inspection only. Sends nothing to the machine.
 ///
 /// # Errors
 /// Those of [`machines`].
@@ -780,12 +792,12 @@ pub fn grinder(cell: &CellConfig) -> Result<AnyGrinder, MakingError> {
     link.wire.grinder(&Making { cell_folder, ..making(link, cell.simulated, [1, 1]) })
 }
 
-/// The box that the probe's centre must not leave.
+/// Returns the box of allowed positions of the probe's centre, as minimum and maximum in mm.
 fn volume_mm(cell: &CellConfig) -> Option<[[f64; 3]; 2]> {
     cell.cmm.travel.as_ref().map(|travel| [travel.least_mm, travel.most_mm])
 }
 
-/// What a machine of a cell is made of besides its wire, for no part yet.
+/// Returns the context for the driver of a machine, besides its wire, without a part.
 fn making(link: &Link, simulated: bool, [owner, epoch]: [u32; 2]) -> Making<'_> {
     Making {
         part: "",
@@ -806,7 +818,7 @@ fn making(link: &Link, simulated: bool, [owner, epoch]: [u32; 2]) -> Making<'_> 
     }
 }
 
-/// Returns the time between two looks at a machine.
+/// Returns the time between two polls of a machine.
 pub fn poll(link: &Link) -> Duration {
     if link.wire.is_by_person() { link.timing.poll.max(SLOW_POLL) } else { link.timing.poll }
 }

@@ -1,11 +1,12 @@
-//! The rules of the house: which room may know which, and what each must not contain.
+//! Architecture rules: which module ("room") may depend on which, and what each must not contain.
 //!
-//! What the dependencies of the crates keep, the compiler keeps; here stands the rest.
+//! The compiler enforces the dependencies between crates. These tests enforce the rest.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Every room, its folder or file, and the rooms that it may name. An arrow that stands here in no line is a turned arrow.
+/// Every room, its folder or file, and the rooms that it may name. A dependency that is not in a line here points in
+/// the wrong direction.
 const ARROWS: [(&str, &str, &[&str]); 24] = [
     ("geometry", "src/core/geometry", &[]),
     ("surface", "src/core/surface", &["geometry"]),
@@ -47,7 +48,8 @@ const ARROWS: [(&str, &str, &[&str]); 24] = [
 /// The rooms of the numerical core.
 const CORE: [&str; 7] = ["geometry", "surface", "measuring", "registration", "compensation", "form", "model"];
 
-/// The files that may say what system it is, and what each system has alone: twins with the same functions, and what chooses between them.
+/// Files that may name an operating system, with the code that is specific to it: twins with the same functions, and
+/// the code that chooses between them.
 const SYSTEMS: [&str; 16] = [
     "sim/wire/mod.rs",
     "sim/wire/pty.rs",
@@ -67,7 +69,7 @@ const SYSTEMS: [&str; 16] = [
     "src/windows",
 ];
 
-/// What names a system.
+/// Words that name one operating system.
 const OF_ONE_SYSTEM: [&str; 17] = [
     "(unix)",
     "(windows)",
@@ -88,7 +90,7 @@ const OF_ONE_SYSTEM: [&str; 17] = [
     "\"/etc/",
 ];
 
-/// What the numerical core and the deciding machine have no word for.
+/// Words that must not occur in the numerical core and in the decision code of the machine.
 const IMPURE: [&str; 13] = [
     "tokio",
     "async ",
@@ -105,7 +107,7 @@ const IMPURE: [&str; 13] = [
     "std::process",
 ];
 
-/// A source file and its code, without comments and without its tests.
+/// Source file and its code, without comments and without its tests.
 struct Source {
     path: PathBuf,
     code: String,
@@ -115,7 +117,7 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The sources of a room, tests, benches and examples of its crate left out.
+/// Returns the sources of a room, without the tests, benches and examples of its crate.
 fn sources(room: &str) -> Vec<Source> {
     let mut found = Vec::new();
     let mut open = vec![root().join(room)];
@@ -133,7 +135,7 @@ fn sources(room: &str) -> Vec<Source> {
     found
 }
 
-/// Drops comments, and the tests, which stand at the end of a file.
+/// Removes comments, and the tests at the end of a file.
 fn code_of(text: &str) -> String {
     let before_tests = text.split("#[cfg(test)]\nmod ").next().unwrap_or(text);
     before_tests.lines().map(|line| line.split("//").next().unwrap_or(line)).fold(String::new(), |mut code, line| {
@@ -143,7 +145,7 @@ fn code_of(text: &str) -> String {
     })
 }
 
-/// The names that a path begins with behind one of our crates: `a` and `b` of `use crate::{a::X, b}`.
+/// Returns the first path segments after one of our crates: `a` and `b` of `use crate::{a::X, b}`.
 fn named<'a>(code: &'a str, crates: &[&str]) -> Vec<&'a str> {
     let mut names = Vec::new();
     for name in crates {
@@ -159,7 +161,7 @@ fn named<'a>(code: &'a str, crates: &[&str]) -> Vec<&'a str> {
     names
 }
 
-/// The first names in a list in braces, whatever stands in braces within it left out.
+/// Returns the first names in a list in braces. Skips nested braces.
 fn top_level(list: &str) -> Vec<&str> {
     let (mut depth, mut begins, mut names) = (0, 0, Vec::new());
     for (at, c) in list.char_indices() {
@@ -196,7 +198,7 @@ fn is_in(source: &Source, room: &str) -> bool {
 fn no_room_names_one_that_it_must_not_know() {
     let rooms = || ARROWS.iter().map(|(room, ..)| *room).chain(["cli"]);
     for (room, place, may) in ARROWS {
-        // The rooms that are crates name files of their own by `crate`.
+        // Rooms that are crates name their own files by `crate`.
         let apart = [
             "cell", "control", "journal", "formats", "document", "device", "live", "page", "plant", "report", "windows",
         ];
@@ -235,7 +237,7 @@ fn the_core_and_the_machine_that_decides_have_no_file_no_clock_no_chance_and_no_
     }
 }
 
-/// The crates that the manifest of one of ours names, for every system or for one.
+/// Returns the crates that the manifest of one of our crates depends on, for every system or for one.
 fn dependencies(manifest: &str) -> Vec<String> {
     let text = fs::read_to_string(root().join(manifest)).unwrap();
     let table: toml::Table = text.parse().unwrap();

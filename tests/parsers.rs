@@ -1,7 +1,8 @@
-//! Every parser of what comes from outside, given damaged samples: none panics, none goes on for ever, none gives a number that is
-//! none, and none sets aside what a header claims before it is there. The bodies are those that cargo-fuzz runs without an end.
+//! Damaged samples for every parser of external input. No parser panics, runs for ever, returns a number that is not
+//! finite, or allocates the memory that a header claims before the data are there. The bodies are those that cargo-fuzz
+//! runs without end.
 //!
-//! Recipes and cells are damaged in tests/cli/recipe.rs, registers in the room of their driver.
+//! Recipes and cells are damaged in tests/cli/recipe.rs, registers in the module of their driver.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -22,10 +23,10 @@ mod parsers;
 #[global_allocator]
 static MEMORY: PeakAlloc = PeakAlloc;
 
-/// All tests of this file together stay below this; a claim that is believed goes beyond.
+/// Memory limit for all tests of this file together, in MB. A parser that trusts a false claim exceeds it.
 const MOST_MEMORY_MB: f64 = 400.0;
 
-/// The samples of a parser, in the order of their names.
+/// Returns the samples of a parser, in the order of their names.
 fn samples(parser: &str) -> Vec<(PathBuf, Vec<u8>)> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/corpus").join(parser);
     let mut paths: Vec<_> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
@@ -33,7 +34,7 @@ fn samples(parser: &str) -> Vec<(PathBuf, Vec<u8>)> {
     paths.into_iter().map(|path| (path.clone(), fs::read(path).unwrap())).collect()
 }
 
-/// What happens to a file.
+/// Damage to a file.
 #[derive(Clone, Debug)]
 enum Damage {
     Flip(Index, u8),
@@ -126,7 +127,7 @@ macro_rules! survives {
             }
         })*
 
-        /// Each sample by itself, which is read unless it claims what is not there, and what is left of it after a cut.
+        /// Parses each sample, which succeeds unless it claims data that are not there, and each of its truncations.
         #[test]
         fn samples_are_read_and_claims_are_not_believed() {
             let mut wrong = Vec::new();
@@ -151,7 +152,7 @@ survives! {
     program 512, program_map 512, record 1024, references 2048, result 2048, sdf 2048, stl 2048, x3p 1024, x3p_document 1024,
 }
 
-/// What nests without an end is refused before it takes the stack.
+/// Checks that unlimited nesting is refused before the stack overflows.
 #[test]
 fn depth_is_refused() {
     for (open, inner, close) in [
@@ -190,7 +191,7 @@ fn depth_is_refused() {
     }
 }
 
-/// Makes the samples that are made of types: run by whoever has changed one of these.
+/// Writes the samples that are generated from types. Run it after a change to one of these types.
 #[test]
 #[ignore = "writes into fuzz/corpus"]
 fn samples_are_made() {
@@ -273,7 +274,7 @@ fn samples_are_made() {
     }
 }
 
-/// Journal and anchor of a small run that came to its end.
+/// Returns the journal and anchor of a small run that finished.
 fn small_run() -> [(&'static str, Vec<u8>); 2] {
     let home = tempfile::tempdir().unwrap();
     let run = home.path().join("run");
@@ -296,7 +297,7 @@ fn small_run() -> [(&'static str, Vec<u8>); 2] {
     ["journal.sqlite", "journal.anchor"].map(|name| (name, fs::read(run.join(name)).unwrap()))
 }
 
-/// What a run has learned of a grinder, on a small grid.
+/// Returns the knowledge that a run has learned of a grinder, on a small grid.
 fn what_was_learned() -> Learned {
     let grid = Grid { columns: 5, rows: 4, first_mm: [-2.0, -1.5], spacing_mm: [1.0, 1.0] };
     let correction = Correction::none(grid, 0.05);

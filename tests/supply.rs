@@ -1,5 +1,6 @@
-//! What the program is built of, held against deny.toml by the lock file and the manifests of the crates: licences, bans and sources. This is
-//! the part of `cargo deny check licenses bans sources` that can be had without cargo-deny. And what it is handed out with: the list of the package.
+//! Checks of the supply chain. They compare the dependencies with deny.toml by the lock file and the manifests of the
+//! crates: licences, bans and sources. This is the part of `cargo deny check licenses bans sources` that works without
+//! cargo-deny. They also check the contents of the package that is handed out.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -13,12 +14,12 @@ fn table(file: &str) -> Table {
     fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(file)).unwrap().parse().unwrap()
 }
 
-/// The words of a list of texts, or of tables that name a crate.
+/// Returns the words of a list of texts, or of tables that name a crate.
 fn words(list: &toml::Value) -> BTreeSet<&str> {
     list.as_array().unwrap().iter().map(|item| item.get("crate").unwrap_or(item).as_str().unwrap()).collect()
 }
 
-/// The crates that a build for a platform takes with the features of this one, as their manifests have them.
+/// Returns the crates that a build for a platform uses with the features of this one, as their manifests list them.
 fn packages(platform: &str) -> Vec<Value> {
     let output = Command::new(env!("CARGO"))
         .args(["metadata", "--format-version=1", "--offline", "--locked", "--filter-platform", platform])
@@ -31,7 +32,7 @@ fn packages(platform: &str) -> Vec<Value> {
     found["packages"].as_array().unwrap().clone()
 }
 
-/// Whether an SPDX expression can be fulfilled by these licences. `AND` binds closer than `OR`; an old `/` is `OR`.
+/// Returns true if these licences satisfy an SPDX expression. `AND` binds closer than `OR`; an old `/` is `OR`.
 fn is_allowed(expression: &str, may: &BTreeSet<&str>) -> bool {
     let spaced = expression.replace('(', " ( ").replace(')', " ) ").replace('/', " OR ");
     let mut words: Vec<&str> = spaced.split_whitespace().rev().collect();
@@ -64,7 +65,7 @@ fn one(words: &mut Vec<&str>, may: &BTreeSet<&str>) -> bool {
             allowed
         }
         Some(name) => {
-            // A licence with an exception is another licence.
+            // A licence with an exception is a different licence.
             let exception = words.pop_if(|word| *word == "WITH").and_then(|_| words.pop());
             exception.map_or(may.contains(name), |with| may.contains(format!("{name} WITH {with}").as_str()))
         }
@@ -115,7 +116,7 @@ fn every_licence_is_allowed(platform: &str) {
         let may = exception.map_or_else(|| may.clone(), |e| words(&e["allow"]).union(&may).copied().collect());
         assert!(is_allowed(licence, &may), "{name} comes under {licence}, which deny.toml does not allow");
     }
-    // Most of them are for the plant, whose crates nobody has downloaded who tests without it.
+    // Most of them belong to the plant feature. A build without it has not downloaded its crates.
     if cfg!(feature = "plant") {
         assert_eq!(used, exceptions.len(), "an exception that nobody needs");
     }
@@ -125,7 +126,7 @@ fn every_licence_is_allowed(platform: &str) {
 fn no_crate_is_banned_and_all_come_from_one_registry() {
     let (deny, lock) = (table("deny.toml"), table("Cargo.lock"));
     let banned = words(&deny["bans"]["deny"]);
-    // One registry, whichever a mirror makes of it, and no repository.
+    // One registry, or a mirror of it, and no repository.
     let mut registries = BTreeSet::new();
     for package in lock["package"].as_array().unwrap() {
         let name = package["name"].as_str().unwrap();
@@ -141,14 +142,14 @@ fn no_crate_is_banned_and_all_come_from_one_registry() {
     assert_eq!(registries.len(), 1, "{registries:?}");
 }
 
-/// Whether a path is meant by a pattern with at most one `*`, which stands for anything but a slash.
+/// Returns true if a path matches a pattern with at most one `*`, which matches anything but a slash.
 fn is_meant(path: &str, pattern: &str) -> bool {
     let Some((head, tail)) = pattern.split_once('*') else { return path == pattern };
     let middle = path.strip_prefix(head).and_then(|rest| rest.strip_suffix(tail));
     middle.is_some_and(|middle| !middle.contains('/'))
 }
 
-/// The files below a folder of the sources, by their paths from there.
+/// Returns the files below a folder of the sources, as paths relative to it.
 fn files_below(folder: &str) -> Vec<String> {
     let entries = fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join(folder)).unwrap().map(|entry| entry.unwrap());
     let below = entries.flat_map(|entry| {

@@ -1,4 +1,4 @@
-//! `regrind accuracy`: how exact distances to a nominal surface will be, and how fine it must be sampled.
+//! `regrind accuracy`: the accuracy of distances to a nominal surface, and the sampling that it needs.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -96,7 +96,7 @@ fn judge(arguments: &Arguments) -> Result<Accuracy, Failure> {
     match nominal::read(path, arguments.projection, &arguments.table.table())? {
         NominalFile::Points(points) => accuracy(Samples::Points { points: &points, projection }),
         NominalFile::Mesh { points, triangles } => {
-            // Every command says the same of a bad mesh.
+            // Every command reports a bad mesh with the same message.
             Nominal::from_mesh(points.clone(), triangles)
                 .and_then(|mesh| mesh.check_is_open())
                 .and_then(|()| accuracy(Samples::Points { points: &points, projection }))

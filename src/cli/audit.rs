@@ -1,4 +1,4 @@
-//! `regrind audit`: is the record of a run what was written, and what does it say?
+//! `regrind audit`: verifies that the record of a run is unchanged, and prints it.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -148,7 +148,7 @@ fn export(arguments: &ToExport) -> Result<Outcome, Failure> {
     let folder = folder_of(arguments.run.as_deref())?;
     match arguments.format {
         Format::Jsonl => print_lines(folder, None, |_| true, Record::json_line),
-        // Lines of CSV end with a carriage return, too.
+        // Lines of CSV also end with a carriage return.
         Format::Csv => print_lines(folder, Some(Record::csv_head() + "\r"), |_| true, |record| record.csv_row() + "\r"),
     }
 }
@@ -212,10 +212,10 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     }
 }
 
-/// Returns whether a sound run is whole or still under way, or what it lacks.
+/// Returns true if a sound run is complete, false if it is still under way, or an error that names what it lacks.
 pub(super) fn is_whole(verified: &Verified, keys: &[PublicKey]) -> Result<bool, &'static str> {
     match verified {
-        // With a key at hand an end that it has not signed is not believed, whoever holds the lock.
+        // With a key, an end that this key has not signed is not trusted, even if a process holds the lock.
         verified if verified.lacks_last_seal() && (!verified.under_way || !keys.is_empty()) => Err(
             "its end is not signed, and the run names a key: who has no key may have written what follows the last seal",
         ),
@@ -227,13 +227,13 @@ pub(super) fn is_whole(verified: &Verified, keys: &[PublicKey]) -> Result<bool, 
     }
 }
 
-/// Whether runs lie in a folder, and it is none itself.
+/// Returns true if a folder contains runs and is not a run itself.
 fn is_folder_of_runs(folder: &Path) -> bool {
     let has_record = |folder: &Path| folder.join(DATABASE).exists();
     !has_record(folder) && folders(folder).any(|run| has_record(&run))
 }
 
-/// Says what else lies in the folder of a run, of which its record knows nothing.
+/// Returns the text about files in a run folder that the record does not list.
 fn beside(folder: &Path, unrecorded: &[String]) -> String {
     let report = |name: &&String| **name == RUN_REPORT;
     let edited = unrecorded.iter().any(|name| report(&name))
@@ -262,7 +262,7 @@ fn mark(begin: &Value) -> &'static str {
     if begin["simulation"] == true { "SIMULATION  " } else { "" }
 }
 
-/// Says who signed, and how far that reaches.
+/// Returns the text about the signer and the extent of the signature.
 fn signed(verified: &Verified, as_given: bool) -> String {
     let Verified { keys, signed, records, .. } = verified;
     let [first, others @ ..] = keys.as_slice() else {
@@ -324,9 +324,10 @@ fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
     print_lines(folder, Some(head), wanted, row)
 }
 
-/// A record as a row of the table.
+/// Returns a record as a row of the table.
 fn row(record: &Record) -> String {
-    // Whole seconds, without the letters of the standard: within one the numbers tell the order, and --json has the rest.
+    // Whole seconds without `T` and `Z`. Within a second the sequence numbers show the order, and --json has the full
+    // time.
     let utc: String = record.utc.trim_end_matches('Z').replacen('T', " ", 1).chars().take(19).collect();
     let who: String = record.actor.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
     let cycle = if record.cycle == 0 { "-".to_owned() } else { record.cycle.to_string() };
@@ -334,7 +335,7 @@ fn row(record: &Record) -> String {
     format!("{:>6}  {utc:<19}  {who:<16}  {kind:<8}  {cycle:>5}  {}", record.seq, words(record))
 }
 
-/// Prints a line for each record that is wanted, as they are read; a reader that has gone away ends it.
+/// Prints a line for each selected record while the records are read. Stops when the reader of the output is gone.
 fn print_lines(
     folder: PathBuf,
     head: Option<String>,

@@ -1,35 +1,35 @@
-//! A map in coloured blocks, for a terminal: two pixels a character, the upper half and the lower.
+//! Map in coloured blocks for a terminal. Each character shows two pixels, the upper and the lower half.
 
 use regrind::formats::MapNode;
 use regrind::report::ColourMap;
 
-/// A pixel; none where nothing was measured.
+/// Colour of a pixel. `None` without a measurement.
 type Pixel = Option<[u8; 3]>;
 
-/// The pixels of a map.
+/// Pixels of a map.
 pub(super) struct Blocks {
-    /// The upper and the lower half of each character, row by row from above.
+    /// Upper and lower half of each character, row by row from the top.
     pub(super) rows: Vec<Vec<[Pixel; 2]>>,
-    /// What the darkest red stands for, or the brightest where nothing is below zero, in micrometres.
+    /// Value of the darkest red in µm, or of the brightest colour if no value is below zero.
     pub(super) limit_um: f64,
 }
 
 impl Blocks {
-    /// Paints an error map in at most so many characters along and so many above each other.
+    /// Paints an error map. `most` is the maximum number of characters in width and height.
     ///
-    /// Shape: nodes of x, y and error in millimetres. A half of a character is about as wide as it is high.
+    /// Shape: nodes of x, y and error in mm. Half a character is about as wide as it is high.
     pub(super) fn of(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
         let nodes: Vec<[f64; 3]> = nodes.iter().map(MapNode::error).collect();
         Self::painted(&nodes, most, |share| ColourMap::Diverging.at(0.5 + 0.5 * share))
     }
 
-    /// Paints how well the error is known: from dark where it is best to bright.
+    /// Paints the standard deviation of the error, from dark (minimum) to bright.
     pub(super) fn of_sigma(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
         let nodes: Vec<[f64; 3]> = nodes.iter().map(MapNode::sigma).collect();
         Self::painted(&nodes, most, |share| ColourMap::Sequential.at(share))
     }
 
-    /// The colours are those of shares of the largest size.
+    /// Paints values. `colour` takes the value as a share of the maximum magnitude.
     fn painted(nodes: &[[f64; 3]], most: [usize; 2], colour: impl Fn(f64) -> [u8; 3]) -> Option<Self> {
         let range = |k: usize| nodes.iter().fold([f64::MAX, f64::MIN], |[a, b], node| [a.min(node[k]), b.max(node[k])]);
         let ([x0, x1], [y0, y1]) = (range(0), range(1));
@@ -55,7 +55,7 @@ impl Blocks {
         Some(Self { rows: (0..lines).step_by(2).map(row).collect(), limit_um: 1e3 * limit_mm })
     }
 
-    /// Writes them with the codes that terminals of today understand.
+    /// Returns the pixels as text with ANSI colour codes.
     pub(super) fn to_ansi(&self) -> String {
         let code = |plane: u8, [r, g, b]: [u8; 3]| format!("\x1b[{plane};2;{r};{g};{b}m");
         let block = |[above, below]: &[Pixel; 2]| match (above, below) {
@@ -67,7 +67,7 @@ impl Blocks {
         self.rows.iter().map(|row| row.iter().map(block).chain(["\n".to_owned()]).collect::<String>()).collect()
     }
 
-    /// Puts another one of the same size beside it, so far away.
+    /// Puts another map of the same size to the right, at a distance of `apart` characters.
     pub(super) fn beside(mut self, other: Self, apart: usize) -> Self {
         for (row, more) in self.rows.iter_mut().zip(other.rows) {
             row.extend(std::iter::repeat_n([None; 2], apart).chain(more));
@@ -76,7 +76,7 @@ impl Blocks {
     }
 }
 
-/// Draws how a figure came down, a character a cycle: the highest stands for the largest, by the logarithm.
+/// Draws a series of values, one character per cycle, on a logarithmic scale. The highest bar is the maximum.
 pub(super) fn sparkline(values: impl Iterator<Item = f64> + Clone) -> String {
     const STEPS: [char; 8] =
         ['\u{2581}', '\u{2582}', '\u{2583}', '\u{2584}', '\u{2585}', '\u{2586}', '\u{2587}', '\u{2588}'];
@@ -92,7 +92,7 @@ mod tests {
 
     #[test]
     fn a_map_is_painted_as_it_lies_and_no_larger_than_asked() {
-        // Proud above on the right, deep below on the left.
+        // Above the surface on the right, below it on the left.
         let node = |i, j| node([f64::from(i), f64::from(j)], 1e-4 * f64::from(i + j) - 2.9e-3);
         let nodes: Vec<MapNode> = (0..40).flat_map(|i| (0..20).map(move |j| node(i, j))).collect();
         let blocks = Blocks::of(&nodes, [20, 30]).unwrap();
@@ -109,7 +109,7 @@ mod tests {
         assert_eq!(both.rows[0][30][0].unwrap(), ColourMap::Sequential.at(1.0));
     }
 
-    /// A node that is known to a tenth of a micrometre.
+    /// Returns a node with a standard deviation of 0.1 µm.
     fn node(at_mm: [f64; 2], error_mm: f64) -> MapNode {
         MapNode { at_mm, error_mm, sigma_mm: 1e-4 }
     }

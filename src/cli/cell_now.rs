@@ -1,6 +1,8 @@
-//! How the cell is whose runs lie in a folder: which run is on, which was left, and how the last one ended. It is told to others as it is found.
+//! Status of the cell whose runs are in a folder: the active run, an interrupted run, and the result of the last run.
+//! The status is published as it is found.
 //!
-//! The run that counts is the one on whose record something stands last: a folder may be looked into, copied or made by anybody.
+//! The current run is the one with the newest record. The time of the folder does not count, because anybody can read,
+//! copy or create a folder.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -14,18 +16,19 @@ use regrind_live::{Ended, Now, Told};
 
 use super::control;
 
-/// How long a run may be at its beginning or its end, or silent, before it is told that it does not answer.
+/// Time that a run can be starting, ending or silent before it counts as not answering.
 const GRACE: Duration = Duration::from_secs(5);
 
-/// Looks at the runs in a folder, time and again.
+/// Status of the cell, updated by repeated reading of the runs in a folder.
 pub(super) struct Look {
     runs: PathBuf,
     told: Told,
-    /// The run that does not answer, and since when.
+    /// Run that does not answer, and the time since when.
     silent: Option<(PathBuf, Instant)>,
-    /// When something was put on the record of each run last, as its files stood then; none for what is no run.
+    /// Time of the last record of each run, with the stamp of its files at that time. `None` for a folder that is not a
+    /// run.
     known: HashMap<PathBuf, (Stamp, Option<Timestamp>)>,
-    /// The run that counted last, as its files stood then: it needs no second look.
+    /// Last current run, with the stamp of its files. While the stamp is unchanged, the run is not read again.
     settled: Option<(PathBuf, Stamp)>,
 }
 
@@ -34,7 +37,7 @@ impl Look {
         Self { runs: runs.to_owned(), told: Told::default(), silent: None, known: HashMap::new(), settled: None }
     }
 
-    /// Returns how the cell is; where that cannot be seen just now, as it was.
+    /// Returns the current status of the cell, or the last known status if the current one cannot be read.
     pub(super) fn now(&mut self) -> &Told {
         let live = control::live_runs(&self.runs).next();
         match live {
@@ -50,7 +53,7 @@ impl Look {
         &self.told
     }
 
-    /// Looks once more, on a thread of its own: a record is long, and a run may not answer.
+    /// Updates the status on its own thread, because a record can be long and a run can fail to answer.
     pub(super) async fn again(mut self) -> Self {
         let runs = self.runs.clone();
         let looked = tokio::task::spawn_blocking(move || {
@@ -60,12 +63,12 @@ impl Look {
         looked.await.unwrap_or_else(|_| Self::new(&runs))
     }
 
-    /// Returns what was found last.
+    /// Returns the last status found.
     pub(super) fn told(&self) -> &Told {
         &self.told
     }
 
-    /// Takes over how the run is that is on, which somebody else has heard.
+    /// Sets the status of the active run, which the caller received.
     pub(super) fn heard(&mut self, now: Now) {
         (self.told.now, self.silent) = (now, None);
     }
@@ -81,7 +84,8 @@ impl Look {
         self.silent = Some((run, since));
     }
 
-    /// No run listens: one may have begun or ended just now, was left, or is over.
+    /// Determines the status from the records. No run listens: a run is starting or ending, was interrupted, or is
+    /// over.
     fn by_the_records(&mut self) {
         let folders: Vec<PathBuf> = control::folders(&self.runs).collect();
         self.known.retain(|run, _| folders.contains(run));
@@ -94,7 +98,7 @@ impl Look {
         }
         let last = folders.iter().filter_map(|run| Some((self.last_recorded(run)?, run))).max();
         let Some((_, run)) = last else {
-            // Folders in which nothing stands are no runs; one that cannot be read is one of which nothing is known.
+            // A folder without files is not a run. The state of an unreadable run is unknown.
             match folders.iter().find(|run| run.join(DATABASE).is_file() && !self.known.contains_key(*run)) {
                 Some(run) if is_driven(run) => self.does_not_answer(run.clone()),
                 Some(run) => {
@@ -117,19 +121,20 @@ impl Look {
             }
             Ok(_) if is_driven(run) => return self.does_not_answer(run.clone()),
             Ok(RunSummary { machines_within, .. }) => self.told.now = Now::Gone { run: name(run), machines_within },
-            // It cannot be read just now.
+            // The record cannot be read at the moment.
             Err(_) => return,
         }
         (self.settled, self.silent) = (Some((run.clone(), at)), None);
     }
 
-    /// When something was put on the record of a run last; none for what is no run of a part, and what cannot be read.
+    /// Returns the time of the last record of a run. `None` for a folder that is not a run of a part or that cannot be
+    /// read.
     fn last_recorded(&mut self, run: &Path) -> Option<Timestamp> {
         let at = stamp(run);
         if let Some((_, last)) = self.known.get(run).filter(|(then, _)| *then == at) {
             return *last;
         }
-        // To look makes no journal where there is none.
+        // Reading does not create a journal.
         let reader = Reader::open(run).ok()?;
         let first = reader.records(0).next()?.ok()?;
         let last = reader.last().ok()??.utc.parse().ok()?;
@@ -139,7 +144,7 @@ impl Look {
     }
 }
 
-/// What a run is called.
+/// Returns the name of a run.
 pub(super) fn name(folder: &Path) -> String {
     folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
 }

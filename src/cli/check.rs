@@ -1,4 +1,4 @@
-//! `regrind check`: recipes and cell files, with every problem at its place.
+//! `regrind check`: checks recipes and cell files, and shows every problem at its position.
 
 use std::fs::File;
 use std::io::{self, IsTerminal, Read, Write};
@@ -40,7 +40,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// What was found in one file.
+/// Result of the check of one file.
 #[derive(Serialize)]
 struct CheckedFile {
     file: PathBuf,
@@ -52,13 +52,13 @@ struct CheckedFile {
     problems: Vec<ToldProblem>,
 }
 
-/// A good file.
+/// Summary of a valid file.
 struct Good {
     sha256: String,
     notes: Vec<String>,
 }
 
-/// One problem, for a program.
+/// One problem, as JSON.
 #[derive(Serialize)]
 struct ToldProblem {
     line: usize,
@@ -102,7 +102,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     }
 }
 
-/// Checks one file; returns its kind and what is to be said of a good one.
+/// Checks one file. Returns its kind, and its summary or its problems.
 fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     if has_table(path, &["[dialect]"]) {
         let good = |(_, sha256): (_, [u8; 32])| Good { sha256: hex(&sha256), notes: Vec::new() };
@@ -120,7 +120,7 @@ fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     ("recipe", checked)
 }
 
-/// Tells a kind of file by what only it has, even if the rest is broken.
+/// Returns true if the file has one of these tables. They identify the kind of a file even if the rest is invalid.
 fn has_table(path: &Path, heads: &[&str]) -> bool {
     const ENOUGH_BYTES: u64 = 1 << 20;
     let mut bytes = Vec::new();
@@ -162,7 +162,7 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
     problems.map_or(Ok(()), Err)
 }
 
-/// Reads the truth of a simulated cell as the simulator would.
+/// Reads the truth of a simulated cell in the same way as the simulator.
 fn check_simulation(recipe: &Recipe) -> Result<(), Problems> {
     let Some(table) = recipe.simulation.clone() else { return Ok(()) };
     let remedy = "correct it, or leave it out: every key has a usual value";
@@ -175,7 +175,7 @@ fn check_simulation(recipe: &Recipe) -> Result<(), Problems> {
     })
 }
 
-/// Shows every problem of a file at its place.
+/// Returns the value, or shows all problems of the file at their positions and returns a failure.
 pub(super) fn or_show<T>(read: Result<T, Problems>) -> Result<T, Failure> {
     read.map_err(|problems| match show(&problems) {
         Ok(()) => Failure::Checked { bad: 1, files: 1 },
@@ -183,7 +183,7 @@ pub(super) fn or_show<T>(read: Result<T, Problems>) -> Result<T, Failure> {
     })
 }
 
-/// Shows problems: with the lines they stand in on a terminal, one line each elsewhere.
+/// Shows problems: with their lines of text on a terminal, otherwise on one line each.
 fn show(problems: &Problems) -> Result<(), Failure> {
     let text = if io::stderr().is_terminal() {
         let columns = Term::stderr().size_checked().map_or(100, |(_, columns)| usize::from(columns));
@@ -198,7 +198,7 @@ fn show(problems: &Problems) -> Result<(), Failure> {
     }
 }
 
-/// Draws one problem: what is wrong, where, the line itself with what is allowed there, and the remedy.
+/// Draws one problem: the error, its position, the line of text with the allowed values, and the remedy.
 fn picture(problems: &Problems, problem: &Problem, renderer: &Renderer) -> String {
     let key = if problem.key.is_empty() { String::new() } else { format!("`{}` ", problem.key) };
     let title = Level::ERROR.primary_title(format!("{key}{}", problem.found));

@@ -1,4 +1,4 @@
-//! Arguments that are one word of an enum: its words are serde's, their help is what its comments say.
+//! Arguments that are one word of an enum. The words are serde's; their help comes from the doc comments.
 
 use std::ffi::OsStr;
 use std::marker::PhantomData;
@@ -9,10 +9,10 @@ use serde::de::DeserializeOwned;
 use serde::de::value::{Error, StrDeserializer};
 use serde_json::Value;
 
-/// Reads a word of an enum.
+/// Parser of a word of an enum.
 pub(super) struct WordOf<T>(PhantomData<fn() -> T>);
 
-/// Returns what reads a word of an enum.
+/// Returns the parser of a word of an enum.
 pub(super) fn word_of<T>() -> WordOf<T> {
     WordOf(PhantomData)
 }
@@ -28,7 +28,7 @@ impl<T: Clone + DeserializeOwned + JsonSchema + Send + Sync + 'static> TypedValu
 
     fn parse_ref(&self, command: &clap::Command, name: Option<&clap::Arg>, value: &OsStr) -> Result<T, clap::Error> {
         let read = |word: &str| T::deserialize(StrDeserializer::<Error>::new(word)).ok();
-        // One that is no word clap tells with the words that are, and the one that was probably meant.
+        // clap reports an unknown word with the allowed words and the most similar one.
         match value.to_str().and_then(read) {
             Some(known) => Ok(known),
             None => PossibleValuesParser::new(words::<T>())

@@ -1,4 +1,4 @@
-//! `regrind compensate`: corrects a program that exists already by a map of the part's error.
+//! `regrind compensate`: corrects an existing program by a map of the part's error.
 
 use std::path::PathBuf;
 
@@ -84,7 +84,7 @@ cuts air, unless its zero is set lower.
 
 Exit codes: 0 written; 2 bad arguments or data; 3 fault.";
 
-/// What is told.
+/// Output as JSON.
 #[derive(Serialize)]
 struct Document<'a> {
     simulation: bool,
@@ -101,7 +101,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         return Err(Failure::Program(GcodeError::Program { path, what, remedy: "give another name to --out" }));
     }
     let map = read_program_map(&arguments.map).map_err(Failure::Program)?;
-    // An error is taken off; a correction is what the surface is to be moved by.
+    // An error is subtracted. A correction is already the displacement of the surface.
     let sign = if map.kind == MapKind::Error { -arguments.gain } else { arguments.gain };
     let values_mm = map.values_mm.iter().map(|v| sign * v).collect();
     let tip_mm = arguments.tip_of_radius.unwrap_or(0.0);
@@ -126,7 +126,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Summarises the corrected program in lines.
+/// Returns a summary of the corrected program, as lines.
 fn summary(amended: &Amended) -> String {
     let mut text = format!(
         "{} straight moves and {} arcs became {} moves, {} arcs among them; no point moved by more than {} um\n",
@@ -149,7 +149,7 @@ fn summary(amended: &Amended) -> String {
     text
 }
 
-/// Beyond its grid a map is levelled off within so many nodes.
+/// Distance in nodes within which a map is levelled off outside its grid.
 const LEVEL_OFF_NODES: f64 = 5.0;
 
 /// Reads the nominal surface.

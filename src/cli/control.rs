@@ -1,4 +1,4 @@
-//! `regrind hold | stop | abort | confirm | status`: a running cell from another terminal.
+//! `regrind hold | stop | abort | confirm | status`: controls a running cell from another terminal.
 
 use std::fmt::Write as _;
 use std::io;
@@ -16,7 +16,7 @@ use super::failure::Failure;
 use super::show::{how_far, limits, pv_name, so_far};
 use super::words::time_left;
 
-/// What stands below the help of each order.
+/// Returns the text after the help of each order.
 pub(super) fn help(example: &str) -> String {
     format!(
         "\
@@ -96,7 +96,7 @@ enum What {
     Over,
 }
 
-/// Gives an order that is made of the reason for it.
+/// Sends an order. `order` builds it from its reason.
 pub(super) fn order(arguments: &Arguments, order: fn(String) -> Request) -> Result<Outcome, Failure> {
     give(arguments.run.as_deref(), &order(arguments.reason.clone()), arguments.json)
 }
@@ -124,7 +124,7 @@ fn named_map(arguments: &Confirmation) -> Result<Option<String>, Failure> {
     }
 }
 
-/// The file as the running cell finds it, which may have been started in another folder.
+/// Returns the absolute path of the named file, because the cell can run in another folder.
 fn named_file(arguments: &Confirmation) -> Result<Option<PathBuf>, Failure> {
     let absolute =
         |path: &PathBuf| path.canonicalize().map_err(|source| Failure::NoFile { path: path.clone(), source });
@@ -135,7 +135,8 @@ pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<
     let folder = run.map_or_else(|| live(Path::new("runs")), |run| Ok(run.to_owned()))?;
     let asked = |request: &Request| reached(&folder, request).map_err(|source| Failure::unreached(&folder, source));
     let reply = match request {
-        // Meant for the state in which the cell is now: another terminal may hold it meanwhile, and then the hold stands.
+        // The resume applies to the current state of the cell. If another terminal gives a hold in the meantime, that
+        // hold stays.
         Request::Resume { reason, seen: None } => {
             let seen = Some(asked(&Request::Status)?.status.number);
             asked(&Request::Resume { reason: reason.clone(), seen })?
@@ -146,7 +147,8 @@ pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<
     if reply.taken { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
 }
 
-/// Asks the cell of a run folder; where nobody listens there, by the door beside the lock of its machines.
+/// Sends a request to the cell of a run folder. If nobody listens there, uses the socket next to the lock of its
+/// machines.
 fn reached(folder: &Path, request: &Request) -> io::Result<Reply> {
     match ask(folder, request) {
         Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused) => {
@@ -156,7 +158,7 @@ fn reached(folder: &Path, request: &Request) -> io::Result<Reply> {
     }
 }
 
-/// Whether a program drives the run of a folder, by the door in the folder or the one beside the lock of its machines.
+/// Returns true if a program drives the run of a folder: it listens in the folder or next to the lock of its machines.
 pub(super) fn is_driven(folder: &Path) -> bool {
     is_live(folder) || door_beside_lock(folder).is_some()
 }
@@ -166,12 +168,12 @@ fn door_beside_lock(folder: &Path) -> Option<PathBuf> {
     beside_locks().find(|(of, _)| is_same(of, &run)).map(|(_, door)| door)
 }
 
-/// The runs that have machines on this computer, and whose cell listens beside the lock of these.
+/// Returns the runs that hold machines on this computer and whose cells listen next to the machine locks.
 fn beside_locks() -> impl Iterator<Item = (PathBuf, PathBuf)> {
     MachineLock::doors().into_iter().filter(|(_, door)| is_live_at(door))
 }
 
-/// Whether two paths are one, however they are written; what is gone is told by its name alone.
+/// Returns true if two paths have the same components. The files need not exist.
 fn is_same(a: &Path, b: &Path) -> bool {
     a.components().eq(b.components())
 }
@@ -186,7 +188,7 @@ fn show(reply: &Reply, request: &Request, folder: &Path, json: bool) -> Result<(
     super::print(&told(&reply.status, folder))
 }
 
-/// Says how a cell is, the most urgent first.
+/// Returns the status of a cell as text, the most urgent information first.
 fn told(status: &Snapshot, folder: &Path) -> String {
     let mut text = String::new();
     let marked = if status.simulation { "SIMULATION  " } else { "" };
@@ -224,21 +226,21 @@ fn told(status: &Snapshot, folder: &Path) -> String {
     text
 }
 
-/// Returns the folder of a run that was named, or that of the newest run.
+/// Returns the folder of the named run, or of the newest run.
 pub(super) fn folder_of(run: Option<&Path>) -> Result<PathBuf, Failure> {
     run.map(Path::to_owned).or_else(|| newest(Path::new("runs"))).ok_or_else(|| Failure::NoRun { path: "runs".into() })
 }
 
-/// Returns the folder of the run that goes on now; where none does, of the one that was made last.
+/// Returns the folder of the active run, or of the newest run if none is active.
 pub(super) fn live(runs: &Path) -> Result<PathBuf, Failure> {
     live_or(runs, newest)
 }
 
-/// The same, with what is meant where none goes on.
+/// Returns the folder of the active run, or the result of `otherwise` if none is active.
 pub(super) fn live_or(runs: &Path, otherwise: fn(&Path) -> Option<PathBuf>) -> Result<PathBuf, Failure> {
     let mut live: Vec<_> = folders(runs).filter(|folder| is_live(folder)).collect();
     if live.is_empty() {
-        // Its folder may be gone while the cell goes on.
+        // The cell can still run after its folder was removed.
         let absolute = std::path::absolute(runs).unwrap_or_else(|_| runs.to_owned());
         let of_these = |run: &PathBuf| run.parent().is_some_and(|above| is_same(above, &absolute));
         live = beside_locks().map(|(run, _)| run).filter(of_these).collect();
@@ -254,7 +256,7 @@ pub(super) fn live_or(runs: &Path, otherwise: fn(&Path) -> Option<PathBuf>) -> R
     }
 }
 
-/// The folders of the runs that are on.
+/// Returns the folders of the active runs.
 #[cfg(feature = "plant")]
 pub(super) fn live_runs(runs: &Path) -> impl Iterator<Item = PathBuf> {
     folders(runs).filter(|folder| is_live(folder))
@@ -262,12 +264,12 @@ pub(super) fn live_runs(runs: &Path) -> impl Iterator<Item = PathBuf> {
 
 pub(super) fn folders(runs: &Path) -> impl Iterator<Item = PathBuf> {
     let entries = std::fs::read_dir(runs).into_iter().flatten().filter_map(io::Result::ok);
-    // What begins with a dot is kept beside the runs, and is none.
+    // A hidden entry is kept next to the runs and is not a run.
     let is_hidden = |entry: &std::fs::DirEntry| entry.file_name().to_string_lossy().starts_with('.');
     entries.filter(move |entry| !is_hidden(entry)).map(|entry| entry.path()).filter(|path| path.is_dir())
 }
 
-/// Returns the newest run that has no end on record; where all have, the newest.
+/// Returns the newest run without a recorded end, or the newest run if all have ended.
 pub(super) fn unfinished(runs: &Path) -> Option<PathBuf> {
     let is_open = |folder: &PathBuf| {
         let Ok(reader) = Reader::open(folder) else { return false };
@@ -285,7 +287,8 @@ fn newest(runs: &Path) -> Option<PathBuf> {
     folders(runs).max_by_key(|folder| began(folder))
 }
 
-/// When a run began, by its first record, or else by its name; text that sorts as time does. Whoever touches a folder does not make it newer.
+/// Returns the time at which a run began, from its first record or else from its name, as text that sorts by time.
+/// Changes to a folder do not make a run newer.
 fn began(folder: &Path) -> Option<String> {
     let by_record = || {
         let reader = Reader::open(folder).ok()?;

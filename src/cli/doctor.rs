@@ -1,4 +1,4 @@
-//! `regrind doctor`: does anything stand in the way of a run? Nothing is moved, and nothing is taken.
+//! `regrind doctor`: checks whether anything prevents a run. It moves nothing and keeps no machine.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
@@ -48,7 +48,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// Something that was looked at.
+/// Result of one check.
 #[derive(Serialize)]
 struct Finding {
     what: String,
@@ -107,10 +107,10 @@ fn in_words(finding: &Finding) -> String {
     format!("{mark:<9}{what}: {words}\n")
 }
 
-/// Whether runs can be written, and how much of them.
+/// Checks whether runs can be written, and how much space there is.
 fn folder(runs: &Path) -> Finding {
     const LITTLE_BYTES: u64 = 1 << 30;
-    // One that is not there yet is made, tried, and taken away again.
+    // A missing folder is created, tested, and removed again.
     let written = if runs.is_dir() { try_writing(runs) } else { ResultFolder::prepare(runs).map(drop) };
     let free = free_bytes(runs).unwrap_or(u64::MAX);
     match written {
@@ -127,7 +127,8 @@ fn folder(runs: &Path) -> Finding {
     }
 }
 
-/// Runs into which every user of the computer may look, as those of earlier versions: who reads a record can hold it up.
+/// Finds runs that every user of the computer can read, as those of earlier versions. A reader of a record can block
+/// its writer.
 fn open_runs(runs: &Path) -> Option<Finding> {
     let open = control::folders(runs).filter(|folder| is_open_to_all(folder)).count();
     let words = format!(
@@ -137,9 +138,9 @@ fn open_runs(runs: &Path) -> Option<Finding> {
     (open > 0).then(|| Finding::new("runs", Found::Notice, words))
 }
 
-/// Whether the clock goes on from what was recorded.
+/// Checks that the clock is not before the recorded times.
 fn clock(runs: &Path) -> Finding {
-    /// When this was written; no clock that is right shows less.
+    /// Date of this code. A correct clock shows no earlier time.
     const LEAST: &str = "2026-01-01T00:00:00Z";
     let now = utc(SystemTime::now());
     let last = control::folders(runs)
@@ -170,7 +171,8 @@ fn signing() -> Finding {
     }
 }
 
-/// Whether a recipe can be run on the cell: the reference sphere clear of the part, everything within the limits of the machines.
+/// Checks whether the cell can run a recipe: the reference sphere is clear of the part, and all values are within the
+/// limits of the machines.
 fn fits(recipe: &Path, cell: &CellConfig) -> Result<String, Failure> {
     let recipe = check::or_show(Recipe::read(recipe))?;
     let (task, _) = setup::prepare(&recipe, cell).map_err(Failure::Setup)?;
@@ -197,7 +199,7 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
     ]
 }
 
-/// A server that keeps no job: a session is opened, it is asked who it is and how it stands, and the session is ended.
+/// Checks a server that runs no job: opens a session, requests identity and status, and ends the session.
 async fn server<M: Machine>(kind: MachineKind, link: &Link, made: Result<M, MakingError>) -> Finding {
     let what = match kind {
         MachineKind::Cmm => Device::Cmm,
@@ -223,10 +225,10 @@ async fn server<M: Machine>(kind: MachineKind, link: &Link, made: Result<M, Maki
     Finding::of(&what, looked.await)
 }
 
-/// How long lines are waited for.
+/// Time for which a line is listened to.
 const LISTENS: Duration = Duration::from_secs(5);
 
-/// A machine that only prints: its line is opened, and what it prints meanwhile is told, with the formats that it fits.
+/// Checks a machine that only prints: opens its line, and reports the lines that arrive with the matching formats.
 async fn heard(link: &Link, made: Result<impl Machine, MakingError>) -> Finding {
     let what = Device::Cmm.to_string();
     let _taken = match take(link, MachineKind::Cmm, Path::new("regrind doctor")) {
@@ -275,7 +277,7 @@ async fn machine<M: Machine>(
         Device::Cmm => (MachineKind::Cmm, &cell.cmm.link),
         Device::Grinder => (MachineKind::Grinder, &cell.grinder.link),
     };
-    // Whoever has it is at work with it, and a second client would be in the way.
+    // The holder of the lock works with the machine, and a second client would disturb it.
     let _taken = match take(link, kind, Path::new("regrind doctor")) {
         Ok(taken) => taken,
         Err(failure) => return Finding::new(what, Found::Notice, failure.to_string()),

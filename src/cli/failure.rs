@@ -1,4 +1,4 @@
-//! Why a command could not do its work, in one sentence with its remedy, and the exit code for it.
+//! Reason why a command failed, in one sentence with its remedy, and its exit code.
 
 use std::io;
 use std::net::SocketAddr;
@@ -16,14 +16,14 @@ use regrind::surface::{DefinitionError, SurfaceError};
 use regrind_plant::PlantError;
 use thiserror::Error;
 
-/// What was looked at is not as it should be.
+/// Exit code if the checked object is not as it must be.
 const NOT_AS_IT_SHOULD_BE: u8 = 1;
-/// Bad arguments, recipe or data.
+/// Exit code for invalid arguments, recipe or data.
 const BAD_INPUT: u8 = 2;
-/// A fault of the machine or of the program.
+/// Exit code for a fault of the machine or of the program.
 pub(super) const FAULT: u8 = 3;
 
-/// Why a command ended without a result.
+/// Reason why a command ended without a result.
 #[derive(Debug, Error)]
 pub(super) enum Failure {
     #[error(transparent)]
@@ -64,7 +64,7 @@ pub(super) enum Failure {
     TooMuchLearned { run: String, source: NextPassError },
     #[error("{path}: {reason}")]
     Simulation { path: PathBuf, reason: String },
-    /// The record was read and cannot be believed.
+    /// The record was read and is not trustworthy.
     #[error(transparent)]
     Broken(JournalError),
     #[error("{}: {flaws} flaw(s) among the runs, the first: {first}", .runs.display())]
@@ -199,7 +199,7 @@ pub(super) enum Failure {
     Ended { reason: String },
     #[error("the result cannot be told: {what} is not a finite number; please report it with the files that led to it")]
     NotFinite { what: &'static str },
-    /// The input was good and the place was writable before; now it is not.
+    /// The input was valid and the place was writable before, but writing failed.
     #[error("the result could not be saved: {0}")]
     NotSaved(FormatError),
     #[error("signals of the operating system cannot be heard: {0}")]
@@ -211,13 +211,14 @@ pub(super) enum Failure {
 #[cfg(feature = "plant")]
 impl From<PlantError> for Failure {
     fn from(error: PlantError) -> Self {
-        // Large, and rare.
+        // Boxed because it is large and rare.
         Self::Plant(Box::new(error))
     }
 }
 
 impl Failure {
-    /// A cell that could not be asked: where this user may not ask, nobody knows whether one runs there.
+    /// Returns the failure for a cell that cannot be reached. If this user has no permission, it is unknown whether a
+    /// cell runs there.
     pub(super) fn unreached(folder: &std::path::Path, source: io::Error) -> Self {
         let path = folder.to_owned();
         match source.kind() {
@@ -267,7 +268,7 @@ impl Failure {
         }
     }
 
-    /// Names the file or the argument that a registration failed for.
+    /// Returns the failure of a registration with the name of the file or argument that caused it.
     pub(super) fn of_registration(source: RegistrationError, nominal: &Path, measured: &Path) -> Self {
         use RegistrationError::*;
         let hint = match source {

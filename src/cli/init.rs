@@ -1,4 +1,4 @@
-//! `regrind init`: a folder in which a shop begins.
+//! `regrind init`: creates a folder with which a shop can begin.
 
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal};
@@ -51,7 +51,7 @@ enum Machines {
 }
 
 impl Machines {
-    /// The cell that ships for them.
+    /// Returns the text of the shipped cell file for these machines.
     fn cell(self) -> &'static str {
         match self {
             Self::Simulated => include_str!("../../config/sim.toml"),
@@ -62,16 +62,16 @@ impl Machines {
         }
     }
 
-    /// The recipe that goes with that cell.
+    /// Returns the recipe for that cell, and the name of its part.
     fn recipe(self) -> (&'static str, &'static str) {
         match self {
-            // Machines that take files have no pattern of ours.
+            // Machines that exchange files have no pattern from Regrind.
             Self::Files => (include_str!("../../recipes/telescope-panel.toml"), "telescope primary mirror"),
             _ => (include_str!("../../recipes/freeform-mirror.toml"), "free-form mirror"),
         }
     }
 
-    /// What is typed to make a part, a line each with what it is for.
+    /// Returns the commands to make a part, each with its purpose.
     fn commands(self) -> Vec<(&'static str, &'static str)> {
         let run = "regrind run recipe.toml --cell cell.toml --part SN-0001 --operator \"Your Name\"";
         let before = match self {
@@ -105,14 +105,15 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     make(&folder, machines, recipe_of(recipe, shipped_name, name), name)
 }
 
-/// What is to be made.
+/// Files to create.
 struct Wanted {
     folder: PathBuf,
     machines: Machines,
     part: Option<String>,
 }
 
-/// What was given; what was not, a person at a terminal is asked for. Who gave the folder has said enough.
+/// Returns the values from the arguments. A person at a terminal is asked for missing ones, unless the folder was
+/// given.
 fn wanted(arguments: &Arguments) -> Result<Wanted, Failure> {
     let Arguments { folder, machines, part } = arguments.clone();
     if let Some(folder) = folder {
@@ -149,12 +150,12 @@ fn ask_for_machines() -> Result<Machines, Failure> {
     })
 }
 
-/// Asks until the answer will do; Enter alone takes the usual one.
+/// Asks until the answer is valid. Enter alone selects the default.
 fn ask<T>(question: &str, usual: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<T, Failure> {
     loop {
         super::print(&format!("{question} [{usual}]: "))?;
         let mut line = String::new();
-        // The end of the input is no answer, and there will be none.
+        // The end of the input is not an answer, and no answer can follow.
         if io::stdin().read_line(&mut line).unwrap_or(0) == 0 {
             return Err(Failure::NoFolder);
         }
@@ -186,7 +187,7 @@ fn make(folder: &Path, machines: Machines, recipe: String, name: &str) -> Result
     Ok(Outcome::Accepted)
 }
 
-/// The recipe for a folder of its own.
+/// Returns the recipe with the name of the new part.
 fn recipe_of(shipped: &str, shipped_name: &str, name: &str) -> String {
     let named = toml::Value::String(name.to_owned()).to_string();
     shipped
@@ -197,7 +198,7 @@ fn recipe_of(shipped: &str, shipped_name: &str, name: &str) -> String {
         .replace("config/file-exchange.toml", "cell.toml")
 }
 
-/// The cell for a folder of its own: what it names lies in it.
+/// Returns the cell file for a separate folder, with the files that it names in that folder.
 fn cell_of(shipped: &str) -> String {
     let text = shipped
         .replace("../docs/cell.schema.json", "cell.schema.json")
@@ -206,7 +207,7 @@ fn cell_of(shipped: &str) -> String {
     let text =
         text.replace("recipes/telescope-panel.toml", "recipe.toml").replace("config/serial-rtu.toml", "cell.toml");
     let text = text.replace("config/modbus-tcp.toml", "cell.toml");
-    // What ships beside it is not here.
+    // The other shipped files are not in this folder.
     text.replace(" With several stations: config/laser-tracker.toml.", "")
 }
 

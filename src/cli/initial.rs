@@ -1,4 +1,4 @@
-//! The pose of `--initial`: sixteen numbers as JSON or text, or what an earlier registration left.
+//! Initial pose of `--initial`: sixteen numbers as JSON or text, or the result of an earlier registration.
 
 use std::fs::File;
 use std::io::Read;
@@ -9,7 +9,7 @@ use serde::Deserialize;
 
 use super::failure::Failure;
 
-/// Far more than a registration leaves behind.
+/// Maximum size of the file: far more than the result of a registration.
 const MOST_BYTES: u64 = 64 << 20;
 
 type Rows = [[f64; 4]; 4];
@@ -20,10 +20,10 @@ struct Earlier {
     cmm_from_model: Rows,
 }
 
-/// Reads a pose `cmm_from_model`, in millimetres.
+/// Reads a pose `cmm_from_model`, in mm.
 ///
 /// # Errors
-/// A file that cannot be read, that is neither JSON nor sixteen numbers, or whose numbers are no rigid pose.
+/// Returns an error if the file cannot be read, is neither JSON nor sixteen numbers, or does not hold a rigid pose.
 pub(super) fn read_pose(path: &Path) -> Result<Pose, Failure> {
     let failed = |reason: String| Failure::Initial { path: path.to_owned(), reason };
     let mut bytes = Vec::new();

@@ -1,4 +1,4 @@
-//! `regrind audit key`: where the key of this computer lies, making it, and the public half on its way to quality.
+//! `regrind audit key`: shows and creates the key of this computer, and exports the public key for quality assurance.
 
 use std::env;
 use std::io;
@@ -12,7 +12,7 @@ use super::Outcome;
 use super::failure::Failure;
 use super::outside::settings_folder;
 
-/// Names the file of the key; empty, there is to be none.
+/// Environment variable with the file of the key. If empty, no key is used.
 const KEY: &str = "REGRIND_KEY";
 
 /// Make the key that signs the records of this computer, once, and print its public half
@@ -57,7 +57,7 @@ fn made_or_read(path: &Path) -> Result<(AuditKey, bool), JournalError> {
     }
     match AuditKey::make(path) {
         Ok(key) => Ok((key, true)),
-        // Another process may have made it at the same moment.
+        // Another process can have created it at the same moment.
         Err(JournalError::File { source, .. }) if source.kind() == io::ErrorKind::AlreadyExists => {
             Ok((AuditKey::read(path)?, false))
         }
@@ -77,13 +77,13 @@ fn in_words(public: &PublicKey, path: &Path, made: bool) -> String {
     )
 }
 
-/// Where the key of a user is to be.
+/// Place of a user's key.
 enum Place {
-    /// Somebody said so: it must be there.
+    /// Named by the user: the key must exist.
     Named(PathBuf),
-    /// Somebody said that there is to be none.
+    /// Excluded by the user: no key is used.
     Nowhere,
-    /// Where programs keep their settings: there may be none.
+    /// Default folder of settings. The key is optional.
     Usual(Option<PathBuf>),
 }
 
@@ -104,7 +104,7 @@ impl Place {
     }
 }
 
-/// Returns the key with which a run of this user signs; none if it has none.
+/// Returns the key that signs the runs of this user, or `None` if there is no key.
 pub(super) fn of_this_user() -> Result<Option<AuditKey>, Failure> {
     let path = match Place::of_this_user() {
         Place::Usual(Some(path)) if path.exists() => path,
@@ -114,7 +114,7 @@ pub(super) fn of_this_user() -> Result<Option<AuditKey>, Failure> {
     AuditKey::read(&path).map(Some).map_err(Failure::Journal)
 }
 
-/// Reads a public key of the command line: its digits, or the file that it was kept in.
+/// Parses a public key of the command line: its digits, or the path of its file.
 pub(super) fn public(word: &str) -> Result<PublicKey, String> {
     if let Ok(key) = word.parse() {
         return Ok(key);

@@ -1,4 +1,4 @@
-//! A run in this process: its machines, its terminal, and what is done from outside to end it.
+//! Run in this process: its machines, its terminal, and the events from outside that end it.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -18,39 +18,39 @@ use super::failure::Failure;
 use super::outside::{self, Endings};
 use super::show::{Show, reads_keys};
 
-/// What a run is driven by.
+/// Context of a run.
 pub(super) struct Live<'a> {
     pub(super) recipe: &'a Recipe,
     pub(super) cell: &'a CellConfig,
-    /// What the part is called in files.
+    /// Name of the part in files.
     pub(super) part: &'a str,
-    /// The folder of the run.
+    /// Folder of the run.
     pub(super) folder: &'a Path,
-    /// The number of the part's run, for the machines.
+    /// Number of the part's run, for the machines.
     pub(super) job: u32,
     pub(super) actor: Actor,
     pub(super) json: bool,
 }
 
-/// The machines of a run. Until this is dropped no other run on this computer has them.
+/// Machines of a run. Other runs on this computer cannot use them until this value is dropped.
 pub(super) struct Machines {
     cmm: AnyCmm,
     grinder: AnyGrinder,
     taken: [Option<MachineLock>; 2],
 }
 
-/// What a run is made of besides its machines.
+/// Inputs of a run besides its machines.
 pub(super) struct Work {
     pub(super) task: Task,
     pub(super) plan: regrind::cell::CellPlan,
     pub(super) journal: Journal,
-    /// Whether loading the part is not asked for.
+    /// True if no confirmation that the part is loaded is required.
     pub(super) loaded: bool,
     pub(super) interrupted: Option<Interrupted>,
 }
 
 impl Live<'_> {
-    /// Takes the machines and opens their wires; nothing is asked of them yet. `now` is the time as an epoch.
+    /// Locks the machines and opens their wires. Sends nothing to them. `now` is the time as an epoch.
     pub(super) fn open(&self, now: u32) -> Result<Machines, Failure> {
         let Self { recipe, cell, part, folder, .. } = self;
         let taken =
@@ -60,7 +60,7 @@ impl Live<'_> {
         Ok(Machines { cmm, grinder, taken })
     }
 
-    /// Lets the run go to its end and its report.
+    /// Runs until the end and writes the report.
     pub(super) async fn carry_out(self, machines: Machines, work: Work) -> Result<Ending, Failure> {
         let (cell, actor) = (self.cell, self.actor);
         let (notices, shown) = mpsc::unbounded_channel();
@@ -75,7 +75,7 @@ impl Live<'_> {
             Run { plan, task, journal, job: self.job, actor: actor_of_run, loaded, poll, notices, interrupted, beside };
         let ending = go(run, machines, actor).await?;
         let shown = showing.await.map_err(|e| Failure::Terminal(e.into()));
-        // The record is closed; a report that cannot be written must not change how the run ended, nor a terminal that has gone.
+        // The record is closed. A failed report or a closed terminal must not change the result of the run.
         let report = regrind::report::write_run_report(self.folder);
         shown??;
         if let Err(error) = report {
@@ -85,13 +85,13 @@ impl Live<'_> {
     }
 }
 
-/// Gives the run its machines and lets it go.
+/// Gives the machines to the run and starts it.
 async fn go(run: Run, machines: Machines, actor: Actor) -> Result<Ending, Failure> {
     let folder = run.journal.folder().to_owned();
     let Machines { cmm, grinder, taken } = machines;
     let (mut drive, orders) =
         Drive::with_cell(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
-    // One door beside the locks is enough, and a cell without one can be given orders all the same.
+    // One socket next to the locks is enough. A cell without it still receives orders in its folder.
     if let Some(door) = taken.iter().flatten().map(MachineLock::door).next()
         && let Err(error) = drive.listen_beside(door)
     {
@@ -108,7 +108,7 @@ async fn go(run: Run, machines: Machines, actor: Actor) -> Result<Ending, Failur
     Ok(ending)
 }
 
-/// Ctrl-C once holds at the next safe place, twice aborts. After a resume it counts from one again.
+/// Holds at the next safe place on the first Ctrl-C and aborts on the second. After a resume the count starts again.
 async fn heed_ctrl_c(orders: Orders, actor: Actor) {
     let mut held_at: Option<Instant> = None;
     while tokio::signal::ctrl_c().await.is_ok() {
@@ -123,17 +123,19 @@ async fn heed_ctrl_c(orders: Orders, actor: Actor) {
     }
 }
 
-/// Enter says that the part is loaded, where a person at this terminal is asked for it. Keys that were pressed ahead confirm nothing.
+/// Confirms the loaded part on Enter, if a person at this terminal is asked for it. Keys pressed earlier confirm
+/// nothing.
 async fn heed_enter(orders: Orders, actor: Actor) {
     let mut status = orders.status();
     if status.wait_for(|seen| seen.next_step == Next::Load).await.is_err() || !reads_keys() {
         return;
     }
-    // What cannot be thrown away is taken for an answer of nobody.
+    // If earlier input cannot be discarded, Enter is not accepted as a confirmation.
     if outside::forget_what_was_typed().is_err() {
         return;
     }
-    // A thread of its own, for a terminal is waited for; no longer than somebody is asked, and only while the program has it.
+    // Own thread, because reading a terminal blocks. It stops when nobody is asked or when the program loses the
+    // terminal.
     let still_asked = move || status.has_changed().is_ok() && status.borrow().next_step == Next::Load;
     let typed = tokio::task::spawn_blocking(move || {
         while still_asked() {
@@ -148,10 +150,10 @@ async fn heed_enter(orders: Orders, actor: Actor) {
     }
 }
 
-/// Between two looks whether a person is still asked.
+/// Time between two checks whether a person is still asked.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
-/// The first ends the run in order, the next one aborts it. A terminal that closes may say so twice.
+/// Ends the run in order on the first event and aborts it on the next. A closing terminal can send the event twice.
 async fn heed_endings(mut endings: Endings, orders: Orders, actor: Actor) {
     let mut first: Option<Instant> = None;
     while let Some(outside::Ending { by, hung_up }) = endings.next().await {
@@ -165,7 +167,7 @@ async fn heed_endings(mut endings: Endings, orders: Orders, actor: Actor) {
     }
 }
 
-/// Keeps a machine on a line from every other run on this computer.
+/// Locks a machine on a line against all other runs on this computer.
 pub(super) fn take(link: &Link, kind: MachineKind, run: &Path) -> Result<Option<MachineLock>, Failure> {
     let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
     let on_line = link.wire.line().map(|(line, unit)| format!("{kind} at {line}, unit {unit}"));
@@ -179,12 +181,13 @@ pub(super) fn take(link: &Link, kind: MachineKind, run: &Path) -> Result<Option<
     Ok(taken)
 }
 
-/// A number for this run as a client of its machines, the same whoever goes on with it.
+/// Returns the number of this run as a client of its machines. It depends only on the station and the run folder, so it
+/// is the same for every person who resumes the run.
 pub(super) fn owner(actor: &Actor, run: &Path) -> u32 {
     let mut hash = crc32fast::Hasher::new();
     hash.update(b"regrind ");
     hash.update(actor.station.as_bytes());
-    // However it was typed.
+    // The result does not depend on the notation of the path.
     let run: std::path::PathBuf = std::path::absolute(run).unwrap_or_else(|_| run.to_owned()).components().collect();
     hash.update(run.as_os_str().as_encoded_bytes());
     hash.finalize().max(1)
@@ -193,7 +196,7 @@ pub(super) fn owner(actor: &Actor, run: &Path) -> u32 {
 pub(super) fn outcome(ending: &Ending) -> Result<Outcome, Failure> {
     match ending {
         Ending::Accepted { .. } => Ok(Outcome::Accepted),
-        // That a person has it end in order is no fault.
+        // An orderly end by a person is not a fault.
         Ending::NotAccepted { .. } | Ending::Stopped { ordered: true, .. } => Ok(Outcome::NotInTolerance),
         Ending::Stopped { reason, .. } | Ending::Aborted { reason, .. } => {
             Err(Failure::Ended { reason: reason.clone() })
@@ -201,5 +204,5 @@ pub(super) fn outcome(ending: &Ending) -> Result<Outcome, Failure> {
     }
 }
 
-/// Two presses within this are one wish, whatever the cell has made of the first by then.
+/// Two presses within this time count as one, even if the state of the cell changed after the first.
 const IN_ONE_GO: Duration = Duration::from_secs(3);

@@ -1,4 +1,4 @@
-//! The command line: one file per command, and the only room that prints or exits.
+//! Command line: one file per command. Only this module prints or exits.
 
 mod accuracy;
 mod audit;
@@ -112,16 +112,16 @@ enum Command {
 
 const EXIT_CODES: &str = "Exit codes: 0 accepted; 1 finished, not in tolerance; 2 bad arguments or data; 3 fault.";
 
-/// How a command that did its work ended.
+/// Outcome of a successful command.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Outcome {
     Accepted,
     NotInTolerance,
-    /// The run that was looked at goes on, and its end is still to come.
+    /// The inspected run is active and has not ended.
     UnderWay,
 }
 
-/// Reads the arguments, carries the command out, and returns the exit code.
+/// Parses the arguments, runs the command, and returns the exit code.
 pub fn main() -> ExitCode {
     std::panic::set_hook(Box::new(|panic| {
         eprintln!("error: a fault of the program itself: {panic}; please report it with the files that led to it");
@@ -133,7 +133,7 @@ fn run() -> ExitCode {
     let arguments = match Arguments::try_parse() {
         Ok(arguments) => arguments,
         Err(error) => {
-            // Nobody is left to tell if the terminal itself fails.
+            // If the terminal itself fails, the error cannot be reported.
             let _ = error.print();
             return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(failure::FAULT));
         }
@@ -187,15 +187,15 @@ fn run() -> ExitCode {
     }
 }
 
-/// Returns what asynchronous commands run on.
+/// Returns the runtime of asynchronous commands.
 fn runtime() -> Result<tokio::runtime::Runtime, Failure> {
     tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().map_err(Failure::Terminal)
 }
 
-/// Writes text to the terminal; a reader that has gone away is no fault.
+/// Prints text. A reader that is gone is not an error.
 fn print(text: &str) -> Result<(), Failure> {
     let mut out = io::stdout().lock();
-    // A question has no end of a line, and is to be seen.
+    // A question has no line end, so it needs a flush.
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Failure::Terminal(error)),
         _ => Ok(()),
@@ -209,7 +209,7 @@ fn print_json(value: &impl serde::Serialize) -> Result<(), Failure> {
     print(&text)
 }
 
-/// Reads what a person, a part or a place is called.
+/// Parses the name of a person, a part or a place.
 fn name(text: &str) -> Result<String, String> {
     const LONGEST: usize = 300;
     match (misleading(text), text.trim()) {
@@ -223,12 +223,12 @@ fn name(text: &str) -> Result<String, String> {
     }
 }
 
-/// Reads what a person has to say, which may be nothing.
+/// Parses the remark of a person, which can be empty.
 fn remark(text: &str) -> Result<String, String> {
     if text.trim().is_empty() { Ok(String::new()) } else { name(text) }
 }
 
-/// Reads a number above 0; `inf` is one.
+/// Parses a number above 0, including `inf`.
 fn above_zero(text: &str) -> Result<f64, String> {
     match text.trim().parse::<f64>() {
         Ok(value) if value > 0.0 => Ok(value),
@@ -236,12 +236,12 @@ fn above_zero(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Reads a finite number above 0.
+/// Parses a finite number above 0.
 fn finite_above_zero(text: &str) -> Result<f64, String> {
     above_zero(text).and_then(|v| if v.is_finite() { Ok(v) } else { Err("give a finite number above 0".into()) })
 }
 
-/// Reads a finite number, 0 or above.
+/// Parses a finite number, 0 or above.
 fn finite_from_zero(text: &str) -> Result<f64, String> {
     match text.trim().parse::<f64>() {
         Ok(value) if value >= 0.0 && value.is_finite() => Ok(value.abs()),

@@ -1,4 +1,4 @@
-//! The nominal surface of a command: whatever form its file has.
+//! Nominal surface of a command, from any supported file format.
 
 use std::path::Path;
 
@@ -30,10 +30,11 @@ impl NominalTable {
     }
 }
 
-/// Reads a nominal file; of a table of points `table` says what it does not say of itself.
+/// Reads a nominal file. `table` describes a table of points where the file itself does not.
 ///
 /// # Errors
-/// A file that cannot be read, columns that are not there, and a projection for what is no cloud of points.
+/// Returns an error if the file cannot be read, if columns are missing, or if a projection is given for anything but a
+/// point cloud.
 pub(super) fn read(path: &Path, projection: Projection, table: &Table) -> Result<NominalFile, Failure> {
     let file = read_nominal_as(path, table)?;
     let what = match file {
@@ -47,10 +48,10 @@ pub(super) fn read(path: &Path, projection: Projection, table: &Table) -> Result
     Ok(file)
 }
 
-/// Reads a nominal file and makes the surface of it.
+/// Reads a nominal file and builds its surface.
 ///
 /// # Errors
-/// Those of [`read`], and what makes no surface, by file name.
+/// Returns the errors of [`read`], and an error with the file name if the content does not make a surface.
 pub(super) fn surface(path: &Path, projection: Projection, table: &Table) -> Result<Nominal, Failure> {
     setup::surface(path, read(path, projection, table)?, projection).map_err(Failure::Setup)
 }
@@ -58,7 +59,7 @@ pub(super) fn surface(path: &Path, projection: Projection, table: &Table) -> Res
 /// Samples a defined surface at its spacing.
 ///
 /// # Errors
-/// Whatever is wrong with the definition, by file name.
+/// Returns all errors of the definition, with the file name.
 pub(super) fn sampled(path: &Path, text: &str) -> Result<SampledSurface, Failure> {
     let sample = || {
         let defined = DefinedSurface::from_toml(text)?;
@@ -67,7 +68,7 @@ pub(super) fn sampled(path: &Path, text: &str) -> Result<SampledSurface, Failure
     sample().map_err(|source| Failure::Definition { path: path.to_owned(), source })
 }
 
-/// Tells in words what a nominal surface was made from.
+/// Returns the kind of source of a nominal surface, in words.
 pub(super) fn kind_in_words(kind: NominalKind) -> String {
     match kind {
         NominalKind::Grid { columns, rows } => format!("grid of {} x {}", count(columns), count(rows)),

@@ -1,4 +1,4 @@
-//! `regrind plan`: what a run would command, checked against every limit, without a device.
+//! `regrind plan`: the commands of a run, checked against every limit, without a machine.
 
 use std::path::PathBuf;
 
@@ -40,7 +40,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// A shift: longer than this no pass and no measurement is meant to take.
+/// Duration of a shift in minutes. No pass and no measurement is meant to take longer.
 const MOST_MINUTES: f64 = 480.0;
 
 #[derive(Serialize)]
@@ -98,7 +98,7 @@ struct Document {
     learns: bool,
 }
 
-/// A pass in arcs, beside the same pass in lines.
+/// Pass in arcs, compared with the same pass in lines.
 #[derive(Serialize)]
 struct ArcsTold {
     arcs: u64,
@@ -147,7 +147,7 @@ impl ArcsTold {
     }
 }
 
-/// How the head tilts the wheel, on the scale of its axis.
+/// Tilt of the wheel by the head, on the scale of its axis.
 #[derive(Serialize)]
 struct TiltTold {
     axis: char,
@@ -185,7 +185,7 @@ impl TiltTold {
     }
 }
 
-/// The scallops beside what is allowed of form and scallops together.
+/// Scallops, compared with the tolerances for form and scallops together.
 #[derive(Serialize)]
 struct ScallopsTold {
     pv_um: f64,
@@ -205,7 +205,7 @@ impl ScallopsTold {
         Self { pv_um, rms_um, mean_um, allowed_pv_um, allowed_rms_um }
     }
 
-    /// The tolerances of which they take more than their share, each with what they take.
+    /// Returns the tolerances of which the scallops take more than their share, each with that share.
     fn beyond(&self) -> Vec<String> {
         let taken = [
             ("acceptance.pv_um", self.pv_um, self.allowed_pv_um),
@@ -249,7 +249,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         programs.write(file, &first, task.map_identity(&first)).map_err(Failure::Programs)?;
     }
     let [width, depth] = [task.pass.x_mm, task.pass.y_mm].map(|[low, high]| high - low);
-    // Without a program the tracks over the box around the part are the best there is.
+    // Without a program, tracks over the box around the part are the best estimate.
     let (tracks, pass_mm) = match &program {
         Some((path, summary)) => (path.tracks() as f64, summary.length_mm),
         None => {
@@ -310,22 +310,22 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// What the program of the first pass has in arcs, where the cell asks for them.
+/// Returns the arcs in the program of the first pass, if the cell uses arcs.
 fn arcs_of(task: &Task, program: Option<&(ToolPath, Summary)>) -> Result<Option<ArcsTold>, Failure> {
     let (Some((path, summary)), Ok(programs)) = (program, &task.programs) else { return Ok(None) };
     let arcs = programs.arcs(path).map_err(|error| Failure::Programs(GcodeError::from(error).into()))?;
     Ok(arcs.zip(programs.arcs_within_mm).map(|(arcs, within_mm)| ArcsTold::of(&arcs, summary, within_mm)))
 }
 
-/// What the probe takes to search every target from the distance of its approach, and nothing else: the moves between targets are
-/// the measuring machine's own.
+/// Returns the minimum measuring time in minutes: the time in which the probe searches every target from its approach
+/// distance. The moves between targets are not included, because the measuring machine chooses them.
 fn least_measuring_minutes(task: &Task) -> Option<f64> {
     let targets = task.targets.len() + task.sphere.map_or(0, |sphere| sphere.points);
     let seconds = targets as f64 * task.probing.approach_mm / task.probing.speed_mm_s;
     (!task.targets.is_empty()).then_some(seconds / 60.0)
 }
 
-/// Tells of a pass or a measurement that takes longer than any would be left to run.
+/// Returns warnings about a pass or a measurement that takes longer than a shift.
 fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes: Option<f64>) -> Vec<String> {
     let n = three_digits;
     let mut warnings = Vec::new();
@@ -353,7 +353,7 @@ fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes:
     warnings
 }
 
-/// Tells of scallops that leave too little of the tolerances for what a correction can take back.
+/// Returns a warning if the scallops leave too little of the tolerances for the errors that a correction can remove.
 fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
     let scallops = task.scallops?;
     let beyond = ScallopsTold::of(&scallops, recipe).beyond();
@@ -368,7 +368,7 @@ fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
     })
 }
 
-/// Says how long a run may take: as far as recipe and cell tell it.
+/// Returns the estimated duration of a run in words, as far as recipe and cell define it.
 fn time_in_words(d: &Document) -> String {
     let n = three_digits;
     let measurements = counted(d.most_measurements as usize, "measurement");
@@ -384,7 +384,7 @@ fn time_in_words(d: &Document) -> String {
     )
 }
 
-/// Says what a pass takes off the part, and off the wheel.
+/// Returns the removal of a pass from the part and from the wheel, in words.
 fn removal_in_words(d: &Document) -> String {
     let n = three_digits;
     let most = f64::from(d.most_passes);
@@ -399,7 +399,7 @@ fn removal_in_words(d: &Document) -> String {
     format!("about {} mm3 a pass; {wheel}", n(d.removed_mm3_a_pass))
 }
 
-/// Lays the path of the first pass and checks it; none where only the grinder's controller can lay one.
+/// Plans and checks the path of the first pass. Returns `None` if only the grinder's controller can plan one.
 pub(super) fn first_path(
     task: &Task,
     recipe: &Recipe,

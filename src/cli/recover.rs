@@ -1,4 +1,4 @@
-//! `regrind recover`: bring machines home that hold what no run knows.
+//! `regrind recover`: brings machines to idle that hold jobs unknown to any run.
 
 use std::io::{self, BufRead};
 use std::path::PathBuf;
@@ -75,7 +75,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Says why a machine was not brought home; the other one may be all the same.
+/// Prints the reason why a machine did not reach idle. The other machine can still succeed.
 fn told(home: Result<bool, Failure>) -> Result<bool, Failure> {
     match home {
         Err(failure @ Failure::Terminal(_)) => Err(failure),
@@ -84,10 +84,10 @@ fn told(home: Result<bool, Failure>) -> Result<bool, Failure> {
     }
 }
 
-/// Between two looks at a machine that is on its way.
+/// Time between two polls of a machine that is changing its state.
 const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
 
-/// What is done for the machines of a cell, and where it is recorded.
+/// Recovery of the machines of a cell, with its record.
 struct Recovery {
     actor: Actor,
     journal: Journal,
@@ -97,7 +97,8 @@ struct Recovery {
 }
 
 impl Recovery {
-    /// Shows how a machine stands and asks for each step, until it is idle or is to be left as it is. Returns whether it is idle.
+    /// Shows the state of a machine and asks for each step, until the machine is idle or is left as it is. Returns true
+    /// if it is idle.
     async fn bring_home<M: Machine>(
         &mut self,
         device: Device,
@@ -124,7 +125,7 @@ impl Recovery {
             let seen = look(&mut machine).await.map_err(failed)?;
             super::print(&format!("{mark}{}: {}\n", machine.name(), in_short(&seen)))?;
             if matches!(seen.state, State::Stopping | State::Aborting) {
-                // It is on its way by itself.
+                // The machine is changing its state by itself.
                 tokio::time::sleep(BETWEEN_LOOKS).await;
                 continue;
             }
@@ -140,7 +141,7 @@ impl Recovery {
                 return Ok(false);
             }
             match recover::take(&mut machine, device, step, &seen, limit, &mut self.journal, &self.actor).await {
-                // It came to another state in the end, which is shown; what did not change would be asked for ever.
+                // A new state is shown. Without a change the same question would repeat for ever.
                 Ok(now) if now.state == seen.state && now.state != State::Idle => return Ok(false),
                 Ok(_) | Err(RecoverError::Changed { .. }) => {}
                 Err(error) => return Err(failed(error)),
@@ -148,7 +149,7 @@ impl Recovery {
         }
     }
 
-    /// Returns the run that a job belongs to, if one here has no end on record.
+    /// Returns the local run without a recorded end to which a job belongs.
     fn run_of(&self, job: u32) -> Option<String> {
         let is_open = |folder: &PathBuf| -> Option<bool> {
             let reader = Reader::open(folder).ok()?;
@@ -156,7 +157,7 @@ impl Recovery {
             let ended = reader.records(0).any(|record| record.is_ok_and(|record| record.kind == Kind::End));
             Some(begin["content"]["job"] == job && !ended)
         };
-        // This one's own record is being written, and to read it beside that would give back the lock on it.
+        // The record of this recovery is open for writing. Reading it here as well would release its lock.
         let others = control::folders(&self.runs).filter(|folder| *folder != self.folder);
         let mut open = others.filter(|folder| is_open(folder) == Some(true));
         open.next().map(|folder| folder.display().to_string())
@@ -170,7 +171,7 @@ impl Recovery {
     }
 }
 
-/// Reads what a person types; the end of the input is no word.
+/// Reads a line from standard input, trimmed. The end of the input gives an empty answer.
 pub(super) fn answer() -> Result<String, Failure> {
     let mut line = String::new();
     io::stdin().lock().read_line(&mut line).map_err(Failure::Terminal)?;

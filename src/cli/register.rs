@@ -1,4 +1,4 @@
-//! `regrind register`: where is the part, and what is left between it and its nominal surface?
+//! `regrind register`: finds the pose of the part and its deviations from the nominal surface.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -134,7 +134,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// What the points are: a probe without a ball measures the surface itself.
+/// Returns the method that the points require. A probe without a ball measures the surface itself.
 fn method(arguments: &Arguments) -> Method {
     if arguments.probe_radius == Some(0.0) { Method::Contact } else { arguments.method }
 }
@@ -164,7 +164,7 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
     })
 }
 
-/// Reads both files at once; the nominal surface is made while the measured points are still read.
+/// Reads both files in parallel: the nominal surface is built while the measured points are still read.
 fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure> {
     let (path, projection) = (&arguments.nominal, arguments.projection);
     if is_map(&arguments.measured)? && method(arguments) != Method::Contact {
@@ -181,7 +181,7 @@ fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure>
     })
 }
 
-/// What an operator wants to know, a line each.
+/// Returns the summary for an operator, as lines.
 fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let mut text = String::new();
@@ -225,7 +225,7 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
     text
 }
 
-/// What the model says, a line each.
+/// Returns the results of the model, as lines.
 fn form_in_words(form: &Form) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let within =
@@ -261,7 +261,7 @@ fn form_in_words(form: &Form) -> String {
     )
 }
 
-/// Slopes and the figures of ISO 10110-5, where the points are enough for them.
+/// Returns slopes and the figures of ISO 10110-5, if there are enough points for them.
 fn area_in_words(form: &Form) -> String {
     let mut text = String::new();
     if let Some(SlopeFigures { rms, largest, integration_mm, .. }) = form.slope {
@@ -288,7 +288,7 @@ fn pose_in_words(document: &RegistrationDocument) -> String {
     format!("shift {x:.4}, {y:.4}, {z:.4} mm, turned by {:.4} degrees", pose.angle_rad().to_degrees())
 }
 
-/// How far an alternative is from the pose found.
+/// Returns the distance of an alternative from the pose found, as text.
 fn apart(document: &RegistrationDocument, other: &Alternative) -> String {
     let read = |rows| Pose::from_rows(rows).expect("a pose that was found is one");
     let between = read(document.cmm_from_model).inverse() * read(other.cmm_from_model);

@@ -1,4 +1,4 @@
-//! `regrind report`: one HTML file that tells a run, and its results as other systems take them.
+//! `regrind report`: one HTML file about a run, and its results in formats of other systems.
 
 use std::path::PathBuf;
 

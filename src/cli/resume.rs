@@ -1,4 +1,4 @@
-//! `regrind resume`: let a held cell go on, or go on with a run whose program ended in the middle of it.
+//! `regrind resume`: resumes a held cell, or continues a run whose program was interrupted.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -70,13 +70,14 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     take_up(arguments, &std::path::absolute(&folder).unwrap_or(folder))
 }
 
-/// Takes up a run that broke off: all of it is looked through before anything is opened.
+/// Continues an interrupted run. Everything is checked before anything opens.
 fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     let key = key::of_this_user()?;
-    // Whoever else takes the run up, or verifies it, finds it driven from here on.
+    // From here on, another program that resumes or verifies the run finds it driven.
     let lock = RunLock::take(folder).map_err(Failure::Journal)?;
     let begun = Begun::read(folder, arguments.despite_loss)?;
-    // Where it is gone, a recipe that names no file from there needs none of it, and any other says which one is missing.
+    // If the working folder is gone, a recipe without files there still works. Any other recipe reports the missing
+    // file.
     let _ = std::env::set_current_dir(&begun.working_folder);
     let recipe = check::or_show(Recipe::parse(&begun.recipe, &begun.text(folder, "recipe.toml")?))?;
     let mut cell = check::or_show(CellConfig::parse(&begun.cell, &begun.text(folder, "cell.toml")?))?;
@@ -109,7 +110,7 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     })
 }
 
-/// Whether a folder holds nothing but an empty database with its lock.
+/// Returns true if a folder contains nothing except an empty database with its lock.
 fn is_bare(run: &Path) -> bool {
     let mut names = fs::read_dir(run).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.file_name());
     names.all(|name| name.to_str().is_some_and(|name| name.starts_with(DATABASE) || name == LOCK))
@@ -143,15 +144,15 @@ struct Begun {
 }
 
 impl Begun {
-    /// Verifies the record of a run that has no end, and reads how it began. Where more was written than is there, that is told, and only who says that
-    /// he knows it goes on.
+    /// Verifies the record of a run without an end, and reads how the run began. If records are lost, reports the loss.
+    /// Then continues only if `despite_loss` confirms it.
     fn read(run: &Path, despite_loss: bool) -> Result<Self, Failure> {
         let reader = Reader::open(run).map_err(Failure::Journal)?;
         let lost = || may_be_lost(run).map_err(Failure::Journal);
         let refused = |what: String| Failure::MayBeLost { run: run.to_owned(), what };
         let first = reader.records(0).next();
         if first.is_none() {
-            // A program that was ended as it made the folder has written nothing else yet.
+            // A program that was interrupted while it created the folder has written nothing else.
             let what = if is_bare(run) { None } else { lost()? };
             return Err(what.map_or_else(|| Failure::NotBegun { run: run.to_owned() }, refused));
         }
@@ -199,7 +200,7 @@ impl Begun {
         Ok(begun)
     }
 
-    /// Reads a file that the run began with, as it is on record.
+    /// Returns the recorded text of a file with which the run began.
     fn text(&self, run: &Path, name: &str) -> Result<String, Failure> {
         let path = run.join(name);
         let Some(file) = self.files.get(name) else {
@@ -212,7 +213,7 @@ impl Begun {
         })
     }
 
-    /// Makes the task and the plan of the run again, and sees that they are the same.
+    /// Rebuilds the task and the plan of the run, and checks that they are unchanged.
     fn prepared(&self, run: &Path, recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), Failure> {
         let (mut task, plan) = setup::prepare(recipe, cell).map_err(Failure::Setup)?;
         if let Some(seed) = self.seed {

@@ -1,4 +1,5 @@
-//! `regrind run`: grind, measure, register, judge, compensate, until the part is accepted or the loop must stop.
+//! `regrind run`: grinds, measures, registers, judges and compensates, until the part is accepted or the loop must
+//! stop.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -20,7 +21,7 @@ use super::live::{Live, Work, outcome};
 use super::succession::Place;
 use super::{Outcome, check, key, outside, plan, serve, simulated};
 
-/// What a run began with of what an earlier one had learned, in its folder.
+/// Name of the file in the run folder with the knowledge of an earlier run from which the run began.
 pub(super) const LEARNED_FROM: &str = "learned_from.json";
 
 /// Run correction cycles from a recipe until the part is accepted
@@ -96,12 +97,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         true => Some(Earlier::begun_with(&mut task, arguments)?),
         false => None,
     };
-    // A key that cannot be used is no reason to leave the record unsigned.
+    // An unusable key is an error and does not lead to an unsigned record.
     let key = key::of_this_user()?;
     if cell.require_signature && key.is_none() {
         return Err(Failure::Unsigned { cell: arguments.cell.clone() });
     }
-    // What a run begins with is checked before anything opens; the path of any other pass when its map is made, and it may come to none.
+    // The inputs of a run are checked before anything opens. The path of a later pass is checked when its map exists,
+    // and the run may not need a later pass at all.
     if plan.begin_with == Beginning::Grind {
         plan::first_path(&task, &recipe, &cell)?;
     }
@@ -125,7 +127,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Opens the machines, begins the record, and lets the run go to its end.
+/// Opens the machines, begins the record, and runs until the end.
 async fn carry_out(
     arguments: &Arguments,
     recipe: &Recipe,
@@ -138,7 +140,7 @@ async fn carry_out(
     let actor = operator(arguments.operator.as_deref());
     let began = SystemTime::now();
     let job = epoch(began);
-    // Before the record begins: a folder that is not there, or a line that is in use, is no run.
+    // These checks come before the record: with a missing folder or a busy line there is no run.
     let part = arguments.part.clone().unwrap_or_else(|| recipe_name(recipe));
     let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.is_marked());
     let (free, needed) = (free_bytes(&folder).unwrap_or(u64::MAX), task.cycle_bytes());
@@ -155,7 +157,7 @@ async fn carry_out(
     if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {
         super::print(&earlier.in_words(&arguments.runs))?;
     }
-    // The machines are taken, and nothing has been asked of them: from here on the part is this run's.
+    // The machines are locked, and nothing was sent to them. From here on the part belongs to this run.
     #[cfg(feature = "plant")]
     if let Some(work) = &arguments.work {
         work.begin(&folder).await?;
@@ -178,25 +180,25 @@ async fn carry_out(
     live.carry_out(machines, Work { task, plan, journal, loaded, interrupted: None }).await
 }
 
-/// A number that rises from program to program.
+/// Returns a number that increases from program to program.
 pub(super) fn epoch(now: SystemTime) -> u32 {
     let seconds = now.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |since| since.as_secs());
     u32::try_from(seconds & 0x7fff_ffff).unwrap_or(1).max(1)
 }
 
-/// What earlier runs left to learn from.
+/// Knowledge that earlier runs have left.
 #[derive(Default)]
 struct Earlier {
-    /// What the newest finished run of the same setting left, and the file as it is.
+    /// Knowledge of the newest finished run with the same setting, and the content of its file.
     learned: Option<(Learned, Vec<u8>)>,
-    /// What could not be read on the way to it.
+    /// Errors of runs that could not be read during the search.
     left_alone: Vec<LearnedError>,
-    /// What is to be said of what the plant told.
+    /// Messages about the knowledge of the plant.
     told: Vec<String>,
 }
 
 impl Earlier {
-    /// Lets a task begin with what the newest run left that is like it, or else with what other cells found.
+    /// Initialises a task with the knowledge of the newest similar run, or else with that of other cells.
     fn begun_with(task: &mut Task, arguments: &Arguments) -> Result<Self, Failure> {
         let earlier = Self::newest(&arguments.runs, &task.setting, task.simulation);
         if let Some((learned, _)) = &earlier.learned {
@@ -210,13 +212,13 @@ impl Earlier {
         Ok(earlier)
     }
 
-    /// Lets a task begin with what other cells of the plant found, as far as that can be begun with.
+    /// Initialises a task with the usable knowledge of other cells of the plant.
     #[cfg(feature = "plant")]
     fn or_with_others(mut self, task: &mut Task, plant: &Path) -> Result<Self, Failure> {
         let told = super::plant::knowledge::ask(plant, task)?;
         self.told = told.words;
         if let Some(learned) = told.learned {
-            // As a program reads it that goes on with the run.
+            // Read back in the same way as by a program that resumes the run.
             let text = serde_json::to_vec(&learned).map_err(|error| Failure::Terminal(error.into()))?;
             match task.begin_with(learned.clone()) {
                 Ok(()) => self.learned = Some((learned, text)),
@@ -230,7 +232,7 @@ impl Earlier {
 
     fn newest(runs: &Path, setting: &str, simulated: bool) -> Self {
         let mut earlier = Self::default();
-        // No folder is no run yet.
+        // Without the folder there are no runs yet.
         let Ok(entries) = std::fs::read_dir(runs) else { return earlier };
         let written = |run: PathBuf| Some((std::fs::metadata(run.join(LEARNED)).and_then(|m| m.modified()).ok()?, run));
         let mut all: Vec<_> = entries.filter_map(|entry| written(entry.ok()?.path())).collect();
@@ -260,7 +262,7 @@ impl Earlier {
     }
 }
 
-/// Says what a first part begins with that other cells found.
+/// Returns the text about the knowledge of other cells with which a first part begins.
 fn others_in_words(others: &TaughtBy) -> String {
     let runs: Vec<String> = others.runs.iter().map(|from| format!("{} (run {})", from.cell, from.run)).collect();
     let runs = runs.join(" and ");
@@ -283,7 +285,7 @@ fn others_in_words(others: &TaughtBy) -> String {
     }
 }
 
-/// Whether the machines of a cell are simulated in this process: only there a port may be left open.
+/// Returns true if the machines of a cell are simulated in this process. Only then can a port be left open.
 pub(super) fn within(cell: &CellConfig) -> bool {
     let open = |link: &Link| {
         matches!(link.wire.line(), Some((Line::Tcp { port: 0, .. }, _)))
@@ -293,7 +295,7 @@ pub(super) fn within(cell: &CellConfig) -> bool {
     cell.simulated && (open(&cell.cmm.link) || open(&cell.grinder.link))
 }
 
-/// What the record begins with: all that a program needs to go on with the run.
+/// Returns the header of the record: everything that a program needs to resume the run.
 fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), earlier: Option<&Earlier>) -> Header {
     let Live { recipe, cell, folder, actor, .. } = live;
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
@@ -302,7 +304,7 @@ fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), 
         earlier.and_then(|earlier| earlier.learned.as_ref()).and_then(|(learned, _)| learned.taught_by.as_ref());
     let left_alone = earlier.iter().flat_map(|earlier| &earlier.left_alone).map(ToString::to_string);
     let left_alone: Vec<String> = left_alone.chain(earlier.iter().flat_map(|earlier| earlier.told.clone())).collect();
-    // The ports are taken by now; its text says whether they were open.
+    // The open ports are assigned by now. The text of the file shows whether they were open.
     let machines_within = CellConfig::parse(cell.path(), cell.text()).is_ok_and(|cell| within(&cell));
     Header {
         run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
@@ -338,7 +340,8 @@ fn begin(
     Ok(journal)
 }
 
-/// Records the correction of a first pass that begins with what was learned, and its program: as if a cycle before the first had made it.
+/// Records the initial correction of a first pass from learned knowledge, and its program, as if an earlier cycle had
+/// made it.
 fn record_first_correction(task: &Task, journal: &mut Journal) -> Result<(), Failure> {
     let folder = journal.folder().join("cycle-0");
     for name in task.save_first(&folder).map_err(Failure::Programs)? {
@@ -351,9 +354,10 @@ fn recipe_name(recipe: &Recipe) -> String {
     recipe.path().file_stem().map_or("run".into(), |stem| stem.to_string_lossy().into_owned())
 }
 
-/// Returns a folder for a run that began now: the recipe's name and the time, and a number if two begin in one second.
+/// Returns a new folder for a run that begins now: the name of the recipe and the time, and a number if two runs begin
+/// in one second.
 pub(super) fn free_folder(runs: &Path, name: &str, began: SystemTime, simulated: bool) -> PathBuf {
-    // Every file in it carries the mark in its path.
+    // The mark is in the path of every file of the run.
     let mark = if simulated { "-SIMULATION" } else { "" };
     let stamp = utc_to_the_second(began).replace(['-', ':'], "");
     let named = |more: u32| match more {

@@ -1,4 +1,4 @@
-//! `regrind runs`: what was made, and how it ended.
+//! `regrind runs`: lists the runs and their results.
 
 use std::path::PathBuf;
 
@@ -32,7 +32,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// A run in the list.
+/// Run in the list.
 struct Listed {
     folder: PathBuf,
     is_live: bool,
@@ -59,7 +59,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Two lines a run: what to call it by, and what became of it.
+/// Returns two lines per run: its identification, and its result.
 fn in_words(run: &Listed) -> String {
     let Listed { folder, is_live, summary } = run;
     let figures = summary.cycles.iter().rev().find_map(|of| of.figures);

@@ -1,4 +1,4 @@
-//! `regrind serve`: the live page of the cell, and of the runs that it made.
+//! `regrind serve`: the live page of the cell and of its runs.
 
 use std::io::{self, Read};
 use std::net::SocketAddr;
@@ -18,9 +18,9 @@ use tokio::net::TcpListener;
 use super::Outcome;
 use super::failure::Failure;
 
-/// Where the page is, if nothing else is said.
+/// Default address of the page.
 pub(super) const ADDRESS: &str = "127.0.0.1:7373";
-/// How long the page outlives the run that it was begun with, so that every browser hears how it ended.
+/// Time for which the page stays after the end of its run, so that every browser receives the result.
 const LINGERS: Duration = Duration::from_secs(3);
 
 /// Show the cell, and the runs that it made, as a page in the browser
@@ -65,7 +65,7 @@ pub(super) struct Door {
 }
 
 impl Door {
-    /// Listens at an address, where a page may be open there.
+    /// Listens at an address, if the page can be served there.
     pub(super) async fn open(&self, listen: SocketAddr) -> Result<(TcpListener, Entrance), Failure> {
         let Self { certificate, key, users } = self;
         let tls =
@@ -104,10 +104,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Waits until nobody can write to standard input any more.
+/// Waits until standard input is closed by all writers.
 async fn end_of_input() {
     let (ended, end) = tokio::sync::oneshot::channel::<()>();
-    // A thread of its own, which ends with the program: a read of a pipe cannot be called off.
+    // Own thread, which ends with the program, because a blocked read of a pipe cannot be cancelled.
     std::thread::spawn(move || {
         let mut some = [0; 64];
         while io::stdin().read(&mut some).is_ok_and(|read| read > 0) {}
@@ -116,27 +116,27 @@ async fn end_of_input() {
     drop(end.await);
 }
 
-/// The page beside a run. It ends, a little later, with the program that holds this.
+/// Page of a run. It ends shortly after the program that holds this value.
 pub(super) struct Beside {
     _page: Child,
 }
 
 impl Beside {
-    /// Begins to show the runs in a folder. In a program of its own: it can neither slow the run down nor take it along.
+    /// Starts the page for the runs in a folder as a separate process, so it can neither slow the run down nor stop it.
     pub(super) fn begin(runs: &Path, listen: SocketAddr, json: bool) -> Result<Self, Failure> {
         let told = if json { Stdio::null() } else { Stdio::inherit() };
         let failed = |source| Failure::Page { address: listen, source };
         let program = std::env::current_exe().map_err(failed)?;
         let mut command = Command::new(program);
         command.args(["serve", "--while-stdin", "--listen", &listen.to_string(), "--runs"]).arg(runs);
-        // Ctrl-C is for the run; a page that went with it would leave its browsers without the end.
+        // Ctrl-C is for the run only. If it also ended the page, the browsers would not receive the result.
         super::outside::set_apart(&mut command);
         let page = command.stdin(Stdio::piped()).stdout(told).spawn().map_err(failed)?;
         Ok(Self { _page: page })
     }
 }
 
-/// The plan of the run that was asked for last.
+/// Plan of the run that was requested last.
 #[derive(Default)]
 struct Planned(Mutex<Option<(PathBuf, Vec<[f64; 2]>)>>);
 
@@ -154,7 +154,7 @@ impl Planned {
     }
 }
 
-/// Lays the points of a run out again, from what it keeps of its recipe and its cell.
+/// Recomputes the planned points of a run from its stored recipe and cell file.
 fn planned(run: &Path) -> Option<Vec<[f64; 2]>> {
     let first = Reader::open(run).ok()?.records(0).next()?.ok()?.value();
     let content = &first["content"];

@@ -1,4 +1,5 @@
-//! `regrind completions` and `regrind man`: what a shell and `man` know of the program, made of the same words as `--help`.
+//! `regrind completions` and `regrind man`: shell completions and manual pages, generated from the same text as
+//! `--help`.
 
 use std::path::PathBuf;
 
@@ -55,7 +56,7 @@ pub(super) fn pages(arguments: &Pages) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// The page of each command that is shown, by its file name.
+/// Returns the manual page of each visible command, with its file name.
 fn manual() -> Vec<(String, Vec<u8>)> {
     let mut program = super::Arguments::command().disable_help_subcommand(true);
     program.build();
@@ -67,7 +68,7 @@ fn manual() -> Vec<(String, Vec<u8>)> {
 fn gather(command: &Command, name: &str, pages: &mut Vec<(String, Vec<u8>)>) {
     let named = command.clone().name(name.to_owned());
     let mut page = Vec::new();
-    // Into memory: that cannot fail.
+    // Writing into memory cannot fail.
     if Man::new(named).render(&mut page).is_ok() {
         pages.push((format!("{name}.1"), page));
     }

@@ -1,4 +1,4 @@
-//! `regrind ship`: the records of this cell go to the plant, beside whatever the cell does.
+//! `regrind ship`: replicates the records of this cell to the plant, in parallel with the work of the cell.
 
 use std::io::{self, Read};
 use std::path::PathBuf;
@@ -14,10 +14,10 @@ use super::cell_now::Look;
 use super::failure::Failure;
 use super::{Outcome, outside, plant};
 
-/// From one round to the next, and the longest wait for a plant that is not there.
+/// Time between two rounds, and maximum wait for an unreachable plant.
 const ROUND: Duration = Duration::from_secs(1);
 const LONGEST_WAIT: Duration = Duration::from_secs(60);
-/// How long shipping goes on behind a run that has ended, for what it left.
+/// Time for which replication continues after the end of a run, for its remaining records.
 const LINGERS: Duration = Duration::from_secs(30);
 
 /// Ship the records and files of finished and running runs to the plant
@@ -52,7 +52,7 @@ pub(super) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let config = plant::read(&arguments.plant)?;
-    // Whatever else this computer does goes first.
+    // Other programs of this computer have priority.
     outside::give_way();
     let mut shipping = Shipping {
         shipper: Shipper::new(arguments.runs.clone(), config.artefacts.clone()),
@@ -81,9 +81,9 @@ struct Shipping<'a> {
     shipper: Shipper,
     link: Option<Link>,
     arguments: &'a Arguments,
-    /// How the cell was found; none while somebody looks.
+    /// Last known status of the cell. `None` while it is being read.
     look: Option<Look>,
-    /// Whether it was told that the plant is not there.
+    /// True if the message about an unreachable plant was printed.
     waits: bool,
 }
 
@@ -93,12 +93,12 @@ impl Shipping<'_> {
         self.ended()
     }
 
-    /// What the exit code says: whether something differs.
+    /// Returns the outcome of the command: whether any copy differs.
     fn ended(&self) -> Result<Outcome, Failure> {
         Ok(if self.shipper.left_alone().next().is_some() { Outcome::NotInTolerance } else { Outcome::Accepted })
     }
 
-    /// Round after round; ends a little after standard input does, where it is to.
+    /// Runs rounds. If requested, ends shortly after standard input is closed.
     async fn go_on(&mut self) -> Result<(), Failure> {
         let mut over = self.arguments.while_stdin.then(end_of_input);
         let mut last = None;
@@ -118,7 +118,7 @@ impl Shipping<'_> {
             };
             let is_empty = shipped.is_some_and(|shipped| shipped == Shipped::default());
             match last {
-                // One round more than the last that had something: the end of a record is written last.
+                // One more round after the last one with data, because the end of a record is written last.
                 Some(until) if is_empty || Instant::now() > until => return Ok(()),
                 _ => {}
             }
@@ -132,7 +132,7 @@ impl Shipping<'_> {
         }
     }
 
-    /// Ships what is there, and tells how the cell is.
+    /// Replicates new records and the status of the cell.
     async fn round(&mut self) -> Result<Shipped, Failure> {
         if self.link.as_ref().is_none_or(Link::is_closed) {
             self.link = Some(plant::open(&self.config).await?);
@@ -176,7 +176,7 @@ impl Shipping<'_> {
         super::print(&format!("shipped {records} records and {files} files of {runs} runs\n"))
     }
 
-    /// A plant that is not there is told once.
+    /// Prints once that the plant is unreachable.
     fn waits_for(&mut self, error: &PlantError) -> Result<(), Failure> {
         if !std::mem::replace(&mut self.waits, true) {
             eprintln!("ship: {error}; the cell goes on, and its records wait for it here");
@@ -185,7 +185,7 @@ impl Shipping<'_> {
     }
 }
 
-/// Tells the plant how the cell is. What is not known is not told: the plant finds that nothing is heard.
+/// Sends the status of the cell to the plant. An unknown status is not sent: the plant then detects the silence.
 async fn tell_state(link: &Link, told: &Told) -> Result<(), PlantError> {
     match &told.now {
         Now::On { run, snapshot } => {
@@ -196,10 +196,10 @@ async fn tell_state(link: &Link, told: &Told) -> Result<(), PlantError> {
     }
 }
 
-/// Waits until nobody can write to standard input any more.
+/// Waits until standard input is closed by all writers.
 pub(super) fn end_of_input() -> tokio::sync::oneshot::Receiver<()> {
     let (ended, end) = tokio::sync::oneshot::channel::<()>();
-    // A thread of its own, which ends with the program: a read of a pipe cannot be called off.
+    // Own thread, which ends with the program, because a blocked read of a pipe cannot be cancelled.
     std::thread::spawn(move || {
         let mut some = [0; 64];
         while io::stdin().read(&mut some).is_ok_and(|read| read > 0) {}

@@ -1,4 +1,4 @@
-//! What a run shows while it runs: a bar on a terminal, plain lines elsewhere, JSON for programs.
+//! Display of an active run: a bar on a terminal, plain lines elsewhere, JSON for programs.
 
 use std::collections::HashMap;
 use std::fmt::Write as _;
@@ -21,23 +21,23 @@ use super::failure::Failure;
 use super::outside::is_in_front;
 use super::words::{judged, three_digits, time_left, wrapped};
 
-/// How long a line that says nothing new may be left out.
+/// Minimum time between two lines without news.
 const QUIET: Duration = Duration::from_secs(2);
 
-/// Shows a run.
+/// Display of a run.
 pub(super) struct Show {
     json: bool,
     simulated: bool,
     head: String,
     tolerance: Tolerance,
     folder: String,
-    /// Whether touches are chosen: their batches are too many to tell of each how fast it came.
+    /// True if touches are chosen. Their batches are too many to report the speed of each.
     is_chosen: bool,
     bar: Option<ProgressBar>,
-    /// When a plain line about progress was printed last.
+    /// Time of the last plain line about progress.
     said: Option<Instant>,
     job: Option<(Device, u32)>,
-    /// What was said of the alarms that stand.
+    /// Texts of the active alarms that were shown.
     alarms: HashMap<AlarmId, String>,
     /// RMS of each cycle.
     rms_mm: Vec<f64>,
@@ -95,7 +95,7 @@ impl Show {
             }
             Notice::State { state, cycle, event, at_job } => {
                 if let Some(bar) = &self.bar {
-                    // The bar of a job goes with it.
+                    // The bar of a job ends with the job.
                     if !at_job {
                         bar.set_style(style("{wide_msg}"));
                     }
@@ -141,7 +141,7 @@ impl Show {
                 }
                 summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
             }
-            // It is on record each time; a person has seen it.
+            // The record contains every repetition, but a person needs to see the alarm only once.
             Notice::Alarm(alarm) if self.alarms.get(&alarm.id) == Some(&alarm.what) => Ok(()),
             Notice::Alarm(alarm) => {
                 self.alarms.insert(alarm.id, alarm.what.clone());
@@ -157,7 +157,7 @@ impl Show {
         }
     }
 
-    /// Says that an order was taken, whoever gave it.
+    /// Shows that an order was accepted, from any source.
     fn order(&mut self, event: &str) -> Result<(), Failure> {
         match event {
             "hold" => self.line(&format!(
@@ -192,7 +192,7 @@ impl Show {
         let [pv, rms] = compared.map(|compared| judged(&compared));
         let (points, outliers) = (figures.points, figures.outliers);
         if let Some(TouchOn { targets, why }) = figures.touch_on.as_deref() {
-            // Of the first touches nothing is known but that they belong to this part.
+            // The first touches only show that they belong to this part.
             let known = figures
                 .form
                 .filter(|_| points as usize > FIRST_BATCH)
@@ -209,7 +209,7 @@ impl Show {
         self.picture(cycle)
     }
 
-    /// Shows the error map of a cycle on a terminal with colours, and how the RMS has come down to it.
+    /// Shows the error map of a cycle on a colour terminal, and the series of RMS values up to this cycle.
     fn picture(&self, cycle: u32) -> Result<(), Failure> {
         let (Some(bar), true) = (&self.bar, console::colors_enabled()) else { return Ok(()) };
         let nodes = newest_map(Path::new(&self.folder), cycle).and_then(|path| read_error_map(&path).ok());
@@ -221,7 +221,7 @@ impl Show {
         };
         let error = |blocks: &Blocks| format!("error, filtered: +- {} um", three_digits(blocks.limit_um));
         let (blocks, below) = if self.is_chosen {
-            // Where touches are chosen, what is known and how well stand side by side.
+            // For chosen touches, the map of the error and the map of its standard deviation are shown side by side.
             const APART: usize = 2;
             let room = [(columns.min(110) - 4 - APART) / 2, 16];
             let both = Blocks::of(&nodes, room).zip(Blocks::of_sigma(&nodes, room));
@@ -275,9 +275,9 @@ impl Show {
         self.striking(text, "", "")
     }
 
-    /// Prints lines of which a terminal shows a word in colour, with its bell.
+    /// Prints lines. A terminal shows one word of them in colour and rings its bell.
     fn striking(&self, text: &str, word: &str, colour: &str) -> Result<(), Failure> {
-        // Some of it came from a machine or a file.
+        // Parts of the text come from a machine or a file.
         let text = &visible(text);
         let Some(bar) = &self.bar else { return super::print(&format!("{text}\n")) };
         let columns = console::Term::stdout().size_checked().map_or(usize::MAX, |(_, columns)| columns.into());
@@ -290,7 +290,7 @@ impl Show {
     }
 }
 
-/// The error map of a cycle that was made last: what was measured again stands in a folder of its own.
+/// Returns the newest error map of a cycle. A repeated measurement is stored in a separate folder.
 fn newest_map(run: &Path, cycle: u32) -> Option<PathBuf> {
     let cycle = run.join(format!("cycle-{cycle}"));
     let of = |what: &str, first: u32| {
@@ -303,14 +303,16 @@ fn newest_map(run: &Path, cycle: u32) -> Option<PathBuf> {
     maps.rev().find(|map| map.is_file())
 }
 
-/// Whether a person at this terminal can answer: it is one, and not somebody else's at the moment.
+/// Returns true if a person at this terminal can answer: standard input and standard error are terminals, and this
+/// program has the terminal at the moment.
 pub(super) fn reads_keys() -> bool {
     is_in_front() && io::stdin().is_terminal() && io::stderr().is_terminal()
 }
 
 fn bar() -> ProgressBar {
     let bar = ProgressBar::new(1).with_style(style("{wide_msg}"));
-    // Of words that change faster than a terminal is drawn the last would never be seen, and a cell that is held looked as if it went on.
+    // Redraws regularly. Otherwise the last of several quick changes would not be shown, and a held cell would look
+    // active.
     bar.enable_steady_tick(Duration::from_millis(200));
     bar
 }
@@ -319,7 +321,7 @@ fn style(template: &str) -> ProgressStyle {
     ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
-/// Says what a machine does at its job.
+/// Returns the text for the work of a machine.
 fn doing(device: Device) -> &'static str {
     match device {
         Device::Cmm => "measuring",
@@ -327,7 +329,7 @@ fn doing(device: Device) -> &'static str {
     }
 }
 
-/// Says how far a job is.
+/// Returns the progress of a job as text.
 pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
     match device {
         Device::Cmm => format!("measuring, {done} of {total} points"),
@@ -337,14 +339,14 @@ pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
     }
 }
 
-/// Says what the touches of a measurement tell that still runs.
+/// Returns the text about the touches of a measurement that is still running.
 pub(super) fn so_far(SoFar { touched, rms_um, least_um, most_um }: &SoFar) -> String {
     format!(
         "preliminary, from where the plan has the part: {touched} touched, RMS {rms_um:.2} um, {least_um:+.2} to {most_um:+.2} um"
     )
 }
 
-/// Names the peak to valley that is judged.
+/// Returns the name of the peak to valley that is judged.
 pub(super) fn pv_name(tolerance: &Tolerance) -> &'static str {
     match tolerance.pv_of {
         PvOf::All => "PV",
@@ -352,14 +354,14 @@ pub(super) fn pv_name(tolerance: &Tolerance) -> &'static str {
     }
 }
 
-/// Says what is accepted.
+/// Returns the acceptance limits as text.
 pub(super) fn limits(tolerance: &Tolerance) -> String {
     let limits =
         [(pv_name(tolerance), tolerance.pv_mm), ("RMS", tolerance.rms_mm)].into_iter().filter(|(_, mm)| mm.is_finite());
     limits.map(|(name, mm)| format!("{name} {} um", three_digits(1e3 * mm))).collect::<Vec<_>>().join(", ")
 }
 
-/// The shares of the error that are taken back: one, or from the shortest waves to the longest.
+/// Returns the gains as text: one value, or from the shortest to the longest wavelength.
 fn gains(gains: &[[f64; 2]]) -> String {
     let least = gains.iter().map(|gain| gain[1]).fold(f64::INFINITY, f64::min);
     let most = gains.iter().map(|gain| gain[1]).fold(0.0, f64::max);

@@ -1,4 +1,4 @@
-//! `regrind simulate`: the simulated machines of a cell on their wires, for another process.
+//! `regrind simulate`: serves the simulated machines of a cell on their wires, for another process.
 
 use std::path::PathBuf;
 
@@ -66,7 +66,7 @@ async fn until_stopped() -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Where a machine answers, after a port that was left open has become one.
+/// Returns the address of a machine. An open port is replaced by the assigned one.
 fn wire(link: &Link) -> Value {
     match link.wire.line() {
         Some((Line::Tcp { host, port }, unit)) => json!({ "host": host, "port": port, "unit": unit }),

@@ -1,4 +1,4 @@
-//! A simulated world for the cell: built here only, and handed to its wires alone.
+//! Simulated world of a cell. It is created only here, and the cell sees it only through the wires.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -31,25 +31,24 @@ use serde::{Deserialize, Serialize};
 
 use super::failure::Failure;
 
-/// The simulated machines of a cell, served until this is dropped.
+/// Simulated machines of a cell, served until this value is dropped.
 pub(super) struct SimulatedCell {
-    /// What answers, on each wire.
+    /// Server of each wire.
     pub(super) servings: Vec<Serving>,
-    /// In words, where each machine answers.
+    /// Address of each machine, in words.
     pub(super) places: Vec<String>,
-    /// A measuring machine that is reached by I++ DME.
+    /// Measuring machine with an I++ DME server.
     dme: Option<ServingDme>,
-    /// A measuring machine that prints its hits, and the folder where its list is put if the cell file names none.
+    /// Measuring machine that prints its hits, and the folder for its list if the cell file names none.
     hits: Option<(ServingHits, Option<ScratchFolder>)>,
-    /// Links that were placed at the devices of serial lines.
+    /// Links to terminals, placed at the device paths of serial lines.
     links: Vec<PathBuf>,
-    /// Kept for the life of the machines.
-    /// What is true of the part; held, and not read where nobody asks for it.
+    /// Truth of the part. It lives as long as the machines and is read only on request.
     #[cfg_attr(not(feature = "plant"), expect(dead_code))]
     world: World,
 }
 
-/// A line of what simulated machines see and do.
+/// Line of the log of simulated machines.
 #[derive(Serialize)]
 struct Witnessed<'a> {
     utc: String,
@@ -62,7 +61,7 @@ struct Witnessed<'a> {
 impl Drop for SimulatedCell {
     fn drop(&mut self) {
         for link in &self.links {
-            // A link that is left behind is replaced by the next simulation.
+            // If removal fails, the next simulation replaces the link.
             let _ = remove_link(link);
         }
     }
@@ -71,7 +70,7 @@ impl Drop for SimulatedCell {
 /// Reads the truth of a recipe.
 ///
 /// # Errors
-/// A recipe without one, and one that cannot be.
+/// Returns an error if the recipe has no truth or an invalid one.
 pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec, Failure> {
     let none = || {
         Failure::Simulation {
@@ -88,11 +87,12 @@ pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec
     Ok(spec)
 }
 
-/// Serves both machines of a cell on their wires. A port of 0 is replaced in the cell by the one that was free. A server of I++ DME has a
-/// probe of its own, whose radius is the one that the recipe has; and so has a grinder behind LinuxCNC its wheel.
+/// Serves both machines of a cell on their wires. Replaces a port of 0 in the cell by the assigned port. An I++ DME
+/// server has its own probe, with the radius from the recipe. A grinder with LinuxCNC has its own wheel in the same
+/// way.
 ///
 /// # Errors
-/// A wire that cannot be had.
+/// Returns an error if a wire is not available.
 pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recipe) -> Result<SimulatedCell, Failure> {
     let probe_radius_mm = recipe.measure.probe_radius_mm;
     let path = cell.path().to_owned();
@@ -156,7 +156,7 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
     Ok(simulated)
 }
 
-/// The wheel of the recipe, along what a controller outside executes.
+/// Returns the path that an external controller executes, with the wheel of the recipe.
 fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<ExecutedPath, String> {
     let grinding = &recipe.grinding;
     if grinding.tilt.is_some() {
@@ -176,7 +176,7 @@ fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<Executed
     })
 }
 
-/// Where the simulated control finds its programs: where the cell puts them.
+/// Returns the place of the programs for the simulated control: the place where the cell puts them.
 fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
     let program = &cell.grinder.program;
     let Some(folder) = program.folder.clone() else { return Ok(None) };
@@ -194,7 +194,7 @@ fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
 }
 
 impl SimulatedCell {
-    /// Writes what the world knows of the part: PV and RMS at the targets, in micrometres, in the position that fits best.
+    /// Writes the true state of the part: PV and RMS at the targets in µm, in the best-fit pose.
     #[cfg(feature = "plant")]
     pub(super) fn tell_truth(&self, recipe: &Recipe, cell: &CellConfig, path: &Path) -> Result<(), Failure> {
         let (task, _) = regrind::setup::prepare(recipe, cell).map_err(Failure::Setup)?;
@@ -211,10 +211,10 @@ impl SimulatedCell {
         Ok(regrind::formats::write_json_atomic(path, &truth)?)
     }
 
-    /// Writes all that the machines see and do from now on to a file, a line of JSON for each thing, as it happens.
+    /// Writes all further events of the machines to a file, one line of JSON per event, as they happen.
     ///
     /// # Errors
-    /// A file that cannot be written.
+    /// Returns an error if the file cannot be written.
     pub(super) fn log_to(&self, path: &Path) -> Result<(), FormatError> {
         let lines = AddedLines::open(path)?;
         let machines = self.servings.iter().flat_map(|serving| serving.machines());
@@ -231,7 +231,7 @@ impl SimulatedCell {
         Ok(())
     }
 
-    /// Serves a measuring machine by I++ DME, and writes the port that it got into its wire.
+    /// Serves a measuring machine by I++ DME, and writes the assigned port into its wire.
     async fn serve_dme(
         &mut self,
         wire: &mut IppdmeWire,
@@ -253,7 +253,8 @@ impl SimulatedCell {
         Ok(())
     }
 
-    /// Serves a measuring machine that prints its hits: its part program measures whatever list Regrind puts into its folder.
+    /// Serves a measuring machine that prints its hits. Its part program measures each list that Regrind writes to its
+    /// folder.
     async fn serve_hits(
         &mut self,
         wire: &mut HitLinesWire,
@@ -302,7 +303,7 @@ impl SimulatedCell {
         Ok(())
     }
 
-    /// Places a link to a terminal at the device of a serial line.
+    /// Places a link to a terminal at the device path of a serial line.
     fn link(&mut self, terminal: &Path, device: &str) -> Result<(), String> {
         place_link(terminal, Path::new(device)).map_err(|e| {
             format!(
@@ -339,7 +340,7 @@ impl SimulatedCell {
     }
 }
 
-/// A folder for the list, where the cell file names none.
+/// Returns a folder for the list, for a cell file that names none.
 fn list_folder() -> Result<ScratchFolder, FormatError> {
     let path = std::env::temp_dir().join(format!("regrind-list-{:016x}", rand::random::<u64>()));
     let folder = ScratchFolder::at(path)?;
@@ -347,7 +348,7 @@ fn list_folder() -> Result<ScratchFolder, FormatError> {
     Ok(folder)
 }
 
-/// How the machine prints, as the cell file has it.
+/// Returns the print format of the machine from the cell file.
 fn style(wire: &HitLinesWire) -> hits::print::Style {
     use regrind::device::hit_lines::Separator;
     let reading = wire.reading();
@@ -368,7 +369,7 @@ fn style(wire: &HitLinesWire) -> hits::print::Style {
     }
 }
 
-/// A number that differs from start to start, as that of a real machine does.
+/// Returns a number that differs at each start, like that of a real machine.
 fn boot_id() -> u32 {
     rand::random::<u32>().max(1)
 }

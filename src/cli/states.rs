@@ -1,4 +1,4 @@
-//! `regrind states`: what the cell does upon every event in every state, as a table and as a picture.
+//! `regrind states`: the reaction of the cell to every event in every state, as a table and as a diagram.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -60,7 +60,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Whether anything follows from an event.
+/// Returns true if an event has an effect.
 fn acts(row: &Row, answer: &Answer) -> bool {
     !answer.is_refusal() && (answer.next != row.state || !answer.commands.is_empty())
 }

@@ -1,5 +1,5 @@
-//! The runs of a folder in the order in which they were begun. Each has a number and names the record of the one before, so that a run that is
-//! taken away, or renamed, is missed.
+//! Runs of a folder in the order in which they began. Each run has a number and the hash of the record of the previous
+//! run. A removed or renamed run is therefore detected.
 
 use std::cmp::Reverse;
 use std::collections::BTreeSet;
@@ -18,9 +18,9 @@ use super::audit::is_whole;
 use super::control::folders;
 use super::failure::Failure;
 
-/// Runs of each kind of newest, of which the numbers are read when the next one begins.
+/// Number of newest runs, by each criterion, whose numbers are read when the next run begins.
 const NEWEST: usize = 200;
-/// How long a run waits for others that begin in the same folder, and how often it asks.
+/// Timeout for other runs that begin in the same folder, and time between two tries.
 const TURN_COMES_WITHIN: Duration = Duration::from_secs(5);
 const ASKED_EVERY: Duration = Duration::from_millis(20);
 
@@ -41,22 +41,24 @@ struct Before {
     head: String,
 }
 
-/// Keeps others from beginning a run in a folder, until it is dropped: two that begin at once have numbers of their own. None where the system
-/// locks no folders.
+/// Lock that keeps other runs from beginning in a folder until it is dropped, so that two simultaneous runs receive
+/// different numbers. `None` if the system cannot lock folders.
 pub(super) struct Turn(Option<File>);
 
 impl Drop for Turn {
     fn drop(&mut self) {
-        // Closing would not do: a child that another thread has just forked shares the lock until its exec.
+        // Unlocks explicitly. After a plain close, a child that another thread has just forked would share the lock
+        // until its exec.
         self.0.iter().for_each(|folder| drop(folder.unlock()));
     }
 }
 
 impl Place {
-    /// Takes the next place in a folder of runs, to be kept until the run has its first record.
+    /// Returns the next place in a folder of runs, and its lock. Keep the lock until the run has its first record.
     pub(super) fn next(runs: &Path) -> Result<(Self, Turn), Failure> {
         ResultFolder::prepare(runs).map(ResultFolder::keep).map_err(Failure::File)?;
-        // Any user may hold it: that keeps nobody from a run, who then may have the number of another.
+        // Any user can hold this lock. It does not prevent a run, but without it the run can receive the number of
+        // another run.
         let folder = File::open(runs).ok().filter(is_ours_in_time);
         let last = newest_with_numbers(runs).into_iter().max_by_key(|(number, _)| *number);
         let before = last.as_ref().and_then(|(_, folder)| {
@@ -67,20 +69,20 @@ impl Place {
         Ok((Self { number, before }, Turn(folder)))
     }
 
-    /// As the first record of a run keeps it.
+    /// Adds the place to the first record of a run.
     pub(super) fn in_record(&self, content: &mut Value) {
         content["number"] = json!(self.number);
         content["before"] = json!(self.before);
     }
 
-    /// Reads it from the first record of a run; none of one that was begun before runs had numbers.
+    /// Reads the place from the first record of a run. Returns `None` for a run from before runs had numbers.
     fn of(folder: &Path) -> Option<Self> {
         let first = Reader::open(folder).ok()?.records(0).next()?.ok()?;
         serde_json::from_value(first.value()["content"].clone()).ok()
     }
 }
 
-/// The hash of a record of a run that was found sound.
+/// Returns the hash of a record of a run that was verified.
 fn hash_of(folder: &Path, seq: u64) -> Option<String> {
     let record = Reader::open(folder).ok()?.records(seq).next()?.ok()?;
     (record.seq == seq).then_some(record.hash)
@@ -90,7 +92,7 @@ fn name_of(folder: &Path) -> String {
     folder.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Takes a lock, in some seconds or not at all.
+/// Locks a folder. Returns false if it is not free within a few seconds.
 fn is_ours_in_time(folder: &File) -> bool {
     let began = Instant::now();
     loop {
@@ -102,8 +104,8 @@ fn is_ours_in_time(folder: &File) -> bool {
     }
 }
 
-/// The newest runs of a folder that have a number: those that began last by the time in their names, and those whose folders changed last, since
-/// a copy of the folder has changed all of them, and a run may have any name.
+/// Returns the newest runs of a folder that have a number. Two criteria select them: the time in the name, and the time
+/// of the last change of the folder. Both are needed, because a copy changes all folders, and a run can have any name.
 fn newest_with_numbers(runs: &Path) -> Vec<(u64, PathBuf)> {
     let changed = |folder: &PathBuf| fs::metadata(folder).and_then(|found| found.modified()).ok();
     let mut all: Vec<PathBuf> = folders(runs).collect();
@@ -114,7 +116,7 @@ fn newest_with_numbers(runs: &Path) -> Vec<(u64, PathBuf)> {
     newest.into_iter().filter_map(|folder| Some((Place::of(&folder)?.number, folder))).collect()
 }
 
-/// The time in the name of a run, as 20260704T120000Z; none where it has none.
+/// Returns the time in the name of a run, as 20260704T120000Z, or `None` if there is none.
 fn time_in(name: &str) -> Option<&str> {
     let is_time = |text: &str| {
         let of = |at: usize, byte: u8| {
@@ -131,7 +133,7 @@ fn time_in(name: &str) -> Option<&str> {
     (0..name.len()).rev().filter_map(|at| name.get(at..at + 16)).find(|text| is_time(text))
 }
 
-/// What is wrong among the runs of a folder, and how each of them stands.
+/// Verification of the runs of a folder: flaws, and the state of each run.
 #[derive(Debug, Default)]
 struct Proof {
     told: Vec<Value>,
@@ -139,7 +141,8 @@ struct Proof {
     are_under_way: bool,
 }
 
-/// Proves every run of a folder, and that none of them is missing, renamed, or another than the next one names.
+/// Verifies every run of a folder. Also checks that no run is missing, renamed, or different from the one that its
+/// successor names.
 pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outcome, Failure> {
     let mut proof = Proof::default();
     let mut all: Vec<(Option<Place>, PathBuf)> = folders(runs).map(|folder| (Place::of(&folder), folder)).collect();
@@ -167,7 +170,7 @@ pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outco
 }
 
 impl Proof {
-    /// Takes a run by itself.
+    /// Verifies a single run.
     fn take(&mut self, place: Option<&Place>, folder: &Path, keys: &[PublicKey]) {
         let name = name_of(folder);
         let number = place.map_or("-".to_owned(), |place| place.number.to_string());
@@ -200,7 +203,7 @@ impl Proof {
             .push(json!({ "number": place.map(|place| place.number), "run": name, "stands": stands, "words": words }));
     }
 
-    /// Sees that a run follows the one before it, and that this one is what it was then.
+    /// Checks that a run follows the one before it, and that the earlier run is unchanged since then.
     fn follows(&mut self, (number, folder): (u64, &Path), before: Option<&Before>, last: Option<(u64, &Path)>) {
         let name = name_of(folder);
         let due = last.map_or(1, |(last, _)| last.saturating_add(1));

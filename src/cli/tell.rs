@@ -1,4 +1,4 @@
-//! `regrind tell`: how this cell is, for whoever speaks Sparkplug B or OPC UA, beside whatever the cell does.
+//! `regrind tell`: publishes the status of this cell by Sparkplug B or OPC UA, in parallel with the work of the cell.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -16,13 +16,13 @@ use super::cell_now::{Look, name};
 use super::failure::Failure;
 use super::{Outcome, check, control, outside, plant, ship};
 
-/// From one look for a run to the next, and for the turn of this program.
+/// Time between two searches for a run, and between two tries for the publisher lock.
 const ROUND: Duration = Duration::from_secs(1);
-/// How long it is told behind a run that has ended how that ended.
+/// Time for which the result of an ended run is still published.
 const LINGERS: Duration = Duration::from_secs(3);
-/// How long a farewell may take.
+/// Timeout for the closing messages.
 const FAREWELL: Duration = Duration::from_secs(5);
-/// Most refusals that are told one by one in a minute.
+/// Maximum number of refusals that are reported individually per minute.
 const ONE_BY_ONE: usize = 8;
 const MINUTE: Duration = Duration::from_secs(60);
 
@@ -55,7 +55,7 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let config = plant::read(&arguments.plant)?;
     let cell = cell_of(&config)?;
-    // Whatever else this computer does goes first.
+    // Other programs of this computer have priority.
     outside::give_way();
     super::runtime()?.block_on(async {
         let mut endings = outside::Endings::new().map_err(Failure::Signals)?;
@@ -77,7 +77,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// What the cell is called, which is told to somebody.
+/// Returns the name of the cell for publication.
 fn cell_of(config: &PlantConfig) -> Result<String, Failure> {
     let missing = |key, remedy| check::or_show(Err(config.problem(key, "is missing", "", remedy)));
     match &config.cell {
@@ -89,7 +89,7 @@ fn cell_of(config: &PlantConfig) -> Result<String, Failure> {
     }
 }
 
-/// Waits until no other program tells this cell.
+/// Waits until no other program publishes this cell.
 async fn turn(config: &PlantConfig, arguments: &Arguments) -> Result<Turn, Failure> {
     let folder = config.path().with_extension("live");
     let mut waits = false;
@@ -104,7 +104,7 @@ async fn turn(config: &PlantConfig, arguments: &Arguments) -> Result<Turn, Failu
     }
 }
 
-/// Tells the cell until it is to end.
+/// Publishes the cell until the end is requested.
 async fn tell(
     config: &PlantConfig,
     cell: &str,
@@ -116,7 +116,7 @@ async fn tell(
     let (to, told) = watch::channel(look.now().clone());
     let (notes, news) = notes();
     let mut telling = begin(config, cell, turn, &told, &notes)?;
-    // Only those who tell hold on to the news.
+    // Only the publishers keep the senders and receivers of events.
     drop((told, notes));
     let mut hearing = tokio::spawn(hear(news, arguments.runs.clone(), arguments.json));
     let over = tokio::select! {
@@ -131,7 +131,7 @@ async fn tell(
     };
     drop(to);
     let farewell = async { while telling.join_next().await.is_some() {} };
-    // Who does not listen to a farewell finds out otherwise.
+    // A receiver that does not read the closing messages detects the end by other means.
     let _ = tokio::time::timeout(FAREWELL, farewell).await;
     drop(telling);
     let _ = tokio::time::timeout(FAREWELL, &mut hearing).await;
@@ -143,7 +143,7 @@ async fn tell(
     }
 }
 
-/// Begins to tell all that the plant file names.
+/// Starts all publishers that the plant file names.
 fn begin(
     config: &PlantConfig,
     cell: &str,
@@ -161,11 +161,11 @@ fn begin(
     Ok(telling)
 }
 
-// ---- what is told -------------------------------------------------------------------------------------------------------------------
+// ---- published status ---------------------------------------------------------------------------------------------
 
 enum Never {}
 
-/// Tells how the cell is, from run to run.
+/// Publishes the status of the cell, from run to run.
 async fn follow(mut look: Look, runs: &Path, to: &watch::Sender<Told>) -> Never {
     loop {
         if let Some(folder) = control::live_runs(runs).next() {
@@ -177,7 +177,7 @@ async fn follow(mut look: Look, runs: &Path, to: &watch::Sender<Told>) -> Never 
     }
 }
 
-/// Tells how a run is until nothing is heard of it any more.
+/// Publishes the status of a run until it no longer answers.
 async fn watch_run(folder: &Path, look: &mut Look, to: &watch::Sender<Told>) {
     let Ok(mut watch) = regrind_control::watch(folder).await else { return };
     while let Ok(Some(snapshot)) = watch.next().await {
@@ -195,9 +195,9 @@ fn tell_all(now: &Told, to: &watch::Sender<Told>) {
     });
 }
 
-// ---- what comes back ----------------------------------------------------------------------------------------------------------------
+// ---- returned events ----------------------------------------------------------------------------------------------
 
-/// Says what happened to those who tell, and has on record what was refused while a run was on.
+/// Prints the events of the publishers, and records refused requests while a run is active.
 async fn hear(mut news: mpsc::Receiver<News>, runs: PathBuf, json: bool) {
     let mut some = Vec::new();
     let mut quota = Quota::new(Instant::now());
@@ -229,7 +229,8 @@ async fn hear(mut news: mpsc::Receiver<News>, runs: PathBuf, json: bool) {
     }
 }
 
-/// How many refusals are told in a minute: so many one by one, and once how many there were besides. Each is a line on the record of a run.
+/// Limit of the reported refusals per minute: some individually, and then once the number of the others. Each report is
+/// a line in the record of a run.
 struct Quota {
     since: Instant,
     told: usize,
@@ -248,14 +249,14 @@ impl Quota {
         }
     }
 
-    /// Whether one more is told.
+    /// Returns true if one more refusal is reported individually.
     fn takes(&mut self, now: Instant) -> bool {
         self.turn(now);
         self.told += 1;
         self.told <= ONE_BY_ONE
     }
 
-    /// How many are to be told together now; `over` where nothing comes any more.
+    /// Returns the number of refusals to report together now. `over` is true if no further refusals can arrive.
     fn summed_up(&mut self, now: Instant, over: bool) -> Option<u64> {
         self.turn(now);
         let is_due = self.untold > 0 && (over || !self.has_summed_up);
@@ -266,7 +267,7 @@ impl Quota {
     }
 }
 
-/// Says what was refused, here and in the record of the run that is on.
+/// Reports a refused request, here and in the record of the active run.
 async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
     say(
         json,
@@ -276,7 +277,7 @@ async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
     let runs = runs.to_owned();
     let remark = Request::Remark { what: format!("live values: refused: {what}") };
     let by = OnBehalf { name: None, station: by.to_owned() };
-    // A run that does not answer holds up nothing but this.
+    // A run that does not answer delays only this report.
     let recorded = tokio::task::spawn_blocking(move || {
         let run = control::live_runs(&runs).next()?;
         Some(regrind_control::ask_for(&run, &remark, Some(by)).is_ok_and(|reply| reply.taken))
@@ -289,7 +290,7 @@ async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
 fn say(json: bool, fields: &serde_json::Value, words: &str) {
     eprintln!("tell: {words}");
     if json {
-        // A reader that has gone away is no fault.
+        // A reader that is gone is not an error.
         let _ = super::print(&format!("{fields}\n"));
     }
 }
@@ -303,7 +304,7 @@ mod tests {
         let began = Instant::now();
         let mut quota = Quota::new(began);
         let (mut lines, mut counted) = (0, 0);
-        // A thousand a second for ten minutes, heard four times a second.
+        // A thousand per second for ten minutes, processed four times per second.
         for quarter in 0..2400 {
             let now = began + Duration::from_millis(250 * quarter);
             for _ in 0..250 {

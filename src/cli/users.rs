@@ -1,4 +1,4 @@
-//! `regrind users`: who may sign in to the page from another computer, and as what.
+//! `regrind users`: the users who can sign in to the page from another computer, and their roles.
 
 use std::io::{self, BufRead, IsTerminal};
 use std::path::{Path, PathBuf};
@@ -101,7 +101,7 @@ fn tell(users: &Users, as_json: bool) -> Result<(), Failure> {
     users.people().try_for_each(|of| super::print(&format!("{:9}  {}\n", of.role, of.name)))
 }
 
-/// Asks for a password, twice and unseen; out of a pipe it is the first line.
+/// Asks for a password twice without showing it. From a pipe, reads the first line.
 fn password(name: &str) -> Result<String, Failure> {
     if !io::stdin().is_terminal() {
         let mut line = String::new();

@@ -1,4 +1,4 @@
-//! `regrind watch`: a running cell on the whole of a terminal.
+//! `regrind watch`: full-screen terminal view of a running cell.
 
 use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
@@ -24,7 +24,7 @@ use super::failure::Failure;
 use super::show::{how_far, limits, pv_name, so_far};
 use super::words::time_left;
 
-/// Between two looks whether a map is on record.
+/// Time between two checks for a new map on record.
 const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
 
 /// Watch a running cell: its state, progress, figures and error map, with a key to hold it
@@ -58,13 +58,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         let mut terminal = ratatui::init();
         let ended = view.follow(&mut terminal, &mut watch).await;
         ratatui::restore();
-        // What was on the whole terminal has gone with it.
+        // The full-screen view is gone, so the last status is printed again.
         super::print(&format!("{}\n{}\n", folder.display(), view.seen.message))?;
         ended
     })
 }
 
-/// A line for each new state, for a file or a pipe.
+/// Prints one line per new state, for a file or a pipe.
 async fn in_lines(first: Snapshot, watch: &mut regrind_control::Watch, folder: &Path) -> Result<Outcome, Failure> {
     let mut told = String::new();
     let mut seen = Ok(Some(first));
@@ -80,7 +80,7 @@ async fn in_lines(first: Snapshot, watch: &mut regrind_control::Watch, folder: &
     Ok(Outcome::Accepted)
 }
 
-/// How a run ended whose program tells no more; an error where it has no end on record.
+/// Returns the result of a run whose program no longer answers. Returns an error if its end is not on record.
 fn ended(folder: &Path, told: io::Result<Option<Snapshot>>) -> Result<String, Failure> {
     let summary = run_summary(folder).unwrap_or_default();
     if summary.ended.is_some() {
@@ -90,17 +90,17 @@ fn ended(folder: &Path, told: io::Result<Option<Snapshot>>) -> Result<String, Fa
     Err(Failure::unreached(folder, source))
 }
 
-/// What is on the terminal.
+/// Content of the terminal.
 struct View {
     seen: Snapshot,
     folder: PathBuf,
-    /// Nodes of the last error map, and its name within the run folder.
+    /// Nodes of the last error map, and its name in the run folder.
     map: Option<(String, Vec<MapNode>)>,
-    /// Whether it is shown how well it is known, in place of the error.
+    /// True if the view shows the standard deviation in place of the error.
     as_sigma: bool,
-    /// When the record was looked at for a newer one, and what the cell's state had for a number then.
+    /// Time of the last check of the record for a newer map, and the number of the cell's state at that time.
     looked: Option<(Instant, u64)>,
-    /// What came of the last key.
+    /// Result of the last key.
     said: String,
 }
 
@@ -143,7 +143,7 @@ impl View {
         };
     }
 
-    /// Reads the newest map on record, once there may be another one.
+    /// Reads the newest map on record when a new one is possible.
     fn read_map(&mut self) {
         let number = self.seen.number;
         if self.looked.is_some_and(|(at, of)| of == number || at.elapsed() < BETWEEN_LOOKS) {
@@ -259,18 +259,18 @@ impl View {
     }
 }
 
-/// Keys as they are pressed, from a thread that may wait for them.
+/// Reads pressed keys on a separate thread that can block.
 fn keys() -> mpsc::Receiver<KeyCode> {
     let (pressed, keys) = mpsc::channel(16);
     std::thread::spawn(move || {
         while !pressed.is_closed() {
-            // Looked at again and again, so that the thread ends with who listens.
+            // Polls with a timeout, so that the thread ends with its receiver.
             if !event::poll(Duration::from_millis(200)).unwrap_or(false) {
                 continue;
             }
             match event::read() {
                 Ok(Event::Key(key)) if key.kind == KeyEventKind::Press => {
-                    // In raw mode Ctrl-C is a key like any other.
+                    // In raw mode Ctrl-C is an ordinary key.
                     let leaves = key.code == KeyCode::Char('c') && key.modifiers.contains(event::KeyModifiers::CONTROL);
                     let code = if leaves { KeyCode::Esc } else { key.code };
                     if pressed.blocking_send(code).is_err() {

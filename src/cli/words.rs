@@ -1,8 +1,8 @@
-//! Numbers as people read them.
+//! Numbers in a readable form.
 
 use regrind::cell::Compared;
 
-/// A count with its thousands apart: 451,401.
+/// Returns a count with separated thousands: 451,401.
 pub(super) fn count(n: usize) -> String {
     let digits = n.to_string();
     let mut text = String::new();
@@ -15,12 +15,12 @@ pub(super) fn count(n: usize) -> String {
     text
 }
 
-/// A count with its noun: 1 point, 2 points.
+/// Returns a count with its noun: 1 point, 2 points.
 pub(super) fn counted(n: usize, noun: &str) -> String {
     format!("{} {noun}{}", count(n), if n == 1 { "" } else { "s" })
 }
 
-/// Three significant digits, without an exponent between a thousandth and a million.
+/// Returns three significant digits, without an exponent between 0.001 and a million.
 pub(super) fn three_digits(value: f64) -> String {
     let size = value.abs();
     if size == 0.0 {
@@ -33,7 +33,7 @@ pub(super) fn three_digits(value: f64) -> String {
     format!("{value:.*}", (3 - before_point).max(0) as usize)
 }
 
-/// Writes a figure that is judged, beside its limit if it has one.
+/// Returns a judged figure, with its limit if it has one.
 pub(super) fn judged(compared: &Compared) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let Compared { name, found_mm, limit_mm, .. } = compared;
@@ -42,7 +42,7 @@ pub(super) fn judged(compared: &Compared) -> String {
     format!("{name} {}{of} um{within}", um(*found_mm))
 }
 
-/// Writes the least and the most time that something will take.
+/// Returns the minimum and the maximum remaining time, as text.
 pub(super) fn time_left([least_s, most_s]: [f64; 2]) -> String {
     let (unit, name) = match most_s {
         s if s < 90.0 => (1.0, "s"),
@@ -54,8 +54,8 @@ pub(super) fn time_left([least_s, most_s]: [f64; 2]) -> String {
     if least == most { format!("{most} {name}") } else { format!("{least} to {most} {name}") }
 }
 
-/// Breaks lines between words where a terminal would break them anywhere. What goes on stands below what it goes on with: below the
-/// text of a line that begins with a label and two spaces. A word that is longer than a line is left to the terminal.
+/// Wraps lines between words at `columns`. A continuation is indented to the text of its line, that is, to the text
+/// after a label and two spaces. A word longer than a line is left to the terminal.
 pub(super) fn wrapped(text: &str, columns: usize) -> String {
     let mut out = String::new();
     for line in text.lines() {
@@ -80,7 +80,7 @@ pub(super) fn wrapped(text: &str, columns: usize) -> String {
     out
 }
 
-/// Returns the column of the text behind a label, if both have their place in a line.
+/// Returns the column of the text after a label, if label and text fit into a line.
 fn text_begins(line: &str, columns: usize) -> usize {
     let begin = line.len() - line.trim_start().len();
     let label = line[begin..].find("  ").map(|at| begin + at);

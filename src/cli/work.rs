@@ -1,4 +1,4 @@
-//! `regrind work`: the parts that a plant has queued, taken one after the other, each confirmed by a person at the cell.
+//! `regrind work`: runs the parts in the plant's queue one after the other. A person at the cell confirms each.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -15,9 +15,9 @@ use regrind_plant::{Begun, LEASE, Lease, Link, PlantError, PlantRecipe};
 use super::failure::Failure;
 use super::{Outcome, check, plant, recover, run as making};
 
-/// How often the queue is asked where `--wait` is given.
+/// Time between two queries of the queue with `--wait`.
 const ROUND: Duration = Duration::from_secs(5);
-/// Where pulled recipes are kept, below the folder of the runs.
+/// Folder of downloaded recipes, within the folder of the runs.
 const RECIPES: &str = ".recipes";
 
 /// Make the parts that the plant has queued for this cell, one after the other
@@ -74,7 +74,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// A part that was confirmed, on its way into its run.
+/// Confirmed part, before its run begins.
 #[derive(Clone, Debug)]
 pub(super) struct Taken {
     config: PlantConfig,
@@ -82,12 +82,13 @@ pub(super) struct Taken {
 }
 
 impl Taken {
-    /// Begins the part in a run: from here on it is that run's. Until the plant has said so nothing begins.
+    /// Assigns the part to a run. Nothing begins until the plant has confirmed the assignment.
     pub(super) async fn begin(&self, run: &Path) -> Result<(), Failure> {
         let name = run.file_name().unwrap_or_default().to_string_lossy();
         let link = plant::open(&self.config).await?;
         match self.lease.begin(&link, &name).await {
-            // Whether it was begun is not known: the same question has the same answer.
+            // It is unknown whether the plant made the assignment. The request is idempotent: a retry returns the same
+            // answer.
             Err(error) if error.may_pass() => {
                 let link = plant::open(&self.config).await?;
                 Ok(self.lease.begin(&link, &name).await?)
@@ -130,23 +131,23 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             truth: None,
             json: arguments.json,
         })?;
-        // What did not turn out wants a person before the next blank is ground.
+        // After any other result a person must act before the next blank is ground.
         if outcome != Outcome::Accepted || arguments.once {
             return Ok(outcome);
         }
     }
 }
 
-/// What the queue has for the cell.
+/// Answer of the queue for the cell.
 enum Next {
-    /// A part that was confirmed, and its recipe.
+    /// Confirmed part, and the path of its recipe.
     Part(PathBuf, Box<Taken>),
-    /// A part that nobody at the cell confirmed.
+    /// Part that nobody at the cell confirmed.
     GivenBack,
     None,
 }
 
-/// Takes the next part and has it confirmed.
+/// Takes the next part and requests its confirmation.
 async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failure> {
     let link = plant::open(config).await?;
     nothing_is_open(&link, &arguments.runs).await?;
@@ -154,7 +155,7 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
     let (recipe, signed) = match PlantRecipe::pull(&link, &lease.recipe_sha256, &config.approvers).await {
         Ok(pulled) => pulled,
         Err(error) => {
-            // The next cell may know who has signed it.
+            // Another cell can know the person who signed the recipe.
             lease.hand_back(&link, &error.to_string()).await?;
             return Err(error.into());
         }
@@ -181,7 +182,8 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
     }
 }
 
-/// Whether somebody at the cell wants it made, or the recipe asks for nobody. The lease is kept meanwhile.
+/// Returns true if a person at the cell confirms the part, or if the recipe needs no confirmation. Renews the lease
+/// while it waits.
 async fn confirmed(link: &Link, lease: &Lease, recipe: &Recipe, arguments: &Arguments) -> Result<bool, Failure> {
     if let Some(serial) = &arguments.part {
         return Ok(*serial == lease.serial);
@@ -195,7 +197,7 @@ async fn confirmed(link: &Link, lease: &Lease, recipe: &Recipe, arguments: &Argu
         tokio::select! {
             typed = &mut answer => return Ok(typed.map_err(|error| Failure::Terminal(error.into()))?? == lease.serial),
             () = tokio::time::sleep(LEASE / 3) => match lease.renew(link).await {
-                // The plant decides when the part is begun; a network that is down meanwhile is nobody's answer.
+                // The plant decides when the part begins. A network fault in the meantime does not decide anything.
                 Err(error) if error.may_pass() => {}
                 renewed => renewed?,
             },
@@ -203,12 +205,12 @@ async fn confirmed(link: &Link, lease: &Lease, recipe: &Recipe, arguments: &Argu
     }
 }
 
-/// Refuses to take a part while one that was begun here is not over.
+/// Returns an error if a part that began here has not ended. No further part is taken then.
 async fn nothing_is_open(link: &Link, runs: &Path) -> Result<(), Failure> {
     for begun in Begun::all(link).await? {
         let (run, serial, folder) = (&begun.run, &begun.lease.serial, runs.join(&begun.run));
         let nothing = match how_far(&folder) {
-            // Its end is on its way to the plant.
+            // The end of the run is still on its way to the plant.
             HowFar::Over => continue,
             HowFar::UnderWay => {
                 let why = format!(
@@ -228,7 +230,7 @@ async fn nothing_is_open(link: &Link, runs: &Path) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Gives a part back of whose run nothing came, or up, for a reason.
+/// Returns a part without a run to the queue, or gives it up for the reason in `up`.
 async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>) -> Result<Outcome, Failure> {
     let link = plant::open(config).await?;
     let begun = Begun::all(&link).await?.into_iter().find(|begun| begun.lease.serial == serial);
@@ -256,20 +258,20 @@ async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>)
     Ok(Outcome::Accepted)
 }
 
-/// How far a run came, by its record.
+/// Progress of a run, by its record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum HowFar {
-    /// There is no record of it.
+    /// Run without a record.
     Nowhere,
-    /// It was begun, and nothing was asked of a machine.
+    /// Run that began, but sent nothing to a machine.
     Begun,
-    /// Something was.
+    /// Run that sent a request to a machine.
     UnderWay,
-    /// It has its end.
+    /// Run with a recorded end.
     Over,
 }
 
-/// Looks how far a run came. What cannot be read counts as if something had been asked of a machine.
+/// Returns the progress of a run. An unreadable run counts as one that sent a request to a machine.
 fn how_far(folder: &Path) -> HowFar {
     // To look makes no journal where there is none.
     let Ok(reader) = Reader::open(folder) else {
@@ -287,7 +289,7 @@ fn how_far(folder: &Path) -> HowFar {
     far
 }
 
-/// Keeps a pulled recipe and its files in a folder of its hash; returns where the recipe is.
+/// Stores a downloaded recipe and its files in a folder named by its hash. Returns the path of the recipe.
 fn keep(runs: &Path, sha256: &str, recipe: &PlantRecipe) -> Result<PathBuf, Failure> {
     let folder = runs.join(RECIPES).join(sha256);
     let plain = |c: char| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' };
@@ -309,7 +311,7 @@ fn keep(runs: &Path, sha256: &str, recipe: &PlantRecipe) -> Result<PathBuf, Fail
 }
 
 fn write(path: &Path, content: &[u8]) -> Result<(), Failure> {
-    // What is there is what has been proven before, or is put right.
+    // A file with equal content was verified before. Any other file is overwritten.
     if fs::read(path).is_ok_and(|there| there == content) {
         return Ok(());
     }

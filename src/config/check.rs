@@ -1,4 +1,4 @@
-//! From a cell file as written to a checked one: units, and what one key says against another.
+//! Checks a cell file as written: converts units and finds contradictions between keys.
 
 use std::path::Path;
 use std::time::Duration;
@@ -13,7 +13,7 @@ use crate::formats::gcode::{DialectError, LINUXCNC};
 use crate::geometry::{Point, Pose, Twist};
 use crate::model;
 
-/// Everything of a cell but where it came from; `None` where something is missing, which has been told.
+/// Checked values of a cell without path and text. A field is `None` if a key is missing, which is already reported.
 pub(super) struct Checked {
     name: Option<String>,
     simulated: Option<bool>,
@@ -23,7 +23,7 @@ pub(super) struct Checked {
 }
 
 impl Checked {
-    /// Puts the cell together, if nothing is missing.
+    /// Returns the cell, or `None` if a value is missing.
     pub(super) fn into_cell(self, path: &Path, text: &str, source_sha256: [u8; 32]) -> Option<CellConfig> {
         Some(CellConfig {
             name: self.name?,
@@ -39,7 +39,7 @@ impl Checked {
     }
 }
 
-/// The tables that both machines have.
+/// Tables that both machines have.
 struct Machine<'w> {
     key: &'static str,
     wire: Option<&'w Wire>,
@@ -49,7 +49,7 @@ struct Machine<'w> {
     signals: &'w [SignalTable],
 }
 
-/// Checks a cell file as written; what is wrong is told to the document.
+/// Checks a cell file as written. Errors are reported to `document`.
 pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) -> Checked {
     let (cmm, grinder) = (&written.cmm, &written.grinder);
     let machines = [
@@ -71,7 +71,8 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
         },
     ];
     let simulated = written.cell.simulated;
-    // One machine served by a person beside a simulated one is a rehearsal; both leave nothing to be simulated.
+    // A simulated machine beside one that a person serves is a rehearsal. With both served by people nothing is
+    // simulated.
     if simulated == Some(true) && machines.iter().all(|m| m.wire.is_some_and(Wire::is_by_person)) {
         let found = "is true, and both machines are reached by files or served by hand";
         document.report("cell.simulated", found, "nobody simulates a person", "write `simulated = false`");
@@ -84,7 +85,7 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
     let travel = cmm.travel.as_ref().map(|travel| self::travel(travel, "cmm", document));
     let limits = limits(grinder, document);
     let program = programming(grinder, path, document);
-    // A table that is there and incomplete has been told of.
+    // An incomplete table is already reported.
     let rotary = grinder.rotary.as_ref().map(|rotary| self::rotary(rotary, document));
     let complete = !matches!(sphere, Some(None)) && !matches!(travel, Some(None));
     Checked {
@@ -173,7 +174,7 @@ impl Machine<'_> {
     }
 }
 
-/// Turns about fixed x, then y, then z, then moves.
+/// Returns the pose of the fixture: rotations about fixed x, then y, then z, then a translation.
 fn fixture(written: &FixtureTable) -> Pose {
     let turn = |axis: usize| {
         let mut twist = Twist::zeros();
@@ -185,7 +186,7 @@ fn fixture(written: &FixtureTable) -> Pose {
 
 fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> Option<Programming> {
     let written = &grinder.program;
-    // LinuxCNC takes what is put into a frame for it.
+    // LinuxCNC reads only its own dialect and frame.
     if matches!(grinder.wire, Some(Wire::Linuxcnc(_))) {
         if written.dialect != LINUXCNC {
             let found = format!("is {:?} beside LinuxCNC", written.dialect);

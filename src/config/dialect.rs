@@ -1,4 +1,4 @@
-//! The dialect that a cell's programs are written in: one that comes with the program, or a file of the shop's own.
+//! Dialect of a cell's programs: a built-in one, or a file of the shop.
 
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
@@ -8,7 +8,7 @@ use crate::formats::gcode::Dialect;
 
 static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<Dialect>);
 
-/// The dialects that come with the program, by name.
+/// Built-in dialects, by name.
 const BUILT_IN: [(&str, &str); 4] = [
     ("linuxcnc", include_str!("../../config/dialects/linuxcnc.toml")),
     ("fanuc", include_str!("../../config/dialects/fanuc.toml")),
@@ -21,21 +21,21 @@ pub fn dialect_schema() -> &'static serde_json::Value {
     &SCHEMA
 }
 
-/// Returns the names of the dialects that come with the program.
+/// Returns the names of the built-in dialects.
 pub fn dialects() -> impl Iterator<Item = &'static str> {
     BUILT_IN.iter().map(|(name, _)| *name)
 }
 
-/// Returns the file that a cell file at this path means by a dialect; none for one that comes with the program.
+/// Returns the path of the dialect file that a cell file at `cell` names, or `None` for a built-in dialect.
 pub(super) fn file_of(dialect: &str, cell: &Path) -> Option<PathBuf> {
     let is_built_in = dialects().any(|name| name == dialect);
     (!is_built_in).then(|| cell.parent().unwrap_or(Path::new("")).join(dialect))
 }
 
-/// Reads a dialect that comes with the program, or a file.
+/// Reads a built-in dialect or a dialect file.
 ///
 /// # Errors
-/// A file that cannot be read, and everything that is wrong with its text.
+/// Returns an error if the file cannot be read, and all errors of its text.
 pub(super) fn read(dialect: &str, cell: &Path) -> Result<Dialect, Problems> {
     match BUILT_IN.iter().find(|(name, _)| *name == dialect) {
         Some((name, text)) => parse_dialect(Path::new(name), text).map(|(dialect, _)| dialect),
@@ -43,25 +43,25 @@ pub(super) fn read(dialect: &str, cell: &Path) -> Result<Dialect, Problems> {
     }
 }
 
-/// Reads a file of a dialect, and the SHA-256 of its text.
+/// Reads a dialect file. Returns the dialect and the SHA-256 of its text.
 ///
 /// # Errors
-/// A file that cannot be read, and everything that is wrong with its text.
+/// Returns an error if the file cannot be read, and all errors of its text.
 pub fn read_dialect(path: &Path) -> Result<(Dialect, [u8; 32]), Problems> {
     let text = read_text(path)?;
     parse_dialect(path, &text)
 }
 
-/// Reads a dialect from its text; the path is for messages.
+/// Parses a dialect from its text. Returns the dialect and the SHA-256 of the text. `path` is used in messages.
 ///
 /// # Errors
-/// Everything that is wrong with the text.
+/// Returns all errors of the text.
 pub fn parse_dialect(path: &Path, text: &str) -> Result<(Dialect, [u8; 32]), Problems> {
     let mut document = Document::parse(path, text)?;
     document.hold_against(&SCHEMA);
     let written: Option<Dialect> = document.as_written();
     for fault in written.iter().flat_map(Dialect::faults) {
-        // What is missing altogether has been told.
+        // A missing key is already reported.
         if !document.has_problem(&fault.key) {
             document.report(&fault.key, fault.found, fault.allowed, fault.remedy);
         }

@@ -1,10 +1,10 @@
-//! A cell: which machines there are, on which wires they answer, where the fixture holds the part, and what they can do.
+//! A cell: its machines, their wires, the pose of the part in the fixture, and the limits of the machines.
 //!
 //! ```text
 //!  text -> CellFile (as written, src/config/written.rs) -> CellConfig (checked: mm, rad, s; no contradiction)
 //! ```
 //!
-//! Everything that is wrong with a file is told at once ([`crate::document::Problems`]), each thing at its line and column.
+//! All errors of a file are reported together ([`crate::document::Problems`]), each with its line and column.
 
 mod check;
 mod dialect;
@@ -26,17 +26,18 @@ pub use dialect::{dialect_schema, dialects, parse_dialect, read_dialect};
 pub use plant::{PlantConfig, plant_schema};
 pub use written::RotaryLetter;
 
-/// A cell, checked.
+/// Checked configuration of a cell.
 #[derive(Clone, Debug)]
 pub struct CellConfig {
     /// Name of the cell.
     pub name: String,
-    /// Whether its machines are simulated; everything recorded is marked so.
+    /// True if the machines are simulated. Every record is then marked SIMULATION.
     pub simulated: bool,
-    /// Whether people only play its machines, with no part: everything recorded is marked as that of simulated machines is, and the plan itself may be
-    /// given back as what was measured. No cell file says it; who begins the run does.
+    /// True in a rehearsal: people play the machines and no part exists. Records are then marked like those of
+    /// simulated machines, and the plan itself is accepted as a measurement. No key of the cell file sets this; the
+    /// caller that begins the run sets it.
     pub rehearsal: bool,
-    /// Whether no run is begun without a key that signs its record.
+    /// True if a run needs a key that signs its record.
     pub require_signature: bool,
     /// The measuring machine.
     pub cmm: Cmm,
@@ -50,118 +51,120 @@ pub struct CellConfig {
 /// A measuring machine.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cmm {
-    /// How to talk to it.
+    /// Connection to the machine.
     pub link: Link,
-    /// Where the fixture holds the part: takes model coordinates to CMM coordinates.
+    /// Pose of the part in the fixture. It maps model coordinates to CMM coordinates.
     pub fixture_cmm_from_model: Pose,
-    /// Expansion of its scales in millionths per kelvin, as far as it does not correct that by itself.
+    /// Thermal expansion of its scales in µm/(m K), as far as the machine does not compensate it.
     pub scale_expansion_um_m_k: f64,
-    /// Standard uncertainty of the temperature of the part that it tells.
+    /// Standard uncertainty of the part temperature that the machine reports, in K.
     pub temperature_uncertainty_k: f64,
-    /// What it does to all points together, as standard uncertainties.
+    /// Standard uncertainties of the machine errors that are common to all points.
     pub uncertainty: MachineUncertainty,
-    /// The sphere on which the probe is checked.
+    /// Reference sphere on which the probe is checked.
     pub reference_sphere: Option<ReferenceSphere>,
-    /// The box that the probe's centre must not leave.
+    /// Travel limits of the probe's centre.
     pub travel: Option<Travel>,
 }
 
 /// A grinder.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Grinder {
-    /// How to talk to it.
+    /// Connection to the machine.
     pub link: Link,
-    /// What it can do.
+    /// Limits of the machine.
     pub limits: GrinderLimits,
-    /// How its programs are written.
+    /// Format and settings of its programs.
     pub program: Programming,
     /// The rotary axis of its head, if it has one.
     pub rotary: Option<Rotary>,
 }
 
-/// The rotary axis of a head that tilts the wheel, in the terms of its scale; [`crate::compensation::path::Rotary`] is the same as paths have it.
+/// Rotary axis of a head that tilts the wheel, in units of its own scale. [`crate::compensation::path::Rotary`] is the
+/// same axis in the form that paths use.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rotary {
-    /// What programs call it: an A turns about x, a B about y.
+    /// Letter of the axis in programs: A turns about x, B about y.
     pub letter: RotaryLetter,
-    /// Whether its scale counts left-handed.
+    /// True if the scale counts left-handed.
     pub reversed: bool,
-    /// Least and largest angle on its scale.
+    /// Minimum and maximum angle on its scale.
     pub range_deg: [f64; 2],
-    /// Largest rate.
+    /// Maximum rate.
     pub largest_rate_deg_min: f64,
-    /// From the wheel's centre to the pivot with the head upright; `None` where the control keeps the centre by itself.
+    /// Vector from the wheel's centre to the pivot with the head upright. `None` if the control itself keeps the centre
+    /// in place.
     pub pivot_mm: Option<[f64; 3]>,
 }
 
-/// How the programs of a grinder are written.
+/// Format and settings of the programs of a grinder.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Programming {
-    /// The dialect of its control.
+    /// Dialect of its control.
     pub dialect: Dialect,
-    /// How far the control rounds corners off by a setting of its own, where that is known.
+    /// Tolerance with which the control rounds corners by its own setting, if known.
     pub controller_tolerance_mm: Option<f64>,
-    /// How far arcs may be from the path; none for lines alone.
+    /// Maximum distance of an arc from the path. `None` if programs have lines only.
     pub arcs_within_mm: Option<f64>,
-    /// The folder in which the control finds the program of each pass.
+    /// Folder in which the control finds the program of each pass.
     pub folder: Option<PathBuf>,
 }
 
-/// How to talk to a machine.
+/// Connection to a machine.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Link {
-    /// The wire.
+    /// Wire to the machine.
     pub wire: Wire,
-    /// How long to wait for what.
+    /// Timeouts and polling times.
     pub timing: Timing,
-    /// Where the blocks of its Modbus map stand.
+    /// Addresses of the blocks of its Modbus map.
     pub registers: RegisterMap,
     /// Further values that are read and recorded.
     pub signals: Vec<Signal>,
-    /// The name that the machine must have in its identity block.
+    /// Name that the machine must report in its identity block.
     pub expected_name: Option<String>,
 }
 
-/// The sphere on which the probe is checked.
+/// Reference sphere on which the probe is checked.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ReferenceSphere {
-    /// Its centre in the CMM frame.
+    /// Centre in the CMM frame.
     pub centre: Point,
-    /// Its radius.
+    /// Radius.
     pub radius_mm: f64,
-    /// How many points are taken on it.
+    /// Number of points that are taken on it.
     pub points: u16,
 }
 
-/// A box: in the CMM frame for the probe, in the model frame for the wheel.
+/// Box of allowed positions: in the CMM frame for the probe, in the model frame for the wheel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Travel {
-    /// Least x, y, z.
+    /// Minimum x, y, z.
     pub least_mm: [f64; 3],
-    /// Largest x, y, z.
+    /// Maximum x, y, z.
     pub most_mm: [f64; 3],
 }
 
-/// What a grinder can do.
+/// Limits of a grinder.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GrinderLimits {
-    /// Largest feed.
+    /// Maximum feed.
     pub largest_feed_mm_min: f64,
-    /// Smallest and largest radius of a wheel.
+    /// Minimum and maximum radius of a wheel.
     pub wheel_radius_mm: [f64; 2],
-    /// Most that one pass may take off.
+    /// Maximum depth that one pass removes.
     pub largest_depth_mm: f64,
-    /// Largest speed of an axis, where it is known.
+    /// Maximum speed of an axis, if known.
     pub largest_speed_mm_s: Option<f64>,
-    /// Largest acceleration of an axis, where it is known.
+    /// Maximum acceleration of an axis, if known.
     pub largest_acceleration_mm_s2: Option<f64>,
-    /// Largest change of the acceleration of an axis in time, where it is known.
+    /// Maximum jerk of an axis, if known.
     pub largest_jerk_mm_s3: Option<f64>,
-    /// Where the wheel's centre may be, in the model frame, where it is known.
+    /// Travel limits of the wheel's centre in the model frame, if known.
     pub travel: Option<Travel>,
 }
 
-/// What the simulated cell is called that comes with the program.
+/// Name of the built-in simulated cell.
 pub const BUILT_IN: &str = "sim";
 
 static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<written::CellFile>);
@@ -172,10 +175,10 @@ pub fn json_schema() -> &'static serde_json::Value {
 }
 
 impl CellConfig {
-    /// Reads a cell file; [`BUILT_IN`] is no file but the simulated cell that comes with the program.
+    /// Reads a cell file. [`BUILT_IN`] is not a file; it names the built-in simulated cell.
     ///
     /// # Errors
-    /// A file that cannot be read, and everything that is wrong with its text.
+    /// Returns an error if the file cannot be read, and all errors of its text.
     pub fn read(path: &Path) -> Result<Self, Problems> {
         if path == Path::new(BUILT_IN) {
             return Self::parse(path, include_str!("../../config/sim.toml"));
@@ -184,10 +187,10 @@ impl CellConfig {
         Self::parse(path, &text)
     }
 
-    /// Reads a cell file from its text; the path is for messages, and relative folders are relative to its folder.
+    /// Parses a cell file from its text. `path` is used in messages; relative folders are relative to its folder.
     ///
     /// # Errors
-    /// Everything that is wrong with the text.
+    /// Returns all errors of the text.
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
         document.hold_against(&SCHEMA);
@@ -199,30 +202,30 @@ impl CellConfig {
         })
     }
 
-    /// Returns a problem with a key of this file that somebody else has found, at its place in the text.
+    /// Returns a problem with a key of this file that another module found, at the key's place in the text.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, key, [found, allowed, remedy])
     }
 
-    /// Returns what a person should know of the wires on this computer: serial ports that are not there. It makes the file no worse, which
-    /// may be checked on another computer than the cell's.
+    /// Returns notes about the wires on this computer: serial ports that do not exist here. A note is not an error,
+    /// because the file can be checked on a computer other than the cell's.
     pub fn notes(&self) -> Vec<String> {
         let mut notes = [self.cmm.link.wire.notes(), self.grinder.link.wire.notes()].concat();
         notes.dedup();
         notes
     }
 
-    /// Whether everything recorded is marked SIMULATION: its machines are simulated, or people only play them.
+    /// Returns true if every record is marked SIMULATION: the machines are simulated, or the run is a rehearsal.
     pub fn is_marked(&self) -> bool {
         self.simulated || self.rehearsal
     }
 
-    /// Whether people serve both machines.
+    /// Returns true if people serve both machines.
     pub fn is_by_person(&self) -> bool {
         [&self.cmm.link, &self.grinder.link].iter().all(|link| link.wire.is_by_person())
     }
 
-    /// Returns the path that the cell file was read from.
+    /// Returns the path of the cell file.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -232,7 +235,7 @@ impl CellConfig {
         &self.text
     }
 
-    /// Returns the SHA-256 of the text.
+    /// Returns the SHA-256 of the text of the cell file.
     pub fn source_sha256(&self) -> &[u8; 32] {
         &self.source_sha256
     }

@@ -1,4 +1,5 @@
-//! A plant file: what a computer of a plant calls itself, and where the plant is. A cell runs without one.
+//! Plant file: the name of this computer's cell in the plant, and how the plant is reached. A cell also runs without a
+//! plant file.
 
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
@@ -45,22 +46,22 @@ struct PlantTable {
     machines_differ: Option<f64>,
 }
 
-/// A plant file, checked.
+/// Checked plant file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PlantConfig {
-    /// What this cell is called in the plant; none on a computer that is no cell's.
+    /// Name of this cell in the plant. `None` on a computer that belongs to no cell.
     pub cell: Option<String>,
-    /// How much machines are taken to differ, where somebody knows it.
+    /// Assumed difference between machines, if it is known.
     pub machines_differ: Option<f64>,
-    /// The database of the plant, its files found from here.
+    /// Database of the plant. Its file paths are resolved.
     pub database: Option<DatabaseSettings>,
-    /// Who may approve recipes.
+    /// People who can approve recipes.
     pub approvers: Vec<Approver>,
-    /// Where large files of runs are kept.
+    /// Store for large files of runs.
     pub artefacts: Option<ArtefactSettings>,
-    /// A broker that is told how the cell is.
+    /// Sparkplug B broker to which the status of the cell is published.
     pub sparkplug: Option<SparkplugSettings>,
-    /// A server that shows how the cell is.
+    /// OPC UA server that shows the status of the cell.
     pub opcua: Option<OpcUaSettings>,
     path: PathBuf,
     text: String,
@@ -76,15 +77,15 @@ impl PlantConfig {
     /// Reads a plant file.
     ///
     /// # Errors
-    /// A file that cannot be read, and everything that is wrong with its text.
+    /// Returns an error if the file cannot be read, and all errors of its text.
     pub fn read(path: &Path) -> Result<Self, Problems> {
         Self::parse(path, &read_text(path)?)
     }
 
-    /// Reads a plant file from its text; the path is for messages, and relative files are relative to its folder.
+    /// Parses a plant file from its text. `path` is used in messages; relative files are relative to its folder.
     ///
     /// # Errors
-    /// Everything that is wrong with the text.
+    /// Returns all errors of the text.
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
         document.hold_against(&SCHEMA);
@@ -116,23 +117,23 @@ impl PlantConfig {
         })
     }
 
-    /// Returns a problem with a key of this file that somebody else has found, at its place in the text.
+    /// Returns a problem with a key of this file that another module found, at the key's place in the text.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, key, [found, allowed, remedy])
     }
 
-    /// Returns the path that the plant file was read from.
+    /// Returns the path of the plant file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns the SHA-256 of the text.
+    /// Returns the SHA-256 of the text of the plant file.
     pub fn source_sha256(&self) -> &[u8; 32] {
         &self.source_sha256
     }
 }
 
-/// A file that is named relative to the folder of the plant file.
+/// Returns a file path resolved relative to the folder of the plant file.
 fn beside(at: &Path, file: Option<PathBuf>) -> Option<PathBuf> {
     file.map(|file| at.join(file))
 }

@@ -1,4 +1,4 @@
-//! A cell file as written. The comments here are what an editor shows beside a key; the ranges are what a file is held to.
+//! Cell file as written. Editors show the comments here as help for a key; a file is checked against the ranges.
 
 use schemars::JsonSchema;
 use serde::Deserialize;

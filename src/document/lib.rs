@@ -1,11 +1,11 @@
-//! A file that a person wrote, in TOML, and what is wrong with it: every problem at once, each at its line and column.
+//! TOML file written by a person, and its problems: all of them together, each with its line and column.
 //!
 //! ```text
 //!  text -> syntax -> shape (the JSON schema: keys, types, ranges) -> what is left, as written -> the reader's own checks
 //! ```
 //!
-//! The schema that editors complete from is the one that files are held against, so that neither can be wrong alone. What
-//! does not fit it is told and left out, so that the checks of one value against another still run on the rest.
+//! Editors complete from the same schema that checks the files, so the two always agree. A value that does not fit the
+//! schema is reported and removed. The checks between values then still run on the rest.
 
 mod read;
 mod schema;
@@ -20,41 +20,41 @@ pub use read::{problem_at, read_text, sha256};
 pub use schema::schema_of;
 pub use shown::{countable, misleading, visible};
 
-/// Everything that is wrong with one file.
+/// All problems of one file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Problems {
     /// The file.
     pub file: PathBuf,
-    /// Its text; empty if it could not be read.
+    /// Text of the file. Empty if it could not be read.
     pub text: String,
-    /// What is wrong, in the order of the text. Never empty.
+    /// Problems in the order of the text. Never empty.
     pub problems: Vec<Problem>,
 }
 
-/// One thing that is wrong.
+/// One problem of a file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Problem {
-    /// Where, in bytes of the text.
+    /// Position as a range of bytes in the text.
     pub span: Range<usize>,
-    /// The key as a path, such as `measure.probe_radius_mm`; empty for the file as a whole.
+    /// Key as a path, such as `measure.probe_radius_mm`. Empty for the file as a whole.
     pub key: String,
-    /// What was found.
+    /// Value that was found.
     pub found: String,
-    /// What is allowed there.
+    /// Allowed values.
     pub allowed: String,
-    /// What to do.
+    /// Action that solves the problem.
     pub remedy: String,
 }
 
 impl Problems {
-    /// A file with one problem that has no place in its text.
+    /// Returns one problem that concerns the whole file and has no position in its text.
     pub fn whole(file: &Path, text: &str, found: String, remedy: &str) -> Self {
         let problem =
             Problem { span: 0..0, key: String::new(), found, allowed: String::new(), remedy: remedy.to_owned() };
         Self { file: file.to_owned(), text: text.to_owned(), problems: vec![problem] }
     }
 
-    /// Returns line and column of a problem, both from 1, the column in characters.
+    /// Returns line and column of a problem. Both count from 1; the column counts characters.
     pub fn place(&self, problem: &Problem) -> (usize, usize) {
         line_and_column(&self.text, problem.span.start)
     }
@@ -89,7 +89,7 @@ impl fmt::Display for Problem {
     }
 }
 
-/// Returns line and column of a byte, both from 1, the column in characters.
+/// Returns line and column of a byte. Both count from 1; the column counts characters.
 fn line_and_column(text: &str, byte: usize) -> (usize, usize) {
     let before = text.get(..byte).unwrap_or(text);
     let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);

@@ -1,4 +1,4 @@
-//! Reads a file and holds it against its schema.
+//! Reads a file and checks it against its schema.
 
 use std::fs::File;
 use std::io::Read;
@@ -14,20 +14,20 @@ use super::schema::choices;
 use super::shown::{countable, misleading};
 use super::{Problem, Problems};
 
-/// Far more than a person writes.
+/// Maximum size of a file: far more than a person writes.
 const MOST_BYTES: usize = 256 << 10;
 
-/// More problems than a person reads at once.
+/// Maximum number of reported problems: more than a person reads at once.
 const MOST_PROBLEMS: usize = 200;
 
-/// One step from a table to what stands in it.
+/// One step from a table to a value in it.
 #[derive(Clone, Debug)]
 enum Step {
     Key(String),
     Index(usize),
 }
 
-/// A file on its way to what it says.
+/// File while it is read and checked.
 pub struct Document<'t> {
     file: &'t Path,
     text: &'t str,
@@ -39,7 +39,7 @@ pub struct Document<'t> {
 /// Reads a text file.
 ///
 /// # Errors
-/// A file that cannot be read, that is too large or that is not text.
+/// Returns an error if the file cannot be read, is too large or is not text.
 pub fn read_text(path: &Path) -> Result<String, Problems> {
     let failed = |found: String, remedy: &str| Problems::whole(path, "", found, remedy);
     let mut bytes = Vec::new();
@@ -54,7 +54,8 @@ pub fn read_text(path: &Path) -> Result<String, Problems> {
     })
 }
 
-/// Opens a file; a named pipe would be waited for, and a device has no end. A shell lays what a program is given to read under `/dev/fd`.
+/// Opens a file. Rejects a named pipe, which could block, and a device, which has no end. Paths below `/dev` and
+/// `/proc` are not rejected, because a shell places the input of a program under `/dev/fd`.
 fn open(path: &Path) -> std::io::Result<File> {
     let found = std::fs::metadata(path)?;
     if !found.is_file() && !found.is_dir() && !path.starts_with("/dev") && !path.starts_with("/proc") {
@@ -74,10 +75,10 @@ pub fn sha256(text: &str) -> [u8; 32] {
 }
 
 impl<'t> Document<'t> {
-    /// Reads the syntax of a text.
+    /// Parses the syntax of a text.
     ///
     /// # Errors
-    /// Every place where the text is no TOML.
+    /// Returns every place where the text is not valid TOML.
     pub fn parse(file: &'t Path, text: &'t str) -> Result<Self, Problems> {
         if text.len() > MOST_BYTES {
             return Err(too_large(file));
@@ -110,7 +111,7 @@ impl<'t> Document<'t> {
         self.push(start..end, String::new(), format!("no TOML: {}", error.message().trim()), "", remedy);
     }
 
-    /// Holds the values against a schema; what does not fit is told and left out.
+    /// Checks the values against a schema. A value that does not fit is reported and removed.
     pub fn hold_against(&mut self, schema: &Schema) {
         let mut values = toml::Value::Table(std::mem::take(&mut self.values));
         Shape { document: self, root: schema, path: Vec::new() }.fits(schema, &mut values);
@@ -119,10 +120,10 @@ impl<'t> Document<'t> {
         }
     }
 
-    /// Reads what is left of the values.
+    /// Deserializes the remaining values.
     ///
     /// # Errors
-    /// Values that fit the schema and still cannot be read; told with the rest.
+    /// Reports, with the other problems, values that fit the schema but cannot be deserialized. Then returns `None`.
     pub fn as_written<File: DeserializeOwned>(&mut self) -> Option<File> {
         match self.values.clone().try_into() {
             Ok(written) => Some(written),
@@ -134,14 +135,14 @@ impl<'t> Document<'t> {
         }
     }
 
-    /// Returns whether something is wrong with the value of a key, or within it.
+    /// Returns true if the value of a key, or a value within it, has a problem.
     pub fn has_problem(&self, key: &str) -> bool {
         let within =
             |found: &str| found.strip_prefix(key).is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']));
         self.problems.iter().any(|problem| within(&problem.key))
     }
 
-    /// Returns whether a key stands in the text.
+    /// Returns true if the text contains a key.
     pub fn is_there(&self, key: &str) -> bool {
         let steps = steps(key);
         let Some((Step::Key(last), before)) = steps.split_last() else { return false };
@@ -157,7 +158,7 @@ impl<'t> Document<'t> {
         table.is_some_and(|table| table.contains_key(last.as_str()))
     }
 
-    /// Tells what is wrong with the value of a key.
+    /// Reports a problem with the value of a key.
     pub fn report(&mut self, key: &str, found: impl Into<String>, allowed: &str, remedy: &str) {
         let span = span_of(&self.places, &steps(key));
         self.push(span, key.to_owned(), found.into(), allowed, remedy);
@@ -168,7 +169,7 @@ impl<'t> Document<'t> {
         self.problems.push(Problem { span, key, found, allowed: allowed.to_owned(), remedy: remedy.to_owned() });
     }
 
-    /// Returns everything that was wrong, if anything was.
+    /// Returns all problems as an error, if there are any.
     pub fn finish(self) -> Result<(), Problems> {
         if self.problems.is_empty() { Ok(()) } else { Err(self.into_problems()) }
     }
@@ -192,7 +193,7 @@ impl<'t> Document<'t> {
     }
 }
 
-/// Returns one problem with a value of a text that was read before.
+/// Returns one problem with a value of a text that was read earlier.
 pub fn problem_at(file: &Path, text: &str, key: &str, [found, allowed, remedy]: [&str; 3]) -> Problems {
     let (places, _) = DeTable::parse_recoverable(text);
     let span = span_of(places.get_ref(), &steps(key));
@@ -201,7 +202,7 @@ pub fn problem_at(file: &Path, text: &str, key: &str, [found, allowed, remedy]: 
     Problems { file: file.to_owned(), text: text.to_owned(), problems: vec![problem] }
 }
 
-/// Takes a key such as `cmm.signals[0].address` apart.
+/// Splits a key such as `cmm.signals[0].address` into steps.
 fn steps(key: &str) -> Vec<Step> {
     let mut steps = Vec::new();
     for part in key.split('.') {
@@ -212,7 +213,7 @@ fn steps(key: &str) -> Vec<Step> {
     steps
 }
 
-/// Puts a key together.
+/// Joins steps to a key.
 fn key_of(steps: &[Step]) -> String {
     let mut key = String::new();
     for step in steps {
@@ -229,7 +230,8 @@ fn key_of(steps: &[Step]) -> String {
     key
 }
 
-/// Returns where a value stands, for a table where its name stands; for one that is not there, the innermost that is.
+/// Returns the position of a value, or of the name of a table. If the value does not exist, returns the position of the
+/// innermost existing table.
 fn span_of(root: &DeTable, steps: &[Step]) -> Range<usize> {
     let mut found = 0..0;
     let mut inside: Option<&DeValue> = None;
@@ -255,7 +257,7 @@ fn span_of(root: &DeTable, steps: &[Step]) -> Range<usize> {
     found
 }
 
-/// Returns where the name of a key stands.
+/// Returns the position of the name of a key.
 fn span_of_name(root: &DeTable, steps: &[Step]) -> Range<usize> {
     let Some((Step::Key(last), before)) = steps.split_last() else { return span_of(root, steps) };
     let mut inside: Option<&DeValue> = None;
@@ -276,7 +278,7 @@ fn span_of_name(root: &DeTable, steps: &[Step]) -> Range<usize> {
         .map_or_else(|| span_of(root, steps), |(key, _)| key.span())
 }
 
-/// A walk through values and their schema at once.
+/// Walk through values and their schema together.
 struct Shape<'d, 't> {
     document: &'d mut Document<'t>,
     root: &'d Schema,
@@ -284,7 +286,7 @@ struct Shape<'d, 't> {
 }
 
 impl Shape<'_, '_> {
-    /// Tells what does not fit, and whether the value itself may stay.
+    /// Reports values that do not fit the schema. Returns true if the value itself can stay.
     fn fits(&mut self, schema: &Schema, value: &mut toml::Value) -> bool {
         if let Some(words) = choices(schema) {
             return self.is_one_of(&words, value);
@@ -310,7 +312,7 @@ impl Shape<'_, '_> {
         let empty = serde_json::Map::new();
         let properties = schema.get("properties").and_then(Schema::as_object).unwrap_or(&empty);
         for key in schema.get("required").and_then(Schema::as_array).into_iter().flatten().filter_map(Schema::as_str) {
-            // A key written wrongly is told as that, not once more as missing.
+            // A misspelled key is reported as misspelled, and not also as missing.
             let meant = |other: &str| nearest(other, properties.keys().map(String::as_str)) == Some(key);
             let misspelt = |other: &str| !properties.contains_key(other) && meant(other);
             if !table.contains_key(key) && !table.keys().take(MOST_PROBLEMS).any(|other| misspelt(other.as_ref())) {
@@ -555,7 +557,7 @@ fn nearest<'w>(found: &str, words: impl Iterator<Item = &'w str>) -> Option<&'w 
         .map(|(_, word)| word)
 }
 
-/// Returns the table in which a key would be known.
+/// Returns the table in which a key is known.
 fn home_of(schema: &Schema, key: &str, path: &mut Vec<String>) -> Option<String> {
     let variants = schema.get("oneOf").and_then(Schema::as_array).into_iter().flatten();
     for schema in std::iter::once(schema).chain(variants) {
@@ -579,7 +581,7 @@ fn in_words(words: &[&str]) -> String {
     words.iter().map(|word| format!("\"{word}\"")).collect::<Vec<_>>().join(", ")
 }
 
-/// Returns the unit that a key ends with.
+/// Returns the unit at the end of a key.
 fn unit_of(key: &str) -> Option<&'static str> {
     const UNITS: [(&str, &str); 8] = [
         ("_mm_min", "mm/min"),
@@ -594,7 +596,7 @@ fn unit_of(key: &str) -> Option<&'static str> {
     UNITS.iter().find(|(suffix, _)| key.ends_with(suffix)).map(|(_, unit)| *unit)
 }
 
-/// Returns a value as it may stand in a message.
+/// Returns a value in the form used in messages.
 fn shown(value: &toml::Value) -> String {
     match value {
         toml::Value::String(text) => {

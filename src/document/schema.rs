@@ -1,14 +1,15 @@
-//! The JSON schema of a kind of file, made from the structs that it is read into.
+//! JSON schema of a kind of file, generated from the structs that it is deserialized into.
 
 use schemars::generate::SchemaSettings;
 use schemars::transform::{RecursiveTransform, Transform};
 use schemars::{JsonSchema, Schema};
 use serde_json::Value;
 
-/// Makes the schema of a file.
+/// Returns the schema of a file.
 ///
-/// A key that may be left out is an `Option`, whose null TOML cannot write: it is taken away. A key that must stand can be left out too, so
-/// that what is wrong with it is told with the rest: its default is NaN, which JSON has not, or it says `x-required`.
+/// An optional key is an `Option`. TOML has no null, so null is removed from its types. A required key is optional for
+/// the deserializer too, so that its absence is reported with the other problems: its default is NaN, which JSON cannot
+/// represent, or it carries `x-required`.
 pub fn schema_of<File: JsonSchema>() -> Value {
     let settings = SchemaSettings::draft2020_12().with(|settings| settings.inline_subschemas = true);
     let mut schema = settings.into_generator().into_root_schema_for::<File>();
@@ -18,14 +19,14 @@ pub fn schema_of<File: JsonSchema>() -> Value {
 
 fn tidy(schema: &mut Schema) {
     without_null(schema);
-    // A table's keys have their own defaults.
+    // The keys of a table have their own defaults.
     if schema.get("default").is_some_and(|default| default.is_null() || default.is_object()) {
         schema.remove("default");
     }
     schema.remove("format");
     schema.remove("title");
     let Some(properties) = schema.get("properties").and_then(Value::as_object) else { return };
-    // A key that is an `Option` has more than one type here.
+    // The schema of an `Option` lists more than one type, so it is not matched here.
     let is_nan = |value: &Value| value["type"] == "number" && value.get("default").is_some_and(Value::is_null);
     let by_type = schema.get("required").and_then(Value::as_array).cloned().unwrap_or_default();
     let must = |(key, value): &(&String, &Value)| {
@@ -39,7 +40,7 @@ fn tidy(schema: &mut Schema) {
     }
     if let Some(properties) = schema.get_mut("properties").and_then(Value::as_object_mut) {
         properties.values_mut().filter_map(Value::as_object_mut).for_each(|property| {
-            // What must stand has no default.
+            // A required key has no default.
             if property.remove("x-required").is_some() {
                 property.remove("default");
             }
@@ -64,7 +65,7 @@ fn without_null(schema: &mut Schema) {
         let only = only.clone();
         schema.remove("anyOf");
         for (key, value) in only {
-            // What is said about the key goes before what is said about its type.
+            // The description of the key takes precedence over that of its type.
             if schema.get(&key).is_none() {
                 schema.insert(key, value);
             }
@@ -72,7 +73,7 @@ fn without_null(schema: &mut Schema) {
     }
 }
 
-/// Returns the words that a schema allows, if it is a choice among words.
+/// Returns the allowed words if a schema is a choice among words.
 pub fn choices(schema: &Value) -> Option<Vec<&str>> {
     if let Some(values) = schema.get("enum").and_then(Value::as_array) {
         return values.iter().map(Value::as_str).collect();

@@ -1,13 +1,13 @@
-//! What is shown of a person's text and numbers: text that reads as what it is, numbers of a length that a person reads.
+//! Display of text and numbers that a person wrote: invisible characters become visible, long numbers become short.
 
 use std::fmt::Write;
 
-/// Digits before the point, and zeros behind it, that a person still counts.
+/// Maximum number of digits before the decimal point, or of zeros after it, that a person still counts.
 const MOST_DIGITS: usize = 15;
 const MOST_ZEROS: usize = 9;
 
-/// Returns the first character of a text that is not seen, or that makes the rest read otherwise than it is stored: controls, marks of
-/// direction, and what has no width.
+/// Returns the first character that is invisible or that changes how the rest of the text is displayed: control
+/// characters, direction marks, and characters of zero width.
 pub fn misleading(text: &str) -> Option<char> {
     text.chars().find(|c| is_misleading(*c))
 }
@@ -18,7 +18,8 @@ fn is_misleading(c: char) -> bool {
         || matches!(c, '\u{2060}'..='\u{2069}' | '\u{feff}' | '\u{fff9}'..='\u{fffb}' | '\u{e0000}'..='\u{e007f}')
 }
 
-/// Returns a text with each such character by its number, as `<U+202E>`; line ends and tabs stay what they are.
+/// Returns a text in which each misleading character is replaced by its code, as `<U+202E>`. Line ends and tabs stay
+/// unchanged.
 pub fn visible(text: &str) -> String {
     text.chars().fold(String::with_capacity(text.len()), |mut shown, c| {
         if is_misleading(c) && !matches!(c, '\n' | '\t') {
@@ -30,7 +31,7 @@ pub fn visible(text: &str) -> String {
     })
 }
 
-/// Returns a text in which numbers with more digits than anybody counts are written with an exponent: `1e300`.
+/// Returns a text in which numbers with too many digits to count are written with an exponent: `1e300`.
 pub fn countable(text: &str) -> String {
     let is_of_number = |c: char| c.is_ascii_digit() || c == '.';
     let mut shown = String::with_capacity(text.len());
@@ -38,7 +39,7 @@ pub fn countable(text: &str) -> String {
     while let Some(begin) = rest.find(|c: char| c.is_ascii_digit()) {
         let length = rest[begin..].find(|c| !is_of_number(c)).unwrap_or(rest.len() - begin);
         let (before, number, after) = (&rest[..begin], &rest[begin..begin + length], &rest[begin + length..]);
-        // Digits within a word are no number: a hash, a name.
+        // Digits within a word, such as a hash or a name, are not a number.
         let alone = !before.ends_with(|c: char| c.is_alphanumeric() || c == '_')
             && !after.starts_with(|c: char| c.is_alphanumeric() || c == '_');
         shown.push_str(before);

@@ -1,4 +1,4 @@
-//! What one key of a recipe says against another, and what several make together.
+//! Checks between the keys of a recipe, and the values that several keys define together.
 
 use std::path::{Path, PathBuf};
 
@@ -18,10 +18,11 @@ use crate::measuring::Layout;
 use crate::registration::{Coordinate, ProbeSide};
 use crate::surface::{DefinedSurface, SurfaceDefinition};
 
-/// More points than a part is ever measured with.
+/// Maximum number of points: more than any part is measured with.
 const MOST_POINTS: f64 = 1e6;
 
-/// Checks a recipe as written; what is wrong is told to the document. Returns what several keys make together, `None` where they do not.
+/// Checks a recipe as written. Errors are reported to `document`. Returns the values that several keys define together,
+/// or `None` for those that are invalid.
 pub(super) fn check(
     written: &RecipeFile,
     path: &Path,
@@ -41,7 +42,7 @@ pub(super) fn check(
     (nominal, pattern(&written.measure, folder, document))
 }
 
-/// Joins a path of a recipe to the recipe's folder; an absolute one stays.
+/// Joins a path of a recipe to the recipe's folder. An absolute path stays unchanged.
 fn beside(folder: &Path, path: &str) -> PathBuf {
     folder.join(path)
 }
@@ -96,14 +97,14 @@ fn aperture(table: toml::Table, document: &mut Document) -> Option<Aperture> {
     None
 }
 
-/// Reads the tables of a formula as the definition of a surface, whose own checks know best.
+/// Parses the tables of a formula as a surface definition, which has its own checks.
 fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSource> {
     let tables = [("surface", &written.surface), ("aperture", &written.aperture), ("sampling", &written.sampling)];
     let missing = tables[..2].iter().filter(|(_, table)| table.is_none());
     let missing: Vec<&str> = missing.map(|(name, _)| *name).collect();
     for name in &missing {
         let key = format!("nominal.{name}");
-        // A table that is there and broken has been told of.
+        // An invalid table is already reported.
         if !document.has_problem(&key) {
             let remedy = format!("add the table [nominal.{name}], or `file = \"...\"` in [nominal]");
             document.report(&key, "is missing", "", &remedy);
@@ -120,7 +121,8 @@ fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSou
             Ok(defined) => return Some(NominalSource::Surface(Box::new(defined))),
             Err(error) => {
                 let inner = error.key().unwrap_or_else(|| "surface".into());
-                // A term of a list, such as `terms.[0, 1]`, stands nowhere by that name.
+                // A term of a list, such as `terms.[0, 1]`, is not a key of the file, so the problem is placed at the
+                // list.
                 let key = format!("nominal.{}", inner.split(".[").next().unwrap_or(&inner));
                 document.report(&key, in_place(&inner, &error.to_string()), "", "");
             }
@@ -129,7 +131,7 @@ fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSou
     None
 }
 
-/// Takes the key from the beginning of a sentence that has it there, to stand behind the whole key.
+/// Removes the key at the beginning of a sentence, so that the sentence can follow the full key.
 fn in_place(key: &str, sentence: &str) -> String {
     match sentence.strip_prefix(&format!("`{key}` ")) {
         Some(rest) => rest.to_owned(),
@@ -137,7 +139,7 @@ fn in_place(key: &str, sentence: &str) -> String {
     }
 }
 
-/// What two probabilities may differ by that are meant to be the same.
+/// Tolerance for the comparison of two probabilities that are meant to be equal.
 const ROUNDING: f64 = 1e-9;
 
 fn measuring(written: &RecipeFile, document: &mut Document) {
@@ -258,7 +260,7 @@ fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<
         (PatternWord::Free, _, _, Some(least_points)) => Some(Pattern::Free { least_points }),
         _ => None,
     };
-    // A key that is there and broken has been told of.
+    // An invalid key is already reported.
     if found.is_none()
         && document.is_there("measure")
         && !takes.iter().any(|key| document.has_problem(&format!("measure.{key}")))
@@ -347,7 +349,7 @@ fn compensation(written: &Compensation, document: &mut Document) {
     }
 }
 
-/// What has to stand for parameters of the machine to be told.
+/// Checks the keys that an estimate of machine parameters requires.
 fn parameters(written: &RecipeFile, document: &mut Document) {
     const KEY: &str = "compensation.parameters";
     let Some(parameters) = written.compensation.parameters else { return };
@@ -417,7 +419,8 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
     }
 }
 
-/// How near to the normal the pole of a ball may come that follows the surface: within 2 degrees it hardly moves.
+/// Minimum angle between the normal and the axis of a ball that follows the surface: within 2 degrees of the pole the
+/// ball hardly moves.
 const LEAST_LEAD_DEG: f64 = 2.01;
 
 fn grinding(written: &Grinding, document: &mut Document) {
@@ -462,7 +465,7 @@ fn grinding(written: &Grinding, document: &mut Document) {
     }
 }
 
-/// Compares the tables with each other.
+/// Checks the tables against each other.
 fn compare_tables(written: &RecipeFile, document: &mut Document) {
     if let (Some(most), Some(rms)) = (written.registration.max_rms_um, written.acceptance.rms_um)
         && most < rms
@@ -494,7 +497,7 @@ fn compare_tables(written: &RecipeFile, document: &mut Document) {
     }
 }
 
-/// Compares lengths with the size and the curvature of the part, where a formula or an outline tells them.
+/// Checks lengths against the size and the curvature of the part, if a formula or an outline defines them.
 fn compare_with_part(written: &RecipeFile, nominal: Option<&NominalSource>, document: &mut Document) {
     let (surface, aperture) = match nominal {
         Some(NominalSource::Surface(surface)) => (Some(surface.as_ref()), Some(surface.aperture())),
@@ -569,13 +572,13 @@ fn compare_cutoff(cutoff_mm: f64, apart_mm: f64, document: &mut Document) {
     }
 }
 
-/// Compares the wheel and the probe with the sharpest hollow of the surface on their side.
+/// Checks the wheel and the probe against the smallest concave radius of the surface on their side.
 fn compare_with_curvature(written: &RecipeFile, surface: &DefinedSurface, document: &mut Document) {
     let hollows = curvature::sharpest_hollows_mm(surface);
     let (radius_mm, place) = match written.measure.side {
         ProbeSide::Above => hollows[0],
         ProbeSide::Below => hollows[1],
-        // The side is not known before points are; the flatter one is the least that can be said.
+        // The side is unknown before points are measured. The flatter side gives the weakest requirement.
         ProbeSide::Auto => {
             if hollows[0].0 > hollows[1].0 {
                 hollows[0]

@@ -1,14 +1,15 @@
-//! The sharpest hollows of a formula: what a ball must fit into.
+//! Smallest concave radii of a formula, into which a ball must fit.
 
 use crate::surface::DefinedSurface;
 
-/// Places along each axis of the aperture's box that are looked at.
+/// Number of evaluated positions along each axis of the aperture's box.
 const PLACES: usize = 61;
 
-/// Returns the smallest radius of a hollow towards +z and towards -z, and where; infinity where there is none.
+/// Returns the smallest concave radius towards +z and towards -z, in mm, and its position. The radius is infinite if
+/// there is no concave region.
 ///
-/// Curvature is taken from differences of the exact gradient, at a net of places: good to a few percent, as a check of a recipe
-/// needs it. The registration checks the offset surface itself.
+/// Curvature is computed from finite differences of the exact gradient on a grid. It is accurate to a few percent,
+/// which is enough to check a recipe. The registration checks the offset surface itself.
 pub(super) fn sharpest_hollows_mm(surface: &DefinedSurface) -> [(f64, [f64; 2]); 2] {
     let [[x0, y0], [x1, y1]] = surface.aperture().bounds();
     let at = |least: f64, most: f64, k: usize| least + (most - least) * k as f64 / (PLACES - 1) as f64;
@@ -21,7 +22,7 @@ pub(super) fn sharpest_hollows_mm(surface: &DefinedSurface) -> [(f64, [f64; 2]);
                 continue;
             }
             let Some([least, most]) = principal_curvatures(surface, place, step_mm) else { continue };
-            // A positive curvature opens towards +z.
+            // A surface of positive curvature is concave towards +z.
             for (side, curvature) in [most, -least].into_iter().enumerate() {
                 if curvature > 0.0 && 1.0 / curvature < sharpest[side].0 {
                     sharpest[side] = (1.0 / curvature, place);
@@ -32,7 +33,7 @@ pub(super) fn sharpest_hollows_mm(surface: &DefinedSurface) -> [(f64, [f64; 2]);
     sharpest
 }
 
-/// Returns the lesser and the larger principal curvature in 1/mm.
+/// Returns the minimum and the maximum principal curvature, in 1/mm.
 fn principal_curvatures(surface: &DefinedSurface, [x, y]: [f64; 2], step_mm: f64) -> Option<[f64; 2]> {
     let gradient = |x: f64, y: f64| surface.formula().sag_and_gradient(x, y).map(|(_, gradient)| gradient);
     let [p, q] = gradient(x, y)?;
@@ -41,7 +42,7 @@ fn principal_curvatures(surface: &DefinedSurface, [x, y]: [f64; 2], step_mm: f64
     let (north, south) = (gradient(x, y + step_mm)?, gradient(x, y - step_mm)?);
     let (r, t) = (slope(east, west, 0), slope(north, south, 1));
     let s = 0.5 * (slope(east, west, 1) + slope(north, south, 0));
-    // Mean and Gaussian curvature of a height over the plane.
+    // Mean and Gaussian curvature of a height function over the plane.
     let w = 1.0 + p * p + q * q;
     let mean = ((1.0 + q * q) * r - 2.0 * p * q * s + (1.0 + p * p) * t) / (2.0 * w * w.sqrt());
     let gauss = (r * t - s * s) / (w * w);

@@ -1,14 +1,14 @@
-//! A recipe: what one part shall become and how a cell gets it there.
+//! Recipe of a part: its target surface, and how a cell measures, grinds and accepts it.
 //!
 //! ```text
 //!  text -> tables (each key declared once: src/recipe/tables.rs) -> Recipe (checked, no contradiction)
 //! ```
 //!
-//! Everything that is wrong with a file is told at once ([`crate::document::Problems`]), each thing at its line and column. A
-//! [`Recipe`] keeps the text it came from and its SHA-256, so that the record of a run holds exactly what was run.
+//! All errors of a file are reported together ([`crate::document::Problems`]), each with its line and column. A
+//! [`Recipe`] keeps its text and its SHA-256, so that the record of a run contains exactly the recipe that was run.
 //!
-//! Units are those of the file, last in the names: micrometres ([`Um`]) and degrees end where a recipe is turned into what is computed
-//! with. Feeds are mm/min, as on every grinder's panel.
+//! Units are those of the file and are the last part of each name. Micrometres ([`Um`]) and degrees are converted when
+//! a recipe is turned into numerical settings. Feeds are in mm/min, as on the panel of every grinder.
 
 mod check;
 mod curvature;
@@ -30,80 +30,80 @@ pub use tables::{
     RegistrationSettings, SpindleAxis, StartAt, Tilt, Um, Wheel,
 };
 
-/// A recipe, checked.
+/// Checked recipe.
 #[derive(Clone, Debug)]
 pub struct Recipe {
     /// The part.
     pub part: Part,
-    /// What its surface shall be.
+    /// Source of the nominal surface.
     pub nominal: NominalSource,
-    /// How it is measured.
+    /// Settings of the measurement.
     pub measure: Measure,
-    /// Which targets are touched.
+    /// Selection of the targets that are touched.
     pub measuring: Measuring,
-    /// Where points are taken.
+    /// Pattern of the measured points.
     pub pattern: Pattern,
-    /// How the measured points are registered.
+    /// Settings of the registration.
     pub registration: RegistrationSettings,
-    /// When it is good.
+    /// Acceptance limits.
     pub acceptance: Acceptance,
-    /// How what is left is turned into a correction.
+    /// Settings that turn the remaining error into a correction.
     pub compensation: Compensation,
-    /// How it is ground.
+    /// Settings of grinding.
     pub grinding: Grinding,
-    /// How often, and what to do when it does not get better.
+    /// Maximum number of cycles, and the action if the part does not improve.
     pub cycle: Cycle,
-    /// The truth of a simulated cell, as written; the simulator reads it, nobody else.
+    /// Truth of a simulated cell, as written. Only the simulator reads it.
     pub simulation: Option<toml::Table>,
     path: PathBuf,
     text: String,
     source_sha256: [u8; 32],
 }
 
-/// How a table of points is read where it does not say so itself, in the words of the recipe.
+/// Format of a table of points in the words of the recipe, for files that do not state it themselves.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct TableWords {
-    /// Which columns are x, y and z.
+    /// Columns of x, y and z.
     pub columns: Option<String>,
-    /// The unit; without it mm.
+    /// Unit. The default is mm.
     pub unit: Option<String>,
-    /// The unit of z, where it is another one.
+    /// Unit of z, if it differs.
     pub height_unit: Option<String>,
 }
 
-/// Where the nominal surface comes from.
+/// Source of the nominal surface.
 #[derive(Clone, Debug, PartialEq)]
 pub enum NominalSource {
-    /// A file of points, a mesh or a definition.
+    /// File of points, a mesh or a surface definition.
     File {
-        /// The file; relative paths of a recipe are relative to the recipe.
+        /// Path of the file. Relative paths of a recipe are relative to the recipe.
         path: PathBuf,
-        /// How a table of points is read.
+        /// Format of a table of points.
         table: TableWords,
-        /// What scattered points are projected onto.
+        /// Surface onto which scattered points are projected.
         projection: Projection,
-        /// The outline of the part, if it is smaller than the points.
+        /// Outline of the part, if it is smaller than the points.
         aperture: Option<Aperture>,
     },
-    /// A formula.
+    /// Formula.
     Surface(Box<DefinedSurface>),
 }
 
-/// Where points are taken.
+/// Pattern of the measured points.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Pattern {
-    /// Where Regrind lays them.
+    /// Points that Regrind lays out.
     Laid(Layout),
-    /// At the points of a file, in the model frame.
+    /// Points of a file, in the model frame.
     File {
-        /// The file; relative paths of a recipe are relative to the recipe.
+        /// Path of the file. Relative paths of a recipe are relative to the recipe.
         path: PathBuf,
-        /// How a table of points is read.
+        /// Format of a table of points.
         table: TableWords,
     },
-    /// Where the operator takes them; the machine gets no plan.
+    /// Points that the operator chooses. The machine receives no plan.
     Free {
-        /// How many there must be at least.
+        /// Minimum number of points.
         least_points: u32,
     },
 }
@@ -119,13 +119,13 @@ impl Recipe {
     /// Reads a recipe.
     ///
     /// # Errors
-    /// A file that cannot be read, and everything that is wrong with its text.
+    /// Returns an error if the file cannot be read, and all errors of its text.
     pub fn read(path: &Path) -> Result<Self, Problems> {
         let text = read_text(path)?;
         Self::parse(path, &text)
     }
 
-    /// Returns the files that it names beside itself.
+    /// Returns the other files that the recipe names.
     pub fn files(&self) -> Vec<&Path> {
         let nominal = match &self.nominal {
             NominalSource::File { path, .. } => Some(path.as_path()),
@@ -138,10 +138,10 @@ impl Recipe {
         nominal.into_iter().chain(pattern).collect()
     }
 
-    /// Reads a recipe from its text; the path is for messages, and relative paths are relative to its folder.
+    /// Parses a recipe from its text. `path` is used in messages; relative paths are relative to its folder.
     ///
     /// # Errors
-    /// Everything that is wrong with the text.
+    /// Returns all errors of the text.
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
         document.hold_against(&SCHEMA);
@@ -182,12 +182,12 @@ impl Recipe {
         })
     }
 
-    /// Returns a problem with a key of this recipe that somebody else has found, at its place in the text.
+    /// Returns a problem with a key of this recipe that another module found, at the key's place in the text.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, key, [found, allowed, remedy])
     }
 
-    /// Returns the options of a registration, given where the cell's fixture holds the part.
+    /// Returns the options of a registration, given the pose of the part in the cell's fixture.
     pub fn registration_options(&self, fixture_cmm_from_model: Pose) -> registration::Options {
         let settings = &self.registration;
         registration::Options {
@@ -205,15 +205,15 @@ impl Recipe {
         }
     }
 
-    /// Returns the probability with which a figure must be within its limit: no more may be accepted wrongly by who judges than in the whole
-    /// of a measurement whose touches are chosen.
+    /// Returns the probability with which a figure must be within its limit. Unless the recipe sets it, the risk of a
+    /// wrong acceptance is at most the accepted risk of a measurement with chosen touches.
     pub fn probability(&self) -> f64 {
         let risk = self.measuring.accepted_risk.filter(|_| self.measuring.mode == Mode::Adaptive);
         let usual = risk.filter(|risk| *risk < 1.0 - Tolerance::USUAL).map_or(Tolerance::USUAL, |risk| 1.0 - risk);
         self.acceptance.probability.unwrap_or(usual)
     }
 
-    /// Returns the path that the recipe was read from.
+    /// Returns the path of the recipe.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -223,7 +223,7 @@ impl Recipe {
         &self.text
     }
 
-    /// Returns the SHA-256 of the text.
+    /// Returns the SHA-256 of the text of the recipe.
     pub fn source_sha256(&self) -> &[u8; 32] {
         &self.source_sha256
     }

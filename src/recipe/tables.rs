@@ -1,8 +1,8 @@
-//! The tables of a recipe. A key is declared here, once: its comment is what an editor shows beside it, its range is what a file is held
-//! to, its default holds where it is left out.
+//! Tables of a recipe. Each key is declared here once: editors show its comment as help, a file is checked against its
+//! range, and its default applies if the key is missing.
 //!
-//! A number that is NaN by default must stand in the file; every comparison with it is false, so that one that is missing, which has been
-//! told, leads to no more words. A recipe that was read has none.
+//! A required number has the default NaN. Every comparison with NaN is false, so a missing number, which is already
+//! reported, causes no further messages. A recipe that was read successfully contains no NaN.
 
 use schemars::{JsonSchema, Schema, json_schema};
 use serde::{Deserialize, Serialize};
@@ -358,7 +358,7 @@ pub struct MachineParameters {
 }
 
 impl MachineParameters {
-    /// The tolerances in millimetres and radians, in the order of [`crate::compensation::ParameterKind::ALL`].
+    /// Returns the tolerances in millimetres and radians, in the order of [`crate::compensation::ParameterKind::ALL`].
     pub fn tolerances(&self) -> [Option<f64>; crate::compensation::ParameterKind::COUNT] {
         let [radius, x, y, z] =
             [self.wheel_radius_um, self.wheel_x_um, self.wheel_y_um, self.wheel_z_um].map(|um| um.map(Um::mm));
@@ -497,7 +497,7 @@ pub enum Wheel {
 }
 
 impl Wheel {
-    /// Returns the radius with which the wheel is known to the grinder.
+    /// Returns the wheel radius that the grinder uses.
     pub fn radius_mm(&self) -> f64 {
         match *self {
             Self::Sphere { radius_mm } | Self::Torus { radius_mm, .. } | Self::Cup { radius_mm, .. } => radius_mm,
@@ -505,7 +505,7 @@ impl Wheel {
     }
 }
 
-/// A number that must stand.
+/// Default of a required number.
 fn missing() -> f64 {
     f64::NAN
 }
@@ -575,7 +575,7 @@ impl Default for RegistrationSettings {
 }
 
 impl Compensation {
-    /// Returns by what the share of the deviation that one cycle takes back is chosen.
+    /// Returns the rule that selects the gain: the share of the deviation that one cycle takes back.
     pub fn gain(&self) -> GainRule {
         self.gain.map_or(self.gain_by.unwrap_or_default(), GainRule::Fixed)
     }

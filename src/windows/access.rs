@@ -1,4 +1,4 @@
-//! Who may read what.
+//! Read access to files and pipes on Windows.
 
 use std::ffi::OsStr;
 use std::fs::File;
@@ -20,24 +20,24 @@ use windows_sys::Win32::Storage::FileSystem::FILE_READ_DATA;
 use super::person::{own_sid, text_of};
 use super::{no_error, succeeded, wide};
 
-/// The kind of an entry that allows something.
+/// Type of an access control entry that allows access.
 const ALLOWS: u8 = 0;
-/// Who may read everything on a computer whatever is said: the system itself, and who administers it; and the owner.
+/// Identifiers that can read every file of a computer in any case: the system, the administrators, and the owner.
 const MAY_ANYWAY: [&str; 3] = ["S-1-5-18", "S-1-5-32-544", "S-1-3-4"];
 
-/// What may be done to something, and by whom; Windows has allocated it for us.
+/// Security descriptor: what can be done to an object, and by whom. Windows allocated it for this process.
 struct Descriptor(PSECURITY_DESCRIPTOR);
 
 impl Drop for Descriptor {
     fn drop(&mut self) {
-        // SAFETY: it was allocated for us by the call that returned it, and is freed here alone.
+        // SAFETY: the call that returned it allocated it for us. It is freed only here.
         unsafe { LocalFree(self.0) };
     }
 }
 
-/// Says that something new is for the user of this process alone, whatever holds for the folder that it is in.
+/// Security attributes that give a new object to the user of this process only, whatever its folder allows.
 pub(crate) struct OwnersAlone {
-    /// Held, for the attributes point to it.
+    /// Kept alive, because the attributes point to it.
     _descriptor: Descriptor,
     attributes: SECURITY_ATTRIBUTES,
 }
@@ -45,7 +45,8 @@ pub(crate) struct OwnersAlone {
 impl OwnersAlone {
     pub(crate) fn new() -> io::Result<Self> {
         let sid = own_sid()?;
-        // The owner is said, for who administers a computer may make things in the name of all who do. What is made in a folder inherits it.
+        // The owner is named explicitly, because an object of an administrator can belong to the group of all
+        // administrators. New objects in a folder inherit the descriptor.
         let descriptor = parse(&format!("O:{sid}D:P(A;OICI;GA;;;{sid})"))?;
         let attributes = SECURITY_ATTRIBUTES {
             nLength: size_of::<SECURITY_ATTRIBUTES>() as u32,
@@ -55,17 +56,17 @@ impl OwnersAlone {
         Ok(Self { _descriptor: descriptor, attributes })
     }
 
-    /// Where the attributes lie, for as long as this lives. Windows only reads them.
+    /// Returns a pointer to the attributes, valid as long as `self` lives. Windows only reads them.
     pub(crate) fn attributes(&self) -> *const SECURITY_ATTRIBUTES {
         &raw const self.attributes
     }
 }
 
-/// Reads a descriptor from the text that Windows has for it (SDDL).
+/// Parses a descriptor from Windows' text form (SDDL).
 fn parse(text: &str) -> io::Result<Descriptor> {
     let text = wide(OsStr::new(text))?;
     let mut descriptor = ptr::null_mut();
-    // SAFETY: `text` ends with a zero, `descriptor` lives longer than the call, and the length may be left unasked.
+    // SAFETY: `text` ends with a zero, `descriptor` lives longer than the call, and the length is optional.
     succeeded(unsafe {
         ConvertStringSecurityDescriptorToSecurityDescriptorW(
             text.as_ptr(),
@@ -77,14 +78,15 @@ fn parse(text: &str) -> io::Result<Descriptor> {
     Ok(Descriptor(descriptor))
 }
 
-/// Returns who may read a file besides its owner, the system and who administers it, by their security identifiers.
+/// Returns the security identifiers of those who can read a file, except the owner, the system and the administrators.
 ///
 /// # Errors
-/// Windows does not tell it.
+/// Returns an error if Windows does not report the access list.
 pub fn others_who_read(file: &File) -> io::Result<Vec<String>> {
     let (mut list, mut descriptor) = (ptr::null_mut(), ptr::null_mut());
     let (what, unasked) = (DACL_SECURITY_INFORMATION, ptr::null_mut());
-    // SAFETY: the file is open, what is written to lives longer than the call, and the rest may be left unasked.
+    // SAFETY: the file is open, the targets of the pointers live longer than the call, and the other outputs are
+    // optional.
     no_error(unsafe {
         GetSecurityInfo(
             file.as_raw_handle(),
@@ -99,7 +101,7 @@ pub fn others_who_read(file: &File) -> io::Result<Vec<String>> {
     })?;
     let descriptor = Descriptor(descriptor);
     if list.is_null() {
-        // No list at all: everybody may do everything.
+        // Without a list everybody has full access.
         return Ok(vec!["S-1-1-0".into()]);
     }
     let own = own_sid()?;
@@ -108,24 +110,24 @@ pub fn others_who_read(file: &File) -> io::Result<Vec<String>> {
     Ok(others)
 }
 
-/// Who is allowed to read by a list, which must be one that Windows wrote and nobody has freed yet.
+/// Returns the identifiers that a list allows to read. `list` must be a valid list from Windows that is not yet freed.
 fn readers(list: *const ACL) -> io::Result<Vec<String>> {
-    // SAFETY: every list begins with this head.
+    // SAFETY: every list begins with this header.
     let count = unsafe { list.read() }.AceCount;
     let mut found = Vec::new();
     for index in 0..u32::from(count) {
         let mut entry = ptr::null_mut();
-        // SAFETY: the list is whole, and `entry` lives longer than the call.
+        // SAFETY: the list is complete, and `entry` lives longer than the call.
         succeeded(unsafe { GetAce(list, index, &mut entry) })?;
-        // SAFETY: every entry begins with this head; it need not be aligned.
+        // SAFETY: every entry begins with this header. It need not be aligned.
         let head = unsafe { entry.cast::<ACE_HEADER>().read_unaligned() };
         if head.AceType != ALLOWS || u32::from(head.AceFlags) & INHERIT_ONLY_ACE != 0 {
             continue;
         }
         let entry = entry.cast::<ACCESS_ALLOWED_ACE>();
-        // SAFETY: an entry of this kind is laid out so.
+        // SAFETY: an entry of this type has this layout.
         let mask = unsafe { (&raw const (*entry).Mask).read_unaligned() };
-        // SAFETY: only where it lies is computed; the identifier begins there and ends within the entry.
+        // SAFETY: only the address is computed. The identifier begins there and ends within the entry.
         let sid: PSID = unsafe { (&raw mut (*entry).SidStart).cast() };
         if mask & (FILE_READ_DATA | GENERIC_READ | GENERIC_ALL) != 0 {
             found.push(text_of(sid)?);
@@ -134,11 +136,12 @@ fn readers(list: *const ACL) -> io::Result<Vec<String>> {
     Ok(found)
 }
 
-/// Whether something that is open here, such as a pipe, belongs to the user whose process this is.
+/// Returns true if an open object, such as a pipe, belongs to the user of this process.
 pub(crate) fn is_owned_here(open: BorrowedHandle<'_>) -> io::Result<bool> {
     let (mut owner, mut descriptor) = (ptr::null_mut(), ptr::null_mut());
     let unasked = ptr::null_mut();
-    // SAFETY: the handle is open, what is written to lives longer than the call, and the rest may be left unasked.
+    // SAFETY: the handle is open, the targets of the pointers live longer than the call, and the other outputs are
+    // optional.
     no_error(unsafe {
         GetSecurityInfo(
             open.as_raw_handle(),

@@ -1,4 +1,4 @@
-//! Files and folders for their owner alone, and the room that is left on a disk.
+//! Files and folders that only their owner can access, and the free space of a disk.
 
 use std::fs::File;
 use std::io;
@@ -15,15 +15,16 @@ use windows_sys::Win32::Storage::FileSystem::{
 use super::access::OwnersAlone;
 use super::{succeeded, wide};
 
-/// Makes a file that nobody but its owner may read, for writing. It never was anything else: there is no moment for others in between.
+/// Creates a file that only its owner can read, and opens it for writing. The file has these rights from its creation,
+/// so no other user can open it in between.
 ///
 /// # Errors
-/// A file of that name, and a folder that cannot be written.
+/// Returns an error if the file exists or if the folder is not writable.
 pub fn create_owners_file(path: &Path) -> io::Result<File> {
     let (name, owners_alone) = (wide(path.as_os_str())?, OwnersAlone::new()?);
-    // Whoever shares it may also give it another name while it is open, as a file of std is shared.
+    // Others can read and rename the file while it is open, as with a file of std.
     let share = FILE_SHARE_READ | FILE_SHARE_DELETE;
-    // SAFETY: the name ends with a zero, and like the attributes lives longer than the call; there is no file to take after.
+    // SAFETY: the name ends with a zero. Name and attributes live longer than the call. There is no template file.
     let handle = unsafe {
         CreateFileW(
             name.as_ptr(),
@@ -38,28 +39,28 @@ pub fn create_owners_file(path: &Path) -> io::Result<File> {
     if handle == INVALID_HANDLE_VALUE {
         return Err(io::Error::last_os_error());
     }
-    // SAFETY: the call has opened this handle for us, and nobody else closes it.
+    // SAFETY: the call opened this handle for us, and nobody else closes it.
     Ok(unsafe { File::from_raw_handle(handle) })
 }
 
-/// Makes a folder that nobody but its owner may look into, nor into what will be made in it.
+/// Creates a folder that only its owner can read. The same holds for everything that will be created in it.
 ///
 /// # Errors
-/// Something of that name, and a folder above it that cannot be written.
+/// Returns an error if the name exists or if the parent folder is not writable.
 pub fn create_owners_folder(path: &Path) -> io::Result<()> {
     let (name, owners_alone) = (wide(path.as_os_str())?, OwnersAlone::new()?);
-    // SAFETY: the name ends with a zero, and like the attributes lives longer than the call.
+    // SAFETY: the name ends with a zero. Name and attributes live longer than the call.
     succeeded(unsafe { CreateDirectoryW(name.as_ptr(), owners_alone.attributes()) })
 }
 
-/// Returns how many bytes are left for the user of this process on the disk of a folder.
+/// Returns the number of free bytes for the user of this process on the disk of a folder.
 ///
 /// # Errors
-/// A folder that is not there, and a disk that does not tell.
+/// Returns an error if the folder does not exist or if the disk does not report its free space.
 pub fn free_bytes(folder: &Path) -> io::Result<u64> {
     let folder = wide(folder.as_os_str())?;
     let mut left = 0;
-    // SAFETY: `folder` ends with a zero, `left` lives longer than the call, and the rest may be left unasked.
+    // SAFETY: `folder` ends with a zero, `left` lives longer than the call, and the other outputs are optional.
     succeeded(unsafe { GetDiskFreeSpaceExW(folder.as_ptr(), &mut left, ptr::null_mut(), ptr::null_mut()) })?;
     Ok(left)
 }

@@ -1,4 +1,4 @@
-//! What is asked of Windows and no safe crate asks for it. Elsewhere there is nothing in here.
+//! Calls into Windows for which no safe crate exists. On other systems this crate is empty.
 //!
 //! ```text
 //!  person   who this process belongs to
@@ -7,7 +7,8 @@
 //!  pipe     a named pipe that nobody but its owner opens, from this computer only
 //! ```
 //!
-//! Every call into Windows stands in a block of its own that says why it is sound; what is public can be called by anybody.
+//! Each call into Windows is in its own unsafe block, with the reason why it is sound. Public functions are safe to
+//! call.
 #![cfg(windows)]
 
 mod access;
@@ -24,7 +25,7 @@ use std::ffi::OsStr;
 use std::io;
 use std::os::windows::ffi::OsStrExt;
 
-/// A text as Windows takes it: in UTF-16, with a zero behind it and none within.
+/// Returns a text in the form that Windows expects: UTF-16 with a zero at the end and none inside.
 fn wide(text: &OsStr) -> io::Result<Vec<u16>> {
     let mut units: Vec<u16> = text.encode_wide().collect();
     if units.contains(&0) {
@@ -34,12 +35,12 @@ fn wide(text: &OsStr) -> io::Result<Vec<u16>> {
     Ok(units)
 }
 
-/// What a call says that returns 0 where it failed.
+/// Converts the result of a call that returns 0 on failure.
 fn succeeded(answer: i32) -> io::Result<()> {
     if answer == 0 { Err(io::Error::last_os_error()) } else { Ok(()) }
 }
 
-/// What a call says that returns the number of its error, or 0.
+/// Converts the result of a call that returns an error number, or 0 on success.
 fn no_error(number: u32) -> io::Result<()> {
     if number == 0 { Ok(()) } else { Err(io::Error::from_raw_os_error(number.cast_signed())) }
 }

@@ -1,4 +1,4 @@
-//! Who this process belongs to.
+//! User of this process.
 
 use std::io;
 use std::os::windows::io::{AsRawHandle, FromRawHandle, OwnedHandle};
@@ -12,13 +12,13 @@ use windows_sys::Win32::System::WindowsProgramming::GetUserNameW;
 
 use super::succeeded;
 
-/// Longest name of a user, with the zero behind it (UNLEN).
+/// Maximum length of a user name, including the zero at its end (UNLEN).
 const LONGEST_NAME: usize = 257;
 
-/// Returns the name of the user whose process this is, as Windows knows it.
+/// Returns the name of the user of this process, as Windows knows it.
 ///
 /// # Errors
-/// Windows does not tell it.
+/// Returns an error if Windows does not report the name.
 pub fn own_name() -> io::Result<String> {
     let mut name = [0; LONGEST_NAME];
     let mut length = LONGEST_NAME as u32;
@@ -28,45 +28,45 @@ pub fn own_name() -> io::Result<String> {
     Ok(String::from_utf16_lossy(name))
 }
 
-/// The security identifier of the user whose process this is: `S-1-5-21-...`.
+/// Returns the security identifier of the user of this process: `S-1-5-21-...`.
 pub(crate) fn own_sid() -> io::Result<String> {
     let token = own_token()?;
     let mut length = 0;
-    // SAFETY: with no room to write to the call only tells how much it needs, and fails, which is no news.
+    // SAFETY: without a buffer the call only reports the required length and fails. This failure is expected.
     unsafe { GetTokenInformation(token.as_raw_handle(), TokenUser, ptr::null_mut(), 0, &mut length) };
-    // Words of eight bytes: what is written begins with a pointer.
+    // Words of eight bytes for the alignment: the data begins with a pointer.
     let mut room = vec![0_u64; (length as usize).div_ceil(8).max(1)];
-    // SAFETY: `room` has at least `length` bytes, and is aligned for the `TOKEN_USER` that they begin with.
+    // SAFETY: `room` has at least `length` bytes and the alignment of the `TOKEN_USER` at its beginning.
     succeeded(unsafe {
         GetTokenInformation(token.as_raw_handle(), TokenUser, room.as_mut_ptr().cast(), length, &mut length)
     })?;
     if (length as usize) < size_of::<TOKEN_USER>() {
         return Err(io::ErrorKind::UnexpectedEof.into());
     }
-    // SAFETY: the call has filled in a whole `TOKEN_USER`, whose identifier lies in `room` behind it.
+    // SAFETY: the call filled in a complete `TOKEN_USER`. Its identifier follows it in `room`.
     let user = unsafe { room.as_ptr().cast::<TOKEN_USER>().read() };
     text_of(user.User.Sid)
 }
 
 fn own_token() -> io::Result<OwnedHandle> {
     let mut token: HANDLE = ptr::null_mut();
-    // SAFETY: the handle of the own process is always good, and `token` lives longer than the call.
+    // SAFETY: the handle of the own process is always valid, and `token` lives longer than the call.
     succeeded(unsafe { OpenProcessToken(GetCurrentProcess(), TOKEN_QUERY, &mut token) })?;
-    // SAFETY: the call has opened this handle for us, and nobody else closes it.
+    // SAFETY: the call opened this handle for us, and nobody else closes it.
     Ok(unsafe { OwnedHandle::from_raw_handle(token) })
 }
 
-/// A security identifier as text. It must be a whole one, as all are that Windows hands out.
+/// Returns a security identifier as text. The identifier must be complete, as all those from Windows are.
 pub(crate) fn text_of(sid: PSID) -> io::Result<String> {
     let mut text = ptr::null_mut();
-    // SAFETY: `sid` is one that Windows wrote; where it is none, the call says so.
+    // SAFETY: Windows wrote `sid`. The call reports an invalid one as an error.
     succeeded(unsafe { ConvertSidToStringSidW(sid, &mut text) })?;
     let mut units = Vec::new();
-    // SAFETY: the text ends with a zero, and is read no further than that.
+    // SAFETY: the text ends with a zero and is read only up to it.
     while let unit @ 1.. = unsafe { text.add(units.len()).read() } {
         units.push(unit);
     }
-    // SAFETY: the call has allocated the text for us, and nothing points into it any more.
+    // SAFETY: the call allocated the text for us, and nothing points to it any more.
     unsafe { LocalFree(text.cast()) };
     Ok(String::from_utf16_lossy(&units))
 }

@@ -1,4 +1,4 @@
-//! A named pipe that nobody but its owner opens, from this computer only.
+//! Named pipe that only its owner can open, and only from this computer.
 
 use std::io;
 use std::os::windows::io::{AsRawHandle, BorrowedHandle};
@@ -9,18 +9,18 @@ use windows_sys::Win32::System::Pipes::GetNamedPipeClientProcessId;
 use super::access::{OwnersAlone, is_owned_here};
 use super::succeeded;
 
-/// Makes an end of a pipe for one client to come. The first one fails where somebody has a pipe of that name already.
+/// Creates an end of a pipe for one client. With `is_first`, fails if a pipe of that name exists already.
 ///
 /// # Errors
-/// A name that is taken or no name of a pipe.
+/// Returns an error if the name exists already or is not a valid pipe name.
 ///
 /// # Panics
-/// Outside a runtime of tokio that does input and output, as all its sockets do.
+/// Panics outside a tokio runtime with I/O enabled, like all sockets of tokio.
 pub fn listen(name: &str, is_first: bool) -> io::Result<NamedPipeServer> {
     let owners_alone = OwnersAlone::new()?;
     let mut options = ServerOptions::new();
     options.first_pipe_instance(is_first).reject_remote_clients(true);
-    // SAFETY: the attributes are whole, and what they point to lives longer than the call.
+    // SAFETY: the attributes are complete, and their targets live longer than the call.
     unsafe { options.create_with_security_attributes_raw(name, owners_alone.attributes().cast_mut().cast()) }
 }
 

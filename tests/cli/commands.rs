@@ -1,4 +1,4 @@
-//! The program from its arguments to its exit code, on good input and on every bad one.
+//! Tests of the program from its arguments to its exit code, on good input and on every kind of bad input.
 
 use std::fs;
 use std::io::Write;
@@ -19,7 +19,7 @@ const ROWS: usize = 101;
 /// Columns and rows of the measured pattern.
 const SCAN: [usize; 2] = [50, 30];
 
-/// How far the form error of the part may carry the best fit from where the part was put.
+/// Largest distance by which the form error of the part can shift the best fit from the true pose.
 const FORM_SHIFT_MM: f64 = 0.02;
 
 fn placement() -> Placement {
@@ -98,7 +98,7 @@ impl Bench {
         serde_json::from_slice(&fs::read(self.path("out/here/registration.json")).unwrap()).unwrap()
     }
 
-    /// Asserts that a registration is refused, in one message with these words, and leaves nothing behind.
+    /// Asserts that a registration is refused, in one message with these words, and leaves no files.
     fn refused(&self, nominal: &str, measured: &str, more: &[&str], words: &[&str]) {
         self.assert_refused(&self.register(nominal, measured, more), words);
     }
@@ -186,7 +186,7 @@ fn the_trace_tells_the_objective_of_every_step() {
     let objective = numbers(&document["objective_mm2"]);
     assert_eq!(objective, taken.iter().map(|i| number(&i["objective_mm2"])).collect::<Vec<_>>());
     for (k, pair) in objective.windows(2).enumerate() {
-        // Points that are dropped or taken back change the sum by themselves.
+        // Dropped or restored points change the sum by themselves.
         assert!(pair[1] <= pair[0] || taken[k]["points"] != taken[k + 1]["points"], "{objective:?}");
     }
 }
@@ -527,7 +527,7 @@ fn a_place_that_cannot_be_written_is_refused_before_anything_is_read() {
     let bench = Bench::new();
     bench.write("file", "in the way");
     for out in ["file", "file/below"] {
-        // The input does not exist: had it been read, the message would name it.
+        // The input does not exist: if the program read it, the message would name it.
         let arguments =
             ["register", "--nominal", "no.csv", "--measured", "no.csv", "--probe-radius", "1.5", "--out", out];
         bench.assert_refused(&bench.run(&arguments), &[out, "cannot be written", "permissions"]);
@@ -672,7 +672,8 @@ fn shells_and_man_know_every_command() {
     }
 }
 
-/// Most machines give out the nominal points and the measured ones of a part side by side.
+/// Checks a file with nominal and measured points side by side, as most machines write it: a person says which columns
+/// are measured.
 #[test]
 fn columns_of_nominal_points_are_not_read_as_measured_and_a_person_says_which_are() {
     let bench = Bench::new();
@@ -699,7 +700,7 @@ fn columns_of_nominal_points_are_not_read_as_measured_and_a_person_says_which_ar
         fs::remove_dir_all(bench.path("out")).unwrap();
     }
     bench.refused("nominal.csv", "both.csv", &["--columns", "x=X_ist,y=Y_act,z=Z_act"], &["x_ist"]);
-    // A table in inches that does not say so.
+    // A table in inches without a unit in it.
     bench.write("inches.csv", rows(&scaled(measured(), 1.0 / 25.4), ","));
     bench.write("nominal_inches.csv", format!("X_nom,Y_nom,Z_nom\n{}", rows(&scaled(nominal(), 1.0 / 25.4), ",")));
     let found = bench.registered("nominal_inches.csv", "inches.csv", &["--unit", "inch", "--nominal-unit", "inch"]);

@@ -1,6 +1,6 @@
-//! The commands as a person types them, and the files that a person writes.
+//! Tests of the commands as a person types them, and of the files that a person writes.
 
-// The shell of the book is that of Unix.
+// The book uses a Unix shell.
 #[cfg(unix)]
 mod book;
 mod commands;

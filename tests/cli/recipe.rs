@@ -1,4 +1,5 @@
-//! Recipes and cell files: what ships is good, what is wrong is told at its place, and nothing makes the reader panic.
+//! Tests of recipes and cell files: the shipped files are valid, each error is reported at its position, and no input
+//! makes the reader panic.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -103,7 +104,8 @@ fn the_default_recipe_is_what_it_says() {
     assert_ne!(recipe.source_sha256(), again.source_sha256());
 }
 
-/// Nobody who consents to a small risk for chosen touches is judged by more than that; what is written of the probability is what counts.
+/// Checks that the decision never uses a lower probability than the accepted risk for chosen touches allows. The
+/// probability as written in the file counts.
 #[test]
 fn the_probability_of_a_decision_is_no_less_than_the_accepted_risk_leaves() {
     let with = |measuring: &str| recipe(&changed(RECIPE, "[registration]", &format!("{measuring}\n\n[registration]")));
@@ -135,7 +137,7 @@ fn the_filter_and_the_gate_of_coverage_are_chosen_by_the_recipe() {
     assert_eq!(told(&recipe(&text).unwrap()), (Order::Quadric, Roughness::CrossValidation, 0.8));
 }
 
-/// The simulator is told the same surface in its own words.
+/// Checks that the simulator has the same surface in its own representation.
 #[test]
 fn the_simulated_part_of_every_polynomial_is_the_nominal_one() {
     for name in ["freeform-mirror", "shallow-wave"] {
@@ -176,7 +178,8 @@ fn the_points_of_the_biconic_are_its_formula() {
     assert_eq!(shape["conic"].as_array().unwrap(), &[(-0.5).into(), 0.3.into()]);
 }
 
-/// The places of a measuring plan as another program wrote them: in inches, heights in micrometres, beside what was measured before.
+/// Checks places of a measuring plan as another program wrote them: in inches, heights in micrometres, in a table that
+/// also has measured values.
 #[test]
 fn places_to_measure_are_read_by_the_columns_and_units_that_the_recipe_gives() {
     let home = tempfile::tempdir().unwrap();
@@ -203,7 +206,7 @@ fn places_to_measure_are_read_by_the_columns_and_units_that_the_recipe_gives() {
         assert!(matches!(given(missing), Err(SetupError::File(_))), "{missing}");
     }
     assert!(matches!(given("file_columns = \"x,y,z\"\n"), Err(SetupError::Table { key: "measure.file_columns", .. })));
-    // A plan has nominal places, and says so.
+    // A plan has nominal places, and its header says so.
     fs::write(home.path().join("plan.csv"), "X_nom,Y_nom,Z_nom\n1,2,0\n3,4,0\n-8,2,0\n").unwrap();
     assert_eq!(given("").unwrap(), 3);
 }
@@ -259,7 +262,7 @@ fn registers_and_signals_are_read() {
     assert_eq!(cell.grinder.link.wire, Wire::ModbusTcp(TcpWire { host: "127.0.0.1".into(), port: 15022, unit: 2 }));
 }
 
-/// A file, a key, the value that it is given, and a word of the remedy or limit: the one problem stands at the value.
+/// File, key, bad value, and a word of the remedy or limit. The only problem is reported at the value.
 type BadValue = (&'static str, &'static str, &'static str, &'static str);
 
 const BAD_RECIPE_VALUES: &[BadValue] = &[
@@ -322,7 +325,8 @@ const BAD_CELL_VALUES: &[BadValue] = &[
     (FILES, "cmm.fixture.rotation_deg", "[0.0, 0.0]", "there must be 3"),
 ];
 
-/// File, what is changed into what, and the one problem: its key, what stands where it is, and a word of its remedy or limit.
+/// File, text to replace, its replacement, and the only problem: its key, the text at its position, and a word of its
+/// remedy or limit.
 type BadText = (&'static str, &'static str, &'static str, &'static str, &'static str, &'static str);
 
 const BAD_RECIPES: &[BadText] = &[
@@ -565,7 +569,8 @@ const BAD_CELLS: &[BadText] = &[
     ),
 ];
 
-/// Gives a key of a file another value, adding the key where it does not stand, and returns where the value begins.
+/// Sets a key of a file to another value, and adds the key if it is missing. Returns the position at which the value
+/// begins.
 fn with_value(file: &str, key: &str, value: &str) -> (String, usize) {
     let (table, name) = key.rsplit_once('.').expect("a key within a table");
     let header = format!("\n[{table}]");
@@ -586,7 +591,8 @@ fn with_value(file: &str, key: &str, value: &str) -> (String, usize) {
     }
 }
 
-/// Reads what was made wrong and returns what is not told as it should be: the one problem, at its place, with a word of its remedy.
+/// Reads a damaged text. Returns the description of a wrong report; none if the only problem is at its position with a
+/// word of its remedy.
 fn not_told<T>(text: &str, at: usize, key: &str, word: &str, read: fn(&str) -> Result<T, Problems>) -> Option<String> {
     let Err(problems) = read(text) else { return Some("it was taken".to_owned()) };
     let Some(problem) = problems.problems.iter().find(|problem| problem.key == key) else {
@@ -606,7 +612,7 @@ fn assert_told<T>(values: &[BadValue], texts: &[BadText], read: fn(&str) -> Resu
     });
     let by_text = texts.iter().filter_map(|(file, from, to, key, needle, word)| {
         let text = changed(file, from, to);
-        // The needle is looked for from the change on; a table's name stands before it.
+        // Search the needle from the change on; the name of the table is before it.
         let changed_at = text.find(to).unwrap_or(0);
         let at = text[changed_at..].find(needle).map(|k| changed_at + k).or_else(|| text.find(needle));
         let at = at.unwrap_or_else(|| panic!("`{needle}` must stand in the text"));
@@ -616,7 +622,7 @@ fn assert_told<T>(values: &[BadValue], texts: &[BadText], read: fn(&str) -> Resu
     assert!(wrong.is_empty(), "{}", wrong.join("\n\n"));
 }
 
-/// What is wrong with these is wrong with something else as well.
+/// Keys whose bad values cause a second problem as well.
 const ALSO: &[&str] = &["cmm.wire.port", "cmm.wire.kind"];
 
 fn place_of_byte(text: &str, at: usize) -> (usize, usize) {
@@ -788,7 +794,7 @@ fn the_committed_schemas_are_the_ones_in_force() {
     }
 }
 
-/// The few words of JSON schema that ours use, by themselves.
+/// Evaluates the few keywords of JSON schema that our schemas use, with an independent implementation.
 fn accepts(schema: &Value, value: &Value) -> bool {
     if let Some(variants) = schema.get("oneOf").and_then(Value::as_array) {
         return variants.iter().filter(|one| accepts(one, value)).count() == 1;
@@ -857,7 +863,7 @@ fn shipped_texts() -> [&'static str; 8] {
     [RECIPE, BICONIC, SPIRAL, TELESCOPE, SIM, TCP, RTU, FILES]
 }
 
-/// Reads as both kinds, and looks at every problem.
+/// Reads a text as both kinds of file, and formats every problem.
 fn survive(text: &str) {
     for problems in [recipe(text).err(), cell(text).err()].into_iter().flatten() {
         assert!(!problems.problems.is_empty());

@@ -1,8 +1,8 @@
-//! Real measurements: they stand outside of the project, in the folder that REGRIND_DATA names.
+//! Real measurements. They are not part of the repository: the variable REGRIND_DATA names their folder.
 
 use std::path::PathBuf;
 
-/// A folder of real measurements.
+/// Returns the path of a folder of real measurements.
 pub fn data(folder: &str) -> PathBuf {
     let data = std::env::var_os("REGRIND_DATA").expect("REGRIND_DATA names the folder of real measurements");
     let found = PathBuf::from(data).join(folder);

@@ -1,10 +1,10 @@
-//! The journals that tests make, kept for a verifier that is no part of this program: see .ci/run.
+//! Keeps the journals that tests write, for a verifier that is not part of this program: see .ci/run.
 
 use std::fs;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 
-/// Keeps the run folders below a folder once this goes out of scope.
+/// Guard that keeps the run folders below a folder when it goes out of scope.
 #[allow(dead_code, reason = "not every test that includes this uses all of it")]
 pub struct Kept(pub PathBuf);
 
@@ -14,8 +14,8 @@ impl Drop for Kept {
     }
 }
 
-/// Keeps the run folders below a folder where REGRIND_KEEP_JOURNALS says, if it says so. A later state takes the place of an earlier
-/// one; a run that goes on is left alone.
+/// Copies the run folders below a folder to the folder that REGRIND_KEEP_JOURNALS names, if it is set. A later state
+/// replaces an earlier one. A run that is still active is skipped.
 pub fn keep(home: &Path) {
     if let Some(place) = std::env::var_os("REGRIND_KEEP_JOURNALS").filter(|place| !place.is_empty()) {
         keep_below(home, Path::new(&place), 4);
@@ -25,7 +25,7 @@ pub fn keep(home: &Path) {
 fn keep_below(folder: &Path, place: &Path, depth: u32) {
     if folder.join("journal.sqlite").is_file() {
         let lock = folder.join(".lock");
-        // A test may have laid a pipe in its place, which is waited for without end.
+        // A test may have put a pipe in place of the lock. To open a pipe would block without end.
         if fs::symlink_metadata(&lock).is_ok_and(|found| !found.is_file()) {
             return;
         }
@@ -46,14 +46,14 @@ fn keep_below(folder: &Path, place: &Path, depth: u32) {
     }
 }
 
-/// What a test takes away meanwhile is not there to be kept.
+/// Copies a folder with its content. A file that the test removes meanwhile is skipped.
 fn copy_all(from: &Path, to: &Path) {
     let _ = fs::create_dir_all(to);
     for entry in fs::read_dir(from).into_iter().flatten().flatten() {
         let (path, copy) = (entry.path(), to.join(entry.file_name()));
         match entry.file_type() {
             Ok(kind) if kind.is_dir() => copy_all(&path, &copy),
-            // The files on record are many and large, and nobody writes them again.
+            // The recorded files are many and large, and never change.
             Ok(kind) if kind.is_file() => {
                 let is_journal = entry.file_name().to_string_lossy().starts_with("journal.");
                 if is_journal || fs::hard_link(&path, &copy).is_err() {

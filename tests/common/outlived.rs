@@ -10,8 +10,8 @@ use serde_json::Value;
 
 use crate::program::{PATIENCE, Running, changed, regrind};
 
-/// Follows a program until it has said so much, and kills it then, or to its end; a person lets the cell go on wherever it holds.
-/// Returns its exit code, if it came to its end.
+/// Follows a program until it has printed this number of lines and then kills it, or follows it to its end. Resumes the
+/// cell wherever it holds, as a person would. Returns the exit code if the program reached its end.
 pub fn follow(running: &mut Running, folder: &dyn Fn() -> Option<PathBuf>, lines: usize) -> Option<i32> {
     let began = std::time::Instant::now();
     loop {
@@ -27,7 +27,7 @@ pub fn follow(running: &mut Running, folder: &dyn Fn() -> Option<PathBuf>, lines
             && status.status.state == StateName::Held
         {
             let resume = Request::Resume { reason: "seen".into(), seen: Some(status.status.number) };
-            // It may have been killed meanwhile, or wait for a machine still.
+            // The program may have been killed meanwhile, or may still wait for a machine.
             let _ = ask(&folder().unwrap(), &resume);
         }
         assert!(began.elapsed() < PATIENCE, "it comes to no end: {:#?}", running.said);
@@ -35,7 +35,8 @@ pub fn follow(running: &mut Running, folder: &dyn Fn() -> Option<PathBuf>, lines
     }
 }
 
-/// Machines on serial lines, played by the program itself, beside a cell for them and this recipe.
+/// Starts simulated machines on serial lines, served by the program itself, and writes a cell file for them and this
+/// recipe.
 pub fn on_serial_lines(home: &Path, recipe: impl AsRef<[u8]>) -> Running {
     fs::write(home.join("part.toml"), recipe).unwrap();
     let devices = format!("device = \"{}/", home.display());
@@ -47,7 +48,7 @@ pub fn on_serial_lines(home: &Path, recipe: impl AsRef<[u8]>) -> Running {
     serving
 }
 
-/// By the log of those machines, each pass and each measurement began once. Returns how many there were.
+/// Checks in the log of those machines that each pass and each measurement started exactly once. Returns their number.
 pub fn began_once(home: &Path) -> usize {
     let log = fs::read_to_string(home.join("machines.jsonl")).unwrap();
     let seen = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());

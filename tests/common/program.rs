@@ -1,4 +1,4 @@
-//! The program itself as a process, and one that is ended with the test.
+//! Runs the program as a process that ends with the test.
 #![allow(dead_code, reason = "not every test that includes this uses all of it")]
 
 use std::fs;
@@ -10,14 +10,14 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-/// Longest wait for anything that must happen.
+/// Longest wait for any event that must happen.
 pub const PATIENCE: Duration = Duration::from_secs(300);
 
 pub fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Returns the text of a shipped file with some of it replaced, wherever it stands.
+/// Returns the text of a shipped file, with every occurrence of some strings replaced.
 pub fn changed(file: &str, changes: &[(&str, &str)]) -> String {
     let mut text = fs::read_to_string(root().join(file)).unwrap();
     for (from, to) in changes {
@@ -27,13 +27,13 @@ pub fn changed(file: &str, changes: &[(&str, &str)]) -> String {
     text
 }
 
-/// Returns a text with some of it replaced, wherever it stands.
+/// Returns a text with every occurrence of a string replaced.
 pub fn replaced(text: &str, from: &str, to: &str) -> String {
     assert!(text.contains(from), "no {from:?}");
     text.replace(from, to)
 }
 
-/// The shipped free-form mirror with 300 points; its machines take no second for a job.
+/// Writes the shipped free-form mirror with 300 points as a recipe. Its machines need less than a second for a job.
 pub fn small_recipe(folder: &Path, speed: f64) -> PathBuf {
     let speed = format!("[simulation]\nseed = 1\nspeed = {speed:.1}");
     let changes = [
@@ -51,19 +51,19 @@ pub fn small_recipe(folder: &Path, speed: f64) -> PathBuf {
 pub fn regrind(arguments: &[&str], folder: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_regrind"));
     command.args(arguments).current_dir(folder).stdin(Stdio::null());
-    // Whoever runs the tests may have a key; records are signed here where a test says so.
+    // The person who runs the tests may have a key. Here records are signed only where a test asks for it.
     command.env("REGRIND_KEY", "");
     command
 }
 
-/// A process whose lines are read as they come.
+/// Process whose output lines are read as they arrive.
 pub struct Running {
     child: Child,
     lines: Receiver<String>,
     errors: Option<std::thread::JoinHandle<String>>,
     folder: Option<PathBuf>,
     pub said: Vec<String>,
-    /// What came on the error stream, once it has ended.
+    /// Text of the error stream, once the process has ended.
     pub told: String,
 }
 
@@ -77,14 +77,14 @@ impl Running {
         let mut errors = child.stderr.take().unwrap();
         let errors = std::thread::spawn(move || {
             let mut text = String::new();
-            // What is no text is not looked at.
+            // Output that is not text is ignored.
             let _ = errors.read_to_string(&mut text);
             text
         });
         Self { child, lines, errors: Some(errors), folder, said: Vec::new(), told: String::new() }
     }
 
-    /// Waits for a line that will do.
+    /// Waits for a line that satisfies a condition.
     pub fn line(&mut self, what: &str, will_do: impl Fn(&str) -> bool) -> String {
         let began = Instant::now();
         while let Ok(line) = self.lines.recv_timeout(PATIENCE.saturating_sub(began.elapsed())) {
@@ -97,7 +97,7 @@ impl Running {
         panic!("no {what}:\n{}\n{}", self.said.join("\n"), self.errors.take().unwrap().join().unwrap());
     }
 
-    /// Waits until something is so, while the program runs.
+    /// Waits until a condition is true, while the program runs.
     pub fn until<T>(&mut self, what: &str, mut is_so: impl FnMut(&[String]) -> Option<T>) -> T {
         let began = Instant::now();
         loop {
@@ -112,7 +112,7 @@ impl Running {
         }
     }
 
-    /// How many lines it has said so far.
+    /// Returns the number of lines that the program has printed so far.
     pub fn has_said(&mut self) -> usize {
         self.said.extend(self.lines.try_iter());
         self.said.len()
@@ -122,7 +122,7 @@ impl Running {
         self.child.try_wait().unwrap().is_some()
     }
 
-    /// What it reads from, where it was given a pipe for that.
+    /// Returns the standard input of the process, if it was started with a pipe for it.
     pub fn keys(&mut self) -> std::process::ChildStdin {
         self.child.stdin.take().expect("a pipe for what it reads")
     }
@@ -133,7 +133,7 @@ impl Running {
     }
 
     pub fn signal(&self, name: &str) {
-        // The shell has it built in.
+        // `kill` is built into the shell.
         let done = Command::new("sh").args(["-c", &format!("kill -{name} {}", self.child.id())]).status().unwrap();
         assert!(done.success());
     }
@@ -142,7 +142,7 @@ impl Running {
         self.child.id()
     }
 
-    /// Waits for the end; returns the exit code and what was said on the error stream.
+    /// Waits for the end. Returns the exit code and the text of the error stream.
     pub fn end(&mut self) -> (i32, String) {
         let began = Instant::now();
         let code = loop {
@@ -164,12 +164,12 @@ impl Running {
         (code, self.told.clone())
     }
 
-    /// Whether it was said on the error stream, once it has ended.
+    /// Returns true if the error stream contains these words, once the process has ended.
     pub fn has_been_told(&self, words: &str) -> bool {
         self.told.contains(words)
     }
 
-    /// The folder of the run, once it is named.
+    /// Returns the folder of the run, once the program has printed it.
     pub fn folder(&mut self, home: &Path) -> PathBuf {
         let line = self.line("run folder", |line| line.starts_with("record in "));
         home.join(line.trim_start_matches("record in "))
@@ -178,7 +178,7 @@ impl Running {
 
 impl Drop for Running {
     fn drop(&mut self) {
-        // It may have ended long ago.
+        // The process may have ended long ago.
         let _ = self.child.kill();
         let _ = self.child.wait();
         self.folder.iter().for_each(|folder| crate::keep::keep(folder));
@@ -193,8 +193,8 @@ pub fn run(arguments: &[&str], folder: &Path) -> (i32, String, String) {
     (status.code().unwrap_or(-1), text(stdout), text(stderr))
 }
 
-/// The run folders of a runs folder, in order of their names; none where there is no runs folder. Files whose name begins with a dot are no
-/// runs: a program that begins writes one for a moment to see whether it can.
+/// Returns the run folders of a runs folder in order of their names, or an empty list if there is no runs folder. Files
+/// whose name begins with a dot are not runs: a program that starts writes one for a moment to check that it can write.
 pub fn run_folders(runs: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(runs).into_iter().flatten().map(|entry| entry.unwrap().path());
     let mut folders: Vec<PathBuf> =
@@ -203,14 +203,14 @@ pub fn run_folders(runs: &Path) -> Vec<PathBuf> {
     folders
 }
 
-/// The only run folder of a runs folder.
+/// Returns the only run folder of a runs folder.
 pub fn only_run(runs: &Path) -> PathBuf {
     let mut folders = run_folders(runs);
     assert_eq!(folders.len(), 1, "{folders:?}");
     folders.remove(0)
 }
 
-/// The content of the journal's records of a kind that have a key.
+/// Returns the content of the journal's records that have this key.
 pub fn records_with(folder: &Path, key: &str) -> Vec<Value> {
     let reader = regrind::journal::Reader::open(folder).unwrap();
     let values = reader.records(1).map(|record| record.unwrap().value());

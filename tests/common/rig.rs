@@ -1,4 +1,4 @@
-//! A simulated cell in the process of a test: the world, its wires, and as many runs as are wanted, one after the other.
+//! Simulated cell in the process of a test: the world, its wires, and any number of runs, one after the other.
 #![allow(dead_code, reason = "not every test that includes this uses all of it")]
 
 use std::path::{Path, PathBuf};
@@ -23,12 +23,12 @@ use serde_json::json;
 use tempfile::TempDir;
 use tokio::sync::mpsc;
 
-/// Longest wait for anything that must happen.
+/// Longest wait for any event that must happen.
 pub const PATIENCE: Duration = Duration::from_secs(120);
 pub const CMM: usize = 0;
 pub const GRINDER: usize = 1;
 
-/// Returns the text of a shipped file with some of it replaced.
+/// Returns the text of a shipped file with some strings replaced.
 pub fn changed(file: &str, changes: &[(&str, &str)]) -> String {
     let mut text = std::fs::read_to_string(root().join(file)).unwrap();
     for (from, to) in changes {
@@ -42,7 +42,7 @@ pub fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The shipped free-form mirror on a coarser grid, so that a cycle takes a second.
+/// Returns the shipped free-form mirror on a coarser grid, so that a cycle takes about a second.
 pub fn small(columns: u32, rows: u32, speed: f64) -> Recipe {
     let of = [
         ("columns = 60", format!("columns = {columns}")),
@@ -60,17 +60,17 @@ pub fn recipe(changes: &[(&str, &str)]) -> Recipe {
     Recipe::parse(&root().join("recipes/freeform-mirror.toml"), &text).unwrap_or_else(|p| panic!("{p:?}"))
 }
 
-/// A request that came to a simulated machine, when it came.
+/// Request that arrived at a simulated machine, with its time.
 #[derive(Clone, Copy, Debug)]
 pub struct Came {
     pub at: Instant,
-    /// Whether it changed the beat.
+    /// True if the request changed the heartbeat.
     pub beat: bool,
-    /// The number of the command, if it was one.
+    /// Number of the command, if the request was a command.
     pub command: Option<u16>,
 }
 
-/// What a test does when a command comes, before the machine sees it.
+/// Callback of a test that runs when a command arrives, before the machine sees it.
 pub type Watch = Box<dyn FnMut(u16) + Send>;
 
 /// The world and its wires.
@@ -84,7 +84,7 @@ pub struct Rig {
     runs: u32,
 }
 
-/// A run that has everything but its drive.
+/// Run that is complete except for its drive.
 pub struct Ready {
     pub run: Run,
     pub cmm: ModbusCmm,
@@ -113,7 +113,7 @@ impl Rig {
         let text = changed("config/modbus-tcp.toml", &[("port = 15021", &port(0)), ("port = 15022", &port(1))]);
         let mut cell = CellConfig::parse(Path::new("cell.toml"), &text).unwrap_or_else(|p| panic!("{p:?}"));
         for link in [&mut cell.cmm.link, &mut cell.grinder.link] {
-            // No stall of the computer is taken for a machine that is gone.
+            // A stall of the computer must not look like a machine that is gone.
             link.timing.request_timeout = Duration::from_secs(5);
             link.timing.lost_after = Duration::from_secs(60);
         }
@@ -131,7 +131,7 @@ impl Rig {
         rig
     }
 
-    /// Lets a test look at the moment at which a command comes.
+    /// Calls a test's callback at the moment when a command arrives at a machine.
     pub fn watch(&self, machine: usize, mut watch: Watch) {
         let came = Arc::clone(&self.came[machine]);
         let look = move |request: &regrind_sim::wire::faults::Request| {
@@ -146,7 +146,7 @@ impl Rig {
         self.servings[machine].faults().set(plan);
     }
 
-    /// Prepares the next run: another job, so another part.
+    /// Prepares the next run, with a new job number and thus a new part.
     pub fn next(&mut self, loaded: bool) -> Ready {
         self.runs += 1;
         self.came.iter().for_each(|came| came.lock().unwrap().clear());
@@ -181,14 +181,15 @@ impl Rig {
         Ready { run, cmm, grinder, notices: shown, folder }
     }
 
-    /// When a command came to a machine, if it has.
+    /// Returns the time at which a command arrived at a machine, if it did.
     pub fn command_at(&self, machine: usize, command: u16, since: Instant) -> Option<Instant> {
         let came = self.came[machine].lock().unwrap();
         came.iter().find(|c| c.command == Some(command) && c.at >= since).map(|c| c.at)
     }
 }
 
-/// Gives an order over the control socket, as another terminal does; returns the answer and how long it took.
+/// Gives an order over the control socket, as another terminal does. Returns the answer, the time of the order and how
+/// long the answer took.
 pub async fn order(folder: &Path, request: Request) -> (Reply, Instant, Duration) {
     let folder = folder.to_owned();
     tokio::task::spawn_blocking(move || {
@@ -200,12 +201,12 @@ pub async fn order(folder: &Path, request: Request) -> (Reply, Instant, Duration
     .unwrap()
 }
 
-/// The state of a running cell, in words.
+/// Returns the state of a running cell in words.
 pub async fn words(folder: &Path) -> String {
     order(folder, Request::Status).await.0.status.message
 }
 
-/// Asks until the cell is in a state that will do, and returns its words.
+/// Polls the cell until its state satisfies a condition, and returns the state in words.
 pub async fn until(folder: &Path, will_do: impl Fn(&str) -> bool) -> String {
     let began = Instant::now();
     loop {
@@ -218,7 +219,7 @@ pub async fn until(folder: &Path, will_do: impl Fn(&str) -> bool) -> String {
     }
 }
 
-/// Waits for an event of the run, from where the notices are.
+/// Waits for an event of the run, starting at the current position in the notices.
 pub async fn event(notices: &mut mpsc::UnboundedReceiver<Notice>, wanted: &str, times: usize) {
     let mut left = times;
     let waiting = async {

@@ -1,6 +1,7 @@
-//! A machine that stands before another one and hands on what it does not change.
+//! Wrapper of a machine that forwards every call that the test does not change.
 
-/// The methods of `Machine` by name, each handed on to a field; what is left out is the test's own.
+/// Generates the listed methods of `Machine`, each forwarded to a field. The test implements the methods that are not
+/// listed.
 macro_rules! through {
     ($field:ident: $($method:ident),+ $(,)?) => { $(crate::through::through!(@$method $field);)+ };
     (@name $field:ident) => {

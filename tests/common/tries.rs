@@ -1,4 +1,4 @@
-//! One run that is held, resumed and aborted at a wanted moment from another terminal, with what came of it.
+//! One run that another terminal holds, resumes and aborts at a chosen moment, with the results.
 #![allow(dead_code, reason = "not every test that includes this uses all of it")]
 
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use regrind::drive::{Drive, Request};
 
 use crate::rig::{CMM, GRINDER, Rig, event, order, until, words};
 
-/// A moment of a run: a name, the events to wait for, and whether loading the part is confirmed by itself.
+/// Moment of a run: a name, the events to wait for, and whether the loading of the part is confirmed automatically.
 pub struct Moment {
     pub name: &'static str,
     pub after: &'static [(&'static str, usize)],
@@ -19,7 +19,7 @@ const fn moment(name: &'static str, after: &'static [(&'static str, usize)]) -> 
     Moment { name, after, loaded: true }
 }
 
-/// Every phase, by the event that leads there.
+/// All phases, each with the event that leads to it.
 pub const MOMENTS: [Moment; 15] = [
     Moment { name: "load", after: &[("connected", 2)], loaded: false },
     moment("grind, send", &[("load_confirmed", 1)]),
@@ -38,25 +38,26 @@ pub const MOMENTS: [Moment; 15] = [
     moment("grind again", &[("compensated", 1)]),
 ];
 
-/// What came of one try. Times are from before the order was written.
+/// Result of one try. Times count from before the order was written.
 #[derive(Debug, Default)]
 pub struct Tried {
-    /// The state in which the cell was after the first order.
+    /// State of the cell after the first order.
     pub state: String,
-    /// To the HOLD on the wire; none where no machine moved.
+    /// Time until the HOLD is on the wire; `None` if no machine moved.
     pub hold: Option<Duration>,
     pub hold_answered: Option<Duration>,
-    /// To the RESUME on the wire; none where no machine was held.
+    /// Time until the RESUME is on the wire; `None` if no machine was held.
     pub resume: Option<Duration>,
     pub resume_answered: Option<Duration>,
-    /// To the ABORT on each wire.
+    /// Time until the ABORT is on each wire.
     pub abort: Vec<Duration>,
     pub abort_answered: Duration,
-    /// Commands that came to a machine after its ABORT, other than ABORT and the RELEASE that gives it back.
+    /// Commands that arrived at a machine after its ABORT, other than ABORT and the RELEASE that gives the machine
+    /// back.
     pub after_abort: Vec<u16>,
 }
 
-/// Begins a run, holds and resumes it at a moment if wanted, aborts it, and sees it to its end.
+/// Starts a run, holds and resumes it at a moment if `hold` is set, aborts it, and follows it to its end.
 pub async fn attempt(rig: &mut Rig, moment: &Moment, hold: bool) -> (Tried, std::path::PathBuf) {
     let ready = rig.next(moment.loaded);
     attempt_with(rig, ready, moment, hold).await

@@ -1,5 +1,5 @@
-//! Pages of a result that come while its job still runs: a machine that gives them, one that does not, and some that lie. The machine
-//! measures when a test says so, and stands otherwise.
+//! Pages of a result that arrive while its job is still running: a machine that supports them, one that does not, and
+//! some that send false data. The machine measures only when a test makes it, and otherwise does nothing.
 
 #![cfg(unix)]
 
@@ -25,10 +25,10 @@ use crate::toy::Toy;
 const HEADER: u16 = 400;
 const SELECT: u16 = 460;
 const PAGE: u16 = 462;
-/// Points of a full page.
+/// Number of points of a full page.
 const FULL: usize = 7;
 const POINTS: u32 = 200;
-/// Pages of the whole result.
+/// Number of pages of the whole result.
 const PAGES: u64 = 29;
 
 fn machine(toy: Toy, gives_ahead: bool) -> registers::Machine {
@@ -44,7 +44,7 @@ async fn serve(toy: Toy, gives_ahead: bool) -> Serving {
     Serving::tcp_with("127.0.0.1:0", vec![(1, machine(toy, gives_ahead))], Faults::none()).await.unwrap()
 }
 
-/// Has the machine measure a thousand points a second for so long.
+/// Lets the machine measure a thousand points a second for this time.
 fn work(serving: &Serving, ms: u64) {
     serving.machine(1).unwrap().with(|machine| {
         machine.set_speed(1.0);
@@ -53,7 +53,7 @@ fn work(serving: &Serving, ms: u64) {
     });
 }
 
-/// Has a job begun.
+/// Begins a job.
 async fn begun(settings: ModbusSettings, plan: &Plan) -> ModbusCmm {
     let mut cmm = claimed(settings).await;
     cmm.load_plan(plan, &Interrupt::new()).await.unwrap();
@@ -62,14 +62,14 @@ async fn begun(settings: ModbusSettings, plan: &Plan) -> ModbusCmm {
     cmm
 }
 
-/// Has a job begun, and about half of it measured: more than 14 pages, fewer than 15.
+/// Begins a job, and measures about half of it: more than 14 pages, fewer than 15.
 async fn half_done(serving: &Serving, settings: ModbusSettings, plan: &Plan) -> ModbusCmm {
     let cmm = begun(settings, plan).await;
     work(serving, 102);
     cmm
 }
 
-/// Looks so many times, and takes one step ahead after each.
+/// Polls this number of times, and takes one step of reading ahead after each.
 async fn look(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16, looks: usize) -> Vec<Preliminary> {
     let mut told = Vec::new();
     for _ in 0..looks {
@@ -85,7 +85,7 @@ async fn finish(serving: &Serving, cmm: &mut ModbusCmm, plan: &Plan) -> Result<M
     cmm.collect(job_of(plan, 1), &Interrupt::new()).await
 }
 
-/// Requests that read or write at an address first, counted from now on.
+/// Counts the requests that read or write from an address on, starting now.
 fn counted(serving: &Serving, rules: FaultPlan, at: u16) -> Arc<AtomicU64> {
     let count = Arc::new(AtomicU64::new(0));
     let counter = Arc::clone(&count);
@@ -101,7 +101,7 @@ fn of(count: &AtomicU64) -> u64 {
     count.load(Ordering::SeqCst)
 }
 
-/// Requests at an address while the job runs.
+/// Selects requests at an address while the job runs.
 fn early(at: u16) -> When {
     When::Matching(Box::new(move |request| request.address == at && request.state == Some(At::Execute)))
 }
@@ -119,7 +119,7 @@ async fn what_came_while_it_measured_is_not_read_again_and_the_points_are_those_
         let mut cmm = half_done(&serving, patient(settings(&serving)), &plan).await;
         let early = counted(&serving, FaultPlan::new(0), PAGE);
         let told = look(&mut cmm, &plan, 1, 20).await;
-        // A page that is not full is asked for by nobody.
+        // Nothing requests a page that is not full.
         assert_eq!(of(&early), came);
         assert!(told.iter().enumerate().all(|(k, told)| told.from == FULL * k), "{told:?}");
         let late = counted(&serving, FaultPlan::new(0), PAGE);
@@ -150,7 +150,7 @@ async fn records_that_lie_across_pages_and_low_words_first_come_whole() {
     assert_eq!(measured.points.len(), POINTS as usize);
 }
 
-/// What a machine says ahead that is not so, and what goes wrong on the way: where it is said, and what.
+/// Returns the false data and faults during reading ahead: the register address, and the fault.
 fn lies() -> Vec<(u16, Fault)> {
     let lie = |register, value| Fault::Lie(vec![(register, value)]);
     let mut all = vec![
@@ -201,7 +201,7 @@ async fn whatever_is_said_ahead_the_points_are_right_in_the_end() {
                 true => rules.always(early(at), fault.clone()),
                 false => rules.times(if at == HEADER { 1 } else { 2 }, 1, early(at), fault.clone()),
             });
-            // No look fails by it: what goes wrong ahead is given up, and soon.
+            // No poll fails because of it: after a fault, reading ahead ends, and soon.
             look(&mut cmm, &plan, 1, 8).await;
             let measured = finish(&serving, &mut cmm, &plan).await;
             assert_exact(&plan, &measured.unwrap_or_else(|error| panic!("{hint}: {error}")), &hint);
@@ -219,7 +219,7 @@ async fn a_machine_that_refuses_is_asked_once_and_one_that_does_not_answer_three
         serving.faults().set(FaultPlan::new(1).always(early(HEADER), fault.clone()));
         assert!(look(&mut cmm, &plan, 1, 8).await.is_empty());
         assert_eq!(serving.faults().fired().len(), times, "{fault:?}");
-        // Another START is another job: it is asked anew.
+        // Another START is another job: reading ahead begins again.
         serving.faults().set(FaultPlan::new(1));
         cmm.stop().await.unwrap();
         reaches(&mut cmm, State::Complete).await.unwrap();
@@ -238,7 +238,7 @@ async fn nothing_that_was_kept_outlives_its_line_or_its_job() {
     for reconnects in [false, true] {
         let serving = serve(toy(), true).await;
         let mut cmm = half_done(&serving, settings(&serving), &plan).await;
-        // A page that is kept with a bit turned, which only the line it came on keeps from being used.
+        // A cached page with a flipped bit; only the check over its record prevents its use.
         serving.faults().set(FaultPlan::new(0).once(early(PAGE), Fault::FlipData));
         assert_eq!(points(&look(&mut cmm, &plan, 1, 9).await).len(), 8 * FULL);
         serving.faults().set(FaultPlan::new(0).once(When::Reading(64), Fault::Disconnect(3)));
@@ -265,7 +265,7 @@ async fn a_page_that_changes_after_all_has_everything_read_anew() {
     let late = counted(&serving, FaultPlan::new(0), PAGE);
     assert_exact(&plan, &finish(&serving, &mut cmm, &plan).await.unwrap(), "a page that changed");
     assert_eq!(of(&late), PAGES - 14 + PAGES);
-    // Where the result itself is broken it stays an error, as ever.
+    // A damaged result remains an error, as before.
     serving.faults().set(FaultPlan::new(0).always(When::Reading(PAGE), Fault::FlipData));
     let broken = cmm.collect(job_of(&plan, 1), &Interrupt::new()).await;
     assert!(matches!(broken, Err(DeviceError::Corrupt { what: "check number of a result", .. })), "{broken:?}");
@@ -284,14 +284,14 @@ async fn one_step_follows_a_look_and_none_an_order() {
     assert_eq!(cmm.read_ahead(job, &raised).await, None);
     assert_eq!(cmm.read_ahead(job, &calm).await, None);
     assert_eq!(requests(&serving), before, "an order was on its way, and the look is used up");
-    // The header, then a page a look.
+    // The header, then one page per poll.
     look(&mut cmm, &plan, 1, 2).await;
     cmm.status().await.unwrap();
     let before = requests(&serving);
     assert_eq!(cmm.read_ahead(job, &calm).await.unwrap().from, FULL);
     assert_eq!(cmm.read_ahead(job, &calm).await, None);
     assert_eq!(requests(&serving), before + 2);
-    // An order that comes with the select goes before the page.
+    // An order that arrives at the same time has priority over the page.
     let (raiser, flag) = (calm.clone(), calm.clone());
     let raise = When::Matching(Box::new(move |request| {
         if request.address == SELECT {
@@ -305,7 +305,7 @@ async fn one_step_follows_a_look_and_none_an_order() {
     assert_eq!(of(&pages), 0);
     cmm.hold().await.unwrap();
     reaches(&mut cmm, State::Held).await.unwrap();
-    // What was measured can be read on while it is held, and nothing after an abort.
+    // Reading of measured points continues during a hold, and ends after an abort.
     assert_eq!(look(&mut cmm, &plan, 1, 1).await[0].from, 2 * FULL);
     cmm.abort().await.unwrap();
     reaches(&mut cmm, State::Aborted).await.unwrap();
@@ -325,7 +325,7 @@ async fn on_a_line_on_which_an_order_would_wait_nothing_is_read_ahead() {
     }
 }
 
-/// The figure of docs/figures.md: run with `--ignored --nocapture`.
+/// Measures the figure of docs/figures.md: run with `--ignored --nocapture`.
 #[tokio::test]
 #[ignore = "takes as long as a line of 115,200 baud takes and as 1,800 points at 50 a second, two minutes"]
 async fn eighteen_hundred_points_over_a_serial_line() {

@@ -1,5 +1,5 @@
-//! docs/modbus.md held against the wire: its registers and, to the last digit, its test vectors. A driver works off a job against a
-//! simulated machine, and what it sent and was answered has to be what the page says.
+//! Compares docs/modbus.md with the wire: its registers and, to the last digit, its test vectors. A driver executes a
+//! job against a simulated machine. Its requests and the answers must match the page.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -26,19 +26,19 @@ use crate::toy::{Toy, pass};
 static PAGE: LazyLock<String> =
     LazyLock::new(|| std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/modbus.md")).unwrap());
 
-/// Time that passes at the machine with every request.
+/// Machine time that passes with every request.
 const TURN: Duration = Duration::from_millis(50);
 
 const OWNER: u32 = 0x12ab_34cd;
 const BOOT_ID: u32 = 0x4a6f_6231;
-/// The number that the machine has acknowledged before the client comes.
+/// Number that the machine has acknowledged before the client connects.
 const NUMBER_BEFORE: u32 = 0x0001_0001;
 const JOB: u32 = 70_001;
 const CYCLE: u16 = 3;
 
 // ---- the page -----------------------------------------------------------------------------------------------------------------------
 
-/// The frames of the page by their names: the fenced blocks of hexadecimal digits.
+/// Returns the frames of the page by their names: the fenced blocks of hexadecimal digits.
 fn vectors() -> BTreeMap<String, Vec<u8>> {
     let mut found = BTreeMap::new();
     let mut lines = PAGE.lines();
@@ -51,7 +51,7 @@ fn vectors() -> BTreeMap<String, Vec<u8>> {
     found
 }
 
-/// The cells of a row of a table; none of another line.
+/// Returns the cells of a table row; none for another line.
 fn cells(line: &str) -> Vec<&str> {
     let row = line.strip_prefix("| ").and_then(|line| line.strip_suffix(" |"));
     row.map(|row| row.split(" | ").collect()).unwrap_or_default()
@@ -59,10 +59,10 @@ fn cells(line: &str) -> Vec<&str> {
 
 // ---- the wire -----------------------------------------------------------------------------------------------------------------------
 
-/// Every request and every answer, as Modbus TCP carries them, each as the first transaction.
+/// Requests and answers, in order, as Modbus TCP carries them, each as the first transaction.
 type Record = Arc<Mutex<Vec<Vec<u8>>>>;
 
-/// Serves a machine to one client and keeps what goes over the wire.
+/// Serves a machine to one client and records the traffic.
 async fn record(machine: Machine, word_order: WordOrder) -> (ModbusSettings, Record) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -111,12 +111,12 @@ fn answer(machine: &mut Machine, asked: &[u8]) -> Vec<u8> {
     }
 }
 
-/// The frame of Modbus TCP: transaction 1, unit 1.
+/// Returns the frame of Modbus TCP: transaction 1, unit 1.
 fn tcp(pdu: &[u8]) -> Vec<u8> {
     [&[0, 1, 0, 0, 0, pdu.len() as u8 + 1, 1], pdu].concat()
 }
 
-/// The frame of Modbus RTU for what a frame of Modbus TCP carries.
+/// Returns the frame of Modbus RTU with the content of a frame of Modbus TCP.
 fn rtu(tcp: &[u8]) -> Vec<u8> {
     [&tcp[6..], &crc16(&tcp[6..]).to_le_bytes()].concat()
 }
@@ -144,7 +144,8 @@ fn map() -> CorrectionMap {
     }
 }
 
-/// A machine to which a stranger has spoken, so that the numbers of its client fill both words.
+/// Returns a machine that has already received a command of another client, so that the numbers of its client fill both
+/// words.
 fn machine(kind: Kind, word_order: words::WordOrder) -> Machine {
     let options = MachineOptions { word_order, ..MachineOptions::default() };
     let mut machine = Machine::new(Box::new(Toy::new(kind, 1e9)), BOOT_ID, options);
@@ -153,7 +154,7 @@ fn machine(kind: Kind, word_order: words::WordOrder) -> Machine {
     machine
 }
 
-/// What goes over the wire while a point is measured.
+/// Returns the traffic while a point is measured.
 async fn measured(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>> {
     let (settings, record) = record(machine(Kind::Cmm, sim_order), order).await;
     let (mut cmm, plan, calm) = (ModbusCmm::new(settings).unwrap(), plan(), Interrupt::new());
@@ -174,7 +175,7 @@ async fn measured(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>>
     record.lock().unwrap().clone()
 }
 
-/// What goes over the wire while seven of eight points are measured, and read.
+/// Returns the traffic while seven of eight points are measured, and read.
 async fn measured_ahead(order: WordOrder, word_order: words::WordOrder) -> Vec<Vec<u8>> {
     let options = MachineOptions { word_order, ..MachineOptions::default() };
     let machine = Machine::new(Box::new(Toy::new(Kind::Cmm, 1e9).up_to(7)), BOOT_ID, options);
@@ -215,7 +216,7 @@ async fn complete(machine: &mut impl Driver) -> Status {
     panic!("the job does not end");
 }
 
-/// What goes over the wire while a map and a pass are handed over, and the pass is ground.
+/// Returns the traffic while a map and a pass are transferred, and the pass is ground.
 async fn ground(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>> {
     let (settings, record) = record(machine(Kind::Grinder, sim_order), order).await;
     let (mut grinder, calm) = (ModbusGrinder::new(settings).unwrap(), Interrupt::new());
@@ -231,8 +232,8 @@ async fn ground(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>> {
     record.lock().unwrap().clone()
 }
 
-/// The answer to a look at the status with the snapshot number and the beats of the page, and that to a look at an outbox without a duration:
-/// those are as it happens.
+/// Returns an answer with the variable fields as on the page: the snapshot number and the heartbeats of a status, and
+/// no duration in an outbox.
 fn as_on_the_page(frame: &[u8]) -> Vec<u8> {
     let mut frame = frame.to_vec();
     if frame.len() == 9 + 112 && frame[7..9] == [3, 112] {
@@ -246,7 +247,7 @@ fn as_on_the_page(frame: &[u8]) -> Vec<u8> {
     frame
 }
 
-/// The pieces of the page that stand in one word order, and those that stand in both.
+/// Parts of the page that have one version for each word order; the others are the same in both.
 const TURNED: [&str; 13] = [
     "claim", "status", "header", "page", "point", "beat", "ahead", "full", "plan", "prepare", "start", "pass", "record",
 ];
@@ -291,7 +292,7 @@ async fn the_frames_of_the_page_are_those_on_the_wire() {
     assert_eq!(looked_at, page.into_keys().collect(), "frames that are looked at, and frames of the page");
 }
 
-/// Prints the frames of one job each that are long to write by hand, as they stand on the page (`REGRIND_VECTORS=1 cargo test --test device
+/// Prints the long frames of one job, in the format of the page (`REGRIND_VECTORS=1 cargo test --test device
 /// the_frames_of_the_page -- --nocapture`).
 fn print_vectors(order: &str, sent: &[Vec<u8>]) {
     let word = |frame: &[u8], at: usize| u16::from_be_bytes([frame[at], frame[at + 1]]);

@@ -1,4 +1,5 @@
-//! Machines that are two folders and a person: what is taken, what is left alone, and that nothing is handed over twice.
+//! Machines that consist of two folders and a person: which files are accepted, which are ignored, and that nothing is
+//! handed over twice.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -19,7 +20,7 @@ use tokio::sync::oneshot;
 
 use crate::toy::pass;
 
-/// When the next file is said to have been written.
+/// Modification time of the next file, in seconds.
 static WRITTEN_S: AtomicU64 = AtomicU64::new(1_700_000_000);
 
 /// Two folders of a machine.
@@ -38,7 +39,7 @@ impl Shop {
         Self { _home: home, outbox, inbox }
     }
 
-    /// Settings by which a look tells what it found, however busy the computer is.
+    /// Returns settings with which a poll reports its findings, however busy the computer is.
     fn cmm(&self) -> CmmExchange {
         let read_within = Duration::from_secs(300);
         CmmExchange { read_within, ..CmmExchange::new("SN 7", &self.outbox, &self.inbox) }
@@ -49,7 +50,7 @@ impl Shop {
         GrinderFolders::new(GrinderExchange { part: "SN 7".into(), outbox, inbox, stable_for })
     }
 
-    /// Writes a file; every one is a second younger than the one before, however coarse the clock of the disk.
+    /// Writes a file. Each is a second newer than the one before, independent of the resolution of the disk's clock.
     fn put(&self, name: &str, text: &str) {
         let path = self.inbox.join(name);
         fs::write(&path, text).unwrap();
@@ -57,7 +58,7 @@ impl Shop {
         File::options().write(true).open(&path).unwrap().set_modified(written).unwrap();
     }
 
-    /// Names in the outbox.
+    /// Returns the names in the outbox.
     fn handed(&self) -> Vec<String> {
         let mut names: Vec<String> = fs::read_dir(&self.outbox)
             .unwrap()
@@ -92,7 +93,7 @@ fn order(count: u32) -> (MeasureOrder, u32) {
     (MeasureOrder { plan, plan_identity }, digest(&[plan_identity]))
 }
 
-/// A measuring machine to whose folders a plan of three targets was handed, job 3 cycle 2, and its clock.
+/// Measuring machine with a plan of three targets in its folders, job 3 cycle 2, and its clock.
 struct Bench {
     folders: CmmFolders,
     job: Job,
@@ -113,7 +114,7 @@ impl Bench {
         self.folders.look(Duration::from_secs(self.now_s), self.job).unwrap()
     }
 
-    /// Looks until everything has settled.
+    /// Polls until all files have settled.
     fn settled(&mut self) -> Look<Measurement> {
         for _ in 0..2 {
             self.look();
@@ -128,7 +129,7 @@ impl Bench {
     }
 }
 
-/// The notes of a look say these words.
+/// Asserts that the notes of a poll contain these words.
 fn assert_says<A>(look: &Look<A>, words: &[&str]) {
     let said = look.notes.join("\n");
     for word in words {
@@ -174,12 +175,12 @@ fn a_result_is_taken_when_it_has_settled_and_ended_and_not_before() {
     assert_says(&bench.look(), &["waiting for SN_7_c2.* in"]);
     shop.put("SN_7_c2.csv", "# coordinates: centres\nx,y,z\n1,2,3\n");
     assert!(bench.look().answer.is_none());
-    // It grows while it is looked at: the time begins anew.
+    // The file grows during the polls: the settling time begins again.
     shop.put("SN_7_c2.csv", "# coordinates: centres\nx,y,z\n1,2,3\n4,5,6\n7,8,9.1");
     let look = bench.look();
     assert!(look.answer.is_none());
     assert_says(&look, &["still changing"]);
-    // The last line has three numbers, and is not the end all the same.
+    // The last line has three numbers, but it is incomplete.
     bench.refused("cut in the middle of a line, found `7,8,9.1`");
     shop.put("SN_7_c2.csv", &three());
     assert!(bench.look().answer.is_none());
@@ -188,18 +189,19 @@ fn a_result_is_taken_when_it_has_settled_and_ended_and_not_before() {
     assert_eq!(found.points.iter().map(|p| p.index).collect::<Vec<_>>(), [10, 11, 12]);
     assert_eq!((found.points[2].at_mm, found.coordinates), ([7.0, 8.0, 9.125], Coordinates::Centres));
     assert_eq!((found.job, found.cycle, found.plan_identity), (3, 2, plan(3).identity()));
-    // Asked again it says the same.
+    // A second poll returns the same.
     assert_eq!(bench.look().answer.unwrap(), found);
 }
 
-/// By how much the part stands proud at a point of a plan.
+/// Returns the height of the part above the nominal surface at a point of a plan, in mm.
 fn proud_mm(number: usize) -> f64 {
     0.004 * number as f64
 }
 
-/// Writes what a machine that runs DMIS writes for a program: every statement of its text, and every point touched by a ball of 1.5 mm, a little above its target.
+/// Returns the result file of a machine that runs DMIS: every statement of the program, and every point touched by a
+/// ball of 1.5 mm, a little above its target.
 fn ran(program: &str) -> String {
-    // A `$` at the end of a line goes on in the next.
+    // A `$` at the end of a line continues it on the next.
     let whole = program.replace("$\n", "");
     let mut output = String::from("UNITS/MM,ANGDEC\n");
     let mut points = std::collections::BTreeMap::new();
@@ -231,7 +233,7 @@ fn a_dmis_program_is_handed_over_and_what_a_machine_makes_of_it_is_taken() {
     let mut bench = Bench::new(settings);
     let program = fs::read_to_string(shop.outbox.join("SN_7_j3_c2/plan.dmi")).unwrap();
     let output = ran(&program);
-    // That of another plan, cycle or part is none of this one, whatever its name.
+    // A result of another plan, cycle or part is not accepted, whatever its name.
     for (from, to, expected) in [
         ("'cycle: 2'", "'cycle: 1'", "is of cycle 1, not 2; left alone"),
         ("'part: SN 7'", "'part: SN 8'", "is of part SN 8, not SN 7; left alone"),
@@ -272,7 +274,7 @@ fn a_qif_result_is_taken_by_what_it_says_of_itself() {
     };
     shop.put("export.qif", &document(1, "0.001"));
     bench.refused("export.qif");
-    // The unit is the one that it states.
+    // The unit is the one in the file.
     shop.put("export.qif", &document(2, "0.0254"));
     let found = bench.settled().answer.unwrap();
     assert_eq!(found.points.iter().map(|p| p.index).collect::<Vec<_>>(), [10, 11, 12]);
@@ -299,7 +301,7 @@ fn what_is_not_for_this_part_and_cycle_is_left_alone_and_said() {
     fs::remove_file(shop.inbox.join("SN_7_c2.csv")).unwrap();
     shop.put("notes.txt", &three());
     bench.refused("notes.txt does not say that it belongs here and its name does not fit SN_7_c2.*");
-    // By what it says of itself any name will do.
+    // A file that identifies its part and cycle can have any name.
     shop.put("export 0815.txt", &format!("# part: SN 7\n# cycle: 2\n{}", three()));
     assert!(bench.settled().answer.is_some());
 }
@@ -331,7 +333,7 @@ fn what_is_wrong_with_a_result_is_said_with_the_remedy() {
         shop.put("SN_7_c2.csv", &text);
         bench.refused(expected);
     }
-    // What came of targets without a row is known: they were not found.
+    // Targets without a row have a known result: they were not found.
     shop.put("SN_7_c2.csv", &with("index,x,y,z\n12,1,2,3\n10,4,5,6\n"));
     let found = bench.settled().answer.unwrap();
     let status: Vec<PointStatus> = found.points.iter().map(|p| p.status).collect();
@@ -383,7 +385,7 @@ fn a_job_and_cycle_is_handed_over_once_and_its_bytes_answer_no_other_cycle() {
     assert!(bench.settled().answer.is_some());
     bench.folders.mark(bench.job, Standing::Closed).unwrap();
     assert_eq!(shop.handed(), ["SN_7_j3_c2.done"]);
-    // Nor by another process, nor once it was acknowledged.
+    // Nor does another process accept it, nor after it was acknowledged.
     let mut other = CmmFolders::new(shop.cmm());
     let refused = again(&mut other);
     assert!(matches!(refused, Err(ExchangeError::HandedOver { job: 3, cycle: 2, .. })), "{refused:?}");
@@ -415,12 +417,12 @@ fn a_restart_finds_what_is_open() {
 
 // ---- stations ------------------------------------------------------------------------------------------------------------------
 
-/// Where four reference points and three points of the part are.
+/// Positions of four reference points and three points of the part, in mm.
 const REFERENCE: [[f64; 3]; 4] = [[0.0, 0.0, 0.0], [1000.0, 0.0, 10.0], [30.0, 700.0, 0.0], [900.0, 800.0, 300.0]];
 const NOMINAL: &str = "coords: opt_global\nprimary:\n  left: [[0, 0, 0], [['CODE14', [1, 2, 3]]]] # lower\n  \
     right: [1000, 0, 10]\n  upper: [30, 700, 0]\n  lower: [900, 800, 300]\nother:\n  a: [1, 2, 3]\n";
 
-/// What a station sees that is turned by a quarter about z and shifted.
+/// Returns the coordinates that a station measures, rotated by 90 degrees about z and shifted.
 fn seen(p: [f64; 3], station: usize) -> [f64; 3] {
     let s = station as f64;
     [p[1] + 100.0 * s, -p[0] + 5.0, p[2] - 3.0 * s]
@@ -526,7 +528,7 @@ fn a_pass_is_confirmed_by_files_that_name_its_map() {
 
 // ---- the drivers -----------------------------------------------------------------------------------------------------------------
 
-/// Folders of a test are on this computer.
+/// Time limit for folders of a test, which are on this computer.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(10);
 
 fn at_once(settings: CmmExchange) -> CmmExchange {
@@ -561,7 +563,7 @@ async fn a_measuring_machine_goes_through_the_states_of_a_wire() {
     assert_eq!(cmm.status().await.unwrap().state, State::Prepared);
     assert!(shop.handed().is_empty());
     assert!(matches!(cmm.reconcile(&armed).await.unwrap(), Reconciled::NotStarted(_)));
-    // What was told not to have started does not start any more.
+    // A job that was reported as not started does not start any more.
     assert_eq!(answer_of(cmm.start(armed).await), Answer::WrongState);
     assert!(shop.handed().is_empty());
     let armed = cmm.prepare(job).await.unwrap();
@@ -569,7 +571,7 @@ async fn a_measuring_machine_goes_through_the_states_of_a_wire() {
     assert_eq!((started.status.state, shop.handed().len()), (State::Execute, 1));
     assert_eq!(answer_of(cmm.start(armed.clone()).await), Answer::WrongState);
     assert!(matches!(Cmm::collect(&mut cmm, job, &Interrupt::new()).await, Err(DeviceError::NoResult { .. })));
-    // Held, the plan is not there to be taken; resumed, it is.
+    // While held, the plan is not in the outbox; after a resume it is.
     assert_eq!(cmm.hold().await.unwrap().state, State::Held);
     assert_eq!(shop.handed(), ["SN_7_j3_c2.held"]);
     assert_eq!(cmm.resume().await.unwrap().state, State::Execute);
@@ -597,7 +599,7 @@ async fn while_a_large_file_is_read_the_job_is_held_and_let_go_on_and_then_it_is
     cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
     let armed = cmm.prepare(job).await.unwrap();
     cmm.start(armed).await.unwrap();
-    // A map of nine million heights, none of them on the disk: it takes a while to read.
+    // A map of nine million heights, in a sparse file: reading it takes a while.
     let mut header = vec![0; 834];
     header[..10].copy_from_slice(&[0x88, 0x1b, 0x03, 0x6f, 0, 1, 0, 0, 0x03, 0x42]);
     header[68..76].copy_from_slice(&[0x0b, 0xb8, 0x0b, 0xb8, 0x02, 0x25, 0x51, 0x00]);
@@ -630,7 +632,7 @@ async fn a_restarted_client_learns_what_became_of_its_start() {
     let job = Job { job: 3, cycle: 2, digest: digest(&[plan.identity()]) };
     cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
     let armed = cmm.prepare(job).await.unwrap();
-    // The future is dropped at once: the work behind it is done or not, but never half, and the folder tells which.
+    // The future is dropped at once: its work is done completely or not at all, and the folder shows which.
     drop(cmm.start(armed.clone()));
     cmm.start(armed.clone()).await.unwrap();
     drop(cmm);
@@ -643,7 +645,7 @@ async fn a_restarted_client_learns_what_became_of_its_start() {
     assert_eq!(shop.handed(), ["SN_7_j3_c2.stopped"]);
     assert!(matches!(cmm.reconcile(&armed).await.unwrap(), Reconciled::Finished(s) if s.outcome == Outcome::Stopped));
     cmm.acknowledge(armed.start_sequence).await.unwrap();
-    // An abort takes the next one back for good.
+    // An abort withdraws the next job for good.
     let next = Job { cycle: 3, ..job };
     cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
     let armed = cmm.prepare(next).await.unwrap();
@@ -692,7 +694,8 @@ async fn a_folder_that_is_not_there_is_named() {
     assert!(error.is_link() && error.to_string().contains("/nowhere/out"), "{error}");
 }
 
-/// Folders on a drive that hangs in the middle of the next hand-over, before or after it has appeared, until it is let go.
+/// Folders on a drive that hangs in the middle of the next hand-over, before or after the file has appeared, until it
+/// is released.
 #[derive(Debug)]
 struct Hanging {
     folders: CmmFolders,
@@ -736,7 +739,7 @@ impl Exchange for Hanging {
     }
 }
 
-/// A START that takes longer than it may, and what the machine says of it when the drive answers again.
+/// Runs a START that exceeds its timeout; returns the machine's report after the drive answers again.
 async fn late_start(shop: &Shop, after: bool) -> (ExchangeMachine<Hanging>, DeviceError, Reconciled) {
     let (reached, hangs) = oneshot::channel();
     let (go, let_go) = mpsc::channel();
@@ -766,7 +769,7 @@ async fn a_start_that_timed_out_is_never_handed_over_later() {
     assert!(matches!(told, DeviceError::TimedOut { .. }), "{told}");
     assert!(matches!(found, Reconciled::NotStarted(_)), "{found:?}");
     assert_eq!(shop.handed(), [] as [&str; 0]);
-    // It can be prepared and started anew.
+    // The job can be prepared and started again.
     let job = Job { job: 3, cycle: 2, digest: digest(&[plan(3).identity()]) };
     let armed = cmm.prepare(job).await.unwrap();
     cmm.start(armed).await.unwrap();
@@ -784,7 +787,7 @@ async fn a_start_that_timed_out_while_it_appeared_is_taken_back_and_told() {
 
 // ---- whole cells ----------------------------------------------------------------------------------------------------------------
 
-/// A cell file with these two wires; folders are those of two shops.
+/// Returns a cell file with these two protocols; the folders are those of two shops.
 fn cell_of(wires: [bool; 2], shops: &[Shop; 2]) -> regrind::config::CellConfig {
     let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("config/modbus-tcp.toml")).unwrap();
     let mut text = text.replace("simulated = true", "simulated = false");
@@ -798,7 +801,7 @@ fn cell_of(wires: [bool; 2], shops: &[Shop; 2]) -> regrind::config::CellConfig {
     }
     let text: String = text.split("[nothing]").enumerate().fold(String::new(), |all, (k, piece)| match k {
         0 => piece.to_owned(),
-        // What stands in a table that was taken out, up to the next one.
+        // Skip the rest of the removed table, up to the next one.
         _ => all + piece.find("\n[").map_or("", |at| &piece[at..]),
     });
     regrind::config::CellConfig::parse(Path::new("cell.toml"), &text).unwrap_or_else(|problems| panic!("{problems}"))
@@ -815,7 +818,7 @@ async fn every_combination_of_wires_makes_two_machines() {
         let (cmm, grinder) = setup::machines(&recipe, &cell, "SN 7", Path::new("run"), [1, 1]).unwrap();
         let by_files = [cmm.name(), grinder.name()].map(|name| name.contains("by files"));
         assert_eq!(by_files, wires, "{} and {}", cmm.name(), grinder.name());
-        // A person may take a week; a wire may not. A person's word is for files only.
+        // A person can take a week; a network connection cannot. Only files accept a person's confirmation.
         let (_, plan) = setup::prepare(&recipe, &cell).unwrap();
         assert_eq!(plan.deadlines.progress.map(|limit| limit > Duration::from_secs(86_400)), wires);
         let told = { grinder }.confirm(Word::Started { map_identity: Some([0; 32]) }).await.unwrap_err();

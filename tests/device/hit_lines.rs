@@ -1,6 +1,7 @@
-//! The driver of a machine that prints its hits, at the near end of a real serial line (a pseudo-terminal) or of a TCP connection.
+//! Driver of a machine that prints its hits, at the near end of a real serial line (a pseudo-terminal) or of a TCP
+//! connection.
 //!
-//! Nothing here goes by the clock: what is waited for is a point, a refusal or a state, and however long that takes.
+//! Nothing here depends on time: the tests wait for a point, a refusal or a state, however long that takes.
 #![cfg(unix)]
 
 use std::path::Path;
@@ -15,10 +16,10 @@ use regrind_sim::hits::faults::Fault;
 use regrind_sim::hits::print::Style;
 use regrind_sim::wire::hits::ServingHits;
 
-/// Longer than any test takes.
+/// Timeout longer than any test.
 const LONG: Duration = Duration::from_secs(600);
 
-/// Targets in a row, 50 mm apart, on a plane that looks up.
+/// Returns a plan of targets in a row, 50 mm apart, on a plane that faces up.
 fn plan(targets: u32) -> Plan {
     let point_mm = |k: u32| [100.0 + 50.0 * f64::from(k), 200.0, 298.5];
     let what = TargetKind::Part;
@@ -69,7 +70,7 @@ struct Bench {
 }
 
 impl Bench {
-    /// A measurement that has been asked for.
+    /// Starts a measurement.
     async fn new(
         targets: u32,
         serving: ServingHits,
@@ -96,7 +97,7 @@ impl Bench {
         Self::new(targets, serving, line, change).await
     }
 
-    /// Waits until so many targets are touched, and returns the state.
+    /// Waits until this number of targets is touched, and returns the state.
     async fn until(&mut self, touched: u32, state: State) {
         loop {
             let status = self.cmm.status().await.unwrap();
@@ -123,7 +124,7 @@ impl Bench {
     }
 }
 
-/// The lines of the page that the formats come from, byte for byte.
+/// Lines of the page that defines the formats, byte for byte.
 const GOLDEN: [(LineFormat, &[u8]); 8] = [
     (LineFormat::Decimal, b"100.000,200.000,300.000\r\n"),
     (LineFormat::Integer, b"100000,200000,300000\r\n"),
@@ -146,7 +147,7 @@ async fn the_eight_formats_come_over_a_serial_line_byte_for_byte() {
         };
         assert_eq!(style.line([100.0, 200.0, 300.0]), line, "the simulated machine prints it alike");
         let mut bench = Bench::on_serial(1, |settings| settings.reading.format = format).await;
-        // However it comes.
+        // The line arrives in two pieces.
         let (begin, rest) = line.split_at(line.len() / 2);
         bench.serving.send(begin).await;
         bench.serving.send(rest).await;
@@ -160,7 +161,7 @@ async fn the_eight_formats_come_over_a_serial_line_byte_for_byte() {
     }
 }
 
-/// Lines of a printer whose first line but one has a fault, up to so many targets.
+/// Returns the lines of a printer whose second line has a fault, up to this number of targets.
 fn with_fault(fault: &Fault) -> Vec<u8> {
     let line = |k: usize| Style::default().line([100.0 + 50.0 * k as f64, 200.0, 300.0]);
     (0..4).flat_map(|k| if k == 1 { fault.spoil(line(k)) } else { line(k) }).collect()
@@ -168,7 +169,7 @@ fn with_fault(fault: &Fault) -> Vec<u8> {
 
 #[tokio::test]
 async fn a_line_that_is_not_whole_becomes_no_point_and_what_it_told_is_touched_again() {
-    // Each with how many of the four are touched all the same, and the words.
+    // Fault, number of the four targets that are touched anyway, and the words of the message.
     for (fault, touched, why) in [
         (Fault::Lost(4), 3, "not a number with 3 digits"),
         (Fault::Lost(0), 3, "50.000 mm from target 7, the nearest"),
@@ -188,7 +189,7 @@ async fn a_line_that_is_not_whole_becomes_no_point_and_what_it_told_is_touched_a
         bench.cmm.confirm(Word::Still).await.unwrap();
         bench.until(touched, State::Held).await;
         bench.cmm.resume().await.unwrap();
-        // The person looks at what is left, and touches it.
+        // The person looks at the remaining targets, and touches them.
         for k in [1, 2] {
             if bench.cmm.status().await.unwrap().progress.unwrap().0 < 4 && (k == 1 || touched == 2) {
                 bench.serving.send(&Style::default().line([100.0 + 50.0 * f64::from(k), 200.0, 300.0])).await;
@@ -251,7 +252,7 @@ async fn a_line_of_a_terminal_server_that_breaks_off_loses_no_point_that_there_i
     };
     assert!(lost.is_link(), "{lost}");
     bench.cmm.connect().await.unwrap();
-    // What was touched meanwhile did not come, and nobody knows whether it stands.
+    // A touch in the meantime was lost, and the state of the machine is unknown.
     bench.until(1, State::Holding).await;
     let notes = bench.notes();
     assert!(
@@ -270,7 +271,7 @@ async fn a_line_of_a_terminal_server_that_breaks_off_loses_no_point_that_there_i
 #[tokio::test]
 async fn a_port_that_is_pulled_out_is_lost_and_what_gathered_before_it_is_opened_is_read_away() {
     let serving = ServingHits::serial().unwrap();
-    // Of another part, perhaps.
+    // Possibly of another part.
     serving.send(b"100.000,200.000,300.000\r\n").await;
     let line = serial(&serving);
     let mut bench = Bench::new(2, serving, line, |_| {}).await;

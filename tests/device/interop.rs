@@ -1,8 +1,8 @@
-//! Against other people's programs: Modbus machines and a client on pymodbus, written from docs/modbus.md alone, in jobs and in a whole
-//! run; and our maps in x3pio (tests/device/pymodbus/).
+//! Interoperability with independent programs: Modbus machines and a client on pymodbus, written from docs/modbus.md
+//! alone, in jobs and in a whole run; and our maps in x3pio (tests/device/pymodbus/).
 //!
-//! They run with the Python that REGRIND_PYTHON names, which has to have both, or in an environment that is made below the target
-//! folder.
+//! They run with the Python that REGRIND_PYTHON names, which must have both packages, or in an environment that is made
+//! below the target folder.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -30,7 +30,7 @@ fn scripts() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/device/pymodbus")
 }
 
-/// A Python that has what the tests need, made once.
+/// Returns a Python with the required packages, installed once.
 fn python() -> &'static Path {
     static PYTHON: OnceLock<Result<PathBuf, String>> = OnceLock::new();
     PYTHON.get_or_init(find_python).as_deref().unwrap_or_else(|why| panic!("no Python with pymodbus and x3pio: {why}"))
@@ -52,7 +52,7 @@ fn find_python() -> Result<PathBuf, String> {
     let base = if cfg!(windows) { "python" } else { "python3" };
     run(Command::new(base).args(["-m", "venv", "--clear"]).arg(&home))?;
     let list = scripts().join("requirements.txt");
-    // A network that fails once must not fail the tests.
+    // A single network failure must not fail the tests.
     let mut install = Command::new(&python);
     install.args(["-m", "pip", "install", "--quiet", "--retries", "10", "--timeout", "60", "-r"]).arg(list);
     (0..2).find_map(|_| run(&mut install).ok()).map_or_else(|| run(&mut install), Ok)?;
@@ -68,7 +68,7 @@ fn run(command: &mut Command) -> Result<(), String> {
     }
 }
 
-/// A machine in a process of its own, which ends with it.
+/// Machine in its own process, which ends when this value is dropped.
 struct Process {
     child: Child,
     settings: ModbusSettings,
@@ -186,7 +186,7 @@ async fn a_pymodbus_cmm_gives_pages_while_it_measures() {
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
 async fn our_driver_has_a_pymodbus_grinder_grind() {
     let python = python();
-    // Long enough for a hold to come before its end on any computer.
+    // Long enough for a hold to arrive before its end on any computer.
     let process = Process::of(python, "grinder.py", &["--seconds", "3"]);
     let mut grinder = ModbusGrinder::new(process.settings.clone()).unwrap();
     grinder.connect().await.unwrap();
@@ -214,7 +214,7 @@ async fn our_driver_has_a_pymodbus_grinder_grind() {
     assert_eq!(grinder.status().await.unwrap().state, State::Idle);
 }
 
-/// The whole program against both: grind, measure, register, judge, compensate, until the part is accepted.
+/// Runs the whole program against both: grind, measure, register, judge, compensate, until the part is accepted.
 #[test]
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
 fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
@@ -254,7 +254,7 @@ fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
     assert_eq!(cycles.len(), 2, "{result}");
     assert!(rms_um(&cycles[0]) > 3.0 && rms_um(&cycles[1]) < 0.3 * rms_um(&cycles[0]), "{result}");
 
-    // The same cell file with another name in it: not the machine that is meant, and nothing is begun.
+    // The same cell file with another name in it: the machine is not the configured one, and nothing begins.
     write(
         "other.toml",
         crate::program::changed(
@@ -267,7 +267,7 @@ fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
     assert_eq!(code, 3, "{said}\n{errors}");
     let all = format!("{said}{errors}");
     assert!(all.contains("calls itself \"pymodbus CMM 1\"") && all.contains("expects \"CMM 8\""), "{all}");
-    // And one that takes these machines for real.
+    // A cell file that declares these machines as real.
     write(
         "real.toml",
         crate::program::changed(
@@ -333,7 +333,7 @@ fn our_x3p_opens_in_another_reader_with_equal_values() {
             "{k}"
         );
     }
-    // The mask says the same as the values.
+    // The mask agrees with the values.
     let mask: Vec<bool> = serde_json::from_value(read["mask"].clone()).unwrap();
     assert_eq!(mask, map.valid);
     assert!(read["comment"].as_str().unwrap().starts_with("SIMULATION"), "{read}");

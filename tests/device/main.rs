@@ -1,4 +1,4 @@
-//! The drivers, each against machines at the far end of its real wire.
+//! Tests of the drivers, each against machines at the far end of its real connection.
 
 mod ahead;
 mod contract;

@@ -1,4 +1,4 @@
-//! The Modbus drivers against simulated machines at the far end of real sockets and serial lines, in order and out of order.
+//! Modbus drivers against simulated machines at the far end of real sockets and serial lines, with and without faults.
 
 #![cfg(unix)]
 
@@ -30,7 +30,7 @@ fn toy(kind: Kind, points_a_second: f64, options: MachineOptions) -> registers::
     registers::Machine::new(Box::new(Toy::new(kind, points_a_second)), 0xb007, options)
 }
 
-/// Fast enough to be done between two looks.
+/// Speed that finishes a job between two polls.
 const AT_ONCE: f64 = 1e9;
 
 async fn serve(kind: Kind, points_a_second: f64, faults: Faults) -> Serving {
@@ -49,7 +49,8 @@ pub fn settings(serving: &Serving) -> ModbusSettings {
     }
 }
 
-/// For what must go well at the first try: no stall of the computer is taken for a silent machine.
+/// Returns settings for requests that must succeed at the first try: a stall of the computer does not count as a silent
+/// machine.
 pub fn patient(settings: ModbusSettings) -> ModbusSettings {
     ModbusSettings { request_timeout: Duration::from_secs(30), ..settings }
 }
@@ -95,7 +96,7 @@ pub fn job_of(plan: &Plan, cycle: u16) -> Job {
     Job { job: 42, cycle, digest: digest(&[plan.identity()]) }
 }
 
-/// Every coordinate to the last bit: what the toy machine does is known.
+/// Asserts that every coordinate is exact to the last bit: the behaviour of the toy machine is known.
 pub fn assert_exact(plan: &Plan, measured: &Measurement, hint: &str) {
     assert_eq!(measured.points.len(), plan.targets.len(), "{hint}");
     assert_eq!(measured.plan_identity, plan.identity(), "{hint}");
@@ -107,7 +108,7 @@ pub fn assert_exact(plan: &Plan, measured: &Measurement, hint: &str) {
     }
 }
 
-/// A measuring machine that is connected, and its own.
+/// Returns a measuring machine that is connected and claimed.
 pub async fn claimed(settings: ModbusSettings) -> ModbusCmm {
     let mut cmm = connected(settings).await;
     cmm.claim().await.unwrap();
@@ -183,7 +184,7 @@ async fn a_pass_is_ground_and_recorded() {
     assert_eq!((record.outcome, record.path_mm, record.removed_mm3), (Outcome::Complete, Some(1234.5), Some(67.8)));
     assert_eq!((record.map_identity, record.wheel_radius_mm), (map.identity(), Some(25.0)));
     grinder.acknowledge(record.done).await.unwrap();
-    // The same job and cycle are not begun twice, however well they are prepared.
+    // The same job and cycle do not begin twice, even after another prepare.
     let armed = grinder.prepare(job).await.unwrap();
     let refused = grinder.start(armed).await;
     assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::AlreadyBegun, .. })), "{refused:?}");
@@ -204,7 +205,7 @@ async fn low_words_first_and_other_addresses_are_as_good() {
         let mut cmm = connected(settings.clone()).await;
         let plan = plan(50);
         assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), word_order.name());
-        // Taken in another order it is told which one is right.
+        // With another word order, the error names the right one.
         for other in [word_order.other(), word_order.with_other_bytes(), word_order.with_other_bytes().other()] {
             let registers = RegisterMap { word_order: other, ..registers };
             let wrong = ModbusCmm::new(ModbusSettings { registers, ..settings.clone() }).unwrap().connect().await;
@@ -258,7 +259,7 @@ async fn another_client_is_refused_and_an_abort_is_not() {
     assert!(matches!(state, State::Aborting | State::Aborted), "{state}");
 }
 
-/// A command of a client that is not under test, straight at the machine's registers; returns the answer.
+/// Writes a command of another client directly into the machine's registers; returns the answer.
 fn put(serving: &Serving, frame: SimFrame) -> u16 {
     serving.machine(1).unwrap().with(|machine| {
         machine.write(40, &frame.registers(words::WordOrder::Big)).unwrap();
@@ -275,7 +276,7 @@ async fn an_abort_gets_through_a_line_that_broke_and_past_the_number_of_a_second
     let (serving, plan) = (serve(Kind::Cmm, 1.0, Faults::none()).await, plan(100));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     cmm.start(armed).await.unwrap();
-    // A second master is told no, and has counted the machine far ahead of its owner all the same.
+    // The machine refuses a second master, but its counter is then far ahead of its owner's.
     let stranger = SimFrame { sequence: 0x7000_0000, owner: 2, ..of_first(SimCommand::Claim) };
     assert_eq!(put(&serving, stranger), 2, "not the owner");
     serving.faults().set(FaultPlan::new(0).once(When::Any, Fault::Disconnect(0)));
@@ -283,7 +284,7 @@ async fn an_abort_gets_through_a_line_that_broke_and_past_the_number_of_a_second
     serving.faults().set(FaultPlan::new(0).once(When::Any, Fault::Disconnect(0)));
     let aborting = cmm.abort().await.unwrap().state;
     assert!(matches!(aborting, State::Aborting | State::Aborted), "{aborting}");
-    // The second master takes the machine over: the end of the abort is seen all the same.
+    // The second master takes the machine over: the driver sees the end of the abort anyway.
     assert_eq!(put(&serving, SimFrame { sequence: 0x7000_0001, ..of_first(SimCommand::Release) }), 1);
     assert_eq!(put(&serving, SimFrame { sequence: 0x7000_0002, ..stranger }), 1);
     reaches(&mut cmm, State::Aborted).await.unwrap();
@@ -305,20 +306,21 @@ async fn a_machine_that_another_client_has_taken_is_lost_in_these_words() {
 async fn a_machine_that_is_busy_is_waited_for_and_one_that_stays_so_is_not() {
     let few =
         |serving: &Serving| ModbusSettings { retries: 3, lost_after: Duration::from_secs(2), ..settings(serving) };
-    // A controller that is still starting says so to more questions than a silent one has tries.
+    // A controller that is still starting reports busy for more requests than a silent one has retries.
     let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
     serving.faults().set(FaultPlan::new(0).times(1, 12, When::Any, Fault::Exception(6)));
     let began = Instant::now();
     let mut cmm = connected(few(&serving)).await;
     assert!(began.elapsed() >= 12 * Duration::from_millis(50), "{:?}", began.elapsed());
-    // So does one at work; and what stays busy is lost after its time, and asked no more often than every 50 ms.
+    // A busy machine does the same. A machine that stays busy is lost after its timeout, and polled at most every 50
+    // ms.
     serving.faults().set(FaultPlan::new(0).times(1, 12, When::Any, Fault::Exception(6)));
     cmm.status().await.unwrap();
     serving.faults().set(FaultPlan::new(0).always(When::Any, Fault::Exception(6)));
     let busy = cmm.status().await.unwrap_err();
     assert!(matches!(busy, DeviceError::Exception { code: 6, .. }) && busy.is_link(), "{busy}");
     assert!((4..=41).contains(&serving.faults().fired().len()), "{}", serving.faults().fired().len());
-    // A gateway that finds no machine says so too, and is not waited for as long when it is met.
+    // A gateway that finds no machine reports it too, and connecting does not wait as long for it.
     let serving = serve(Kind::Cmm, AT_ONCE, FaultPlan::new(0).always(When::Any, Fault::Exception(11)).into()).await;
     let met = ModbusCmm::new(few(&serving)).unwrap().connect().await.unwrap_err();
     assert!(matches!(met, DeviceError::Exception { code: 11, .. }), "{met}");
@@ -333,7 +335,7 @@ async fn a_clock_that_was_set_back_makes_nobody_a_stranger_to_his_own_machine() 
     after.claim().await.unwrap();
     let epoch = |serving: &Serving| serving.machine(1).unwrap().with(|machine| machine.read(90, 2).unwrap());
     assert_eq!(epoch(&serving), [0, 51]);
-    // Who meets a higher epoch later than his own has been replaced, and does not outbid.
+    // A client that sees a higher epoch than its own has been replaced, and does not outbid it.
     assert_eq!(put(&serving, SimFrame { sequence: 500, epoch: 60, ..of_first(SimCommand::Claim) }), 1);
     after.connect().await.unwrap();
     let refused = after.claim().await;
@@ -341,7 +343,8 @@ async fn a_clock_that_was_set_back_makes_nobody_a_stranger_to_his_own_machine() 
     assert_eq!(epoch(&serving), [0, 60]);
 }
 
-/// Raises a flag when a machine is sent the page of this number, so that the break comes in the middle for certain; counts the pages.
+/// Raises a flag when a machine receives the page of this number, so that the interruption always comes in the middle.
+/// Counts the pages.
 fn interrupt_at_page(serving: &Serving, number: u32) -> (Interrupt, Arc<AtomicU32>) {
     let (interrupt, pages) = (Interrupt::new(), Arc::new(AtomicU32::new(0)));
     let (raiser, counted) = (interrupt.clone(), Arc::clone(&pages));
@@ -389,12 +392,12 @@ async fn further_signals_are_read_scaled_and_held_against_their_range() {
     assert_eq!((status.signals[0].value, status.temperature_c), (Some(20.25), Some(20.25)));
     assert_eq!(status.signals[0].flaw(), None);
     let mut cmm = connected(ModbusSettings { signals: vec![narrow], ..settings(&serving) }).await;
-    // A bad signal hides nothing of what else the machine says.
+    // A bad signal hides no other part of the status.
     let status = cmm.status().await.unwrap();
     let flaw = status.signals[0].flaw().unwrap();
     assert_eq!(flaw, "part_temperature is 20.25 C, and 15 to 19 C are wanted");
     assert_eq!((status.state, status.temperature_c), (State::Idle, Some(20.25)));
-    // A register that is not there, and one that holds no number.
+    // A register that does not exist, and one that holds no number.
     let cases = [
         (
             60_000,
@@ -414,7 +417,7 @@ async fn further_signals_are_read_scaled_and_held_against_their_range() {
 
 // ---- not the machine that is meant --------------------------------------------------------------------------------------------------
 
-/// Something that answers every read with the same registers, and counts what is written to it.
+/// Answers every read with the same registers, and counts the writes.
 async fn impostor(image: Vec<u16>) -> (ModbusSettings, Arc<AtomicU32>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -514,7 +517,7 @@ async fn a_machine_with_the_right_identity_that_does_not_answer_freshly_is_not_b
 
 #[tokio::test]
 async fn nobody_there_is_said_so() {
-    // A port that is taken and not listened on.
+    // A port that is bound but has no listener.
     let taken = TcpSocket::new_v4().unwrap();
     taken.bind("127.0.0.1:0".parse().unwrap()).unwrap();
     let port = taken.local_addr().unwrap().port();
@@ -528,7 +531,7 @@ async fn nobody_there_is_said_so() {
 
 // ---- out of order -------------------------------------------------------------------------------------------------------------------
 
-/// Everything that a wire can do to an answer without the machine being at fault.
+/// Returns all faults of a connection that can change an answer without a fault of the machine.
 fn wire_faults() -> Vec<Fault> {
     vec![
         Fault::DropRequest,
@@ -594,14 +597,14 @@ async fn seeded_mixtures_of_faults_give_no_wrong_value_and_no_second_start() {
 
 #[tokio::test]
 async fn a_bit_that_every_check_sum_of_the_wire_passes_is_still_found() {
-    // In the pages, where the CRC-32 over the whole stands; once, so that the second fetch comes through.
+    // In the pages, which the CRC-32 over the whole protects; once, so that the second fetch succeeds.
     let rules = FaultPlan::new(1).once(When::Reading(462), Fault::FlipData);
     let serving = serve(Kind::Cmm, AT_ONCE, rules.into()).await;
     let mut cmm = connected(settings(&serving)).await;
     let plan = plan(40);
     assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "a flipped bit");
     assert_eq!((serving.faults().fired().len(), cmm.link().figures().corrupt), (1, 1));
-    // And for ever: an error, no points.
+    // Permanently: an error, no points.
     serving.faults().set(FaultPlan::new(1).always(When::Reading(462), Fault::FlipData));
     let refused = measure(&mut cmm, &plan, 2).await;
     assert!(matches!(refused, Err(DeviceError::Corrupt { what: "check number of a result", .. })), "{refused:?}");
@@ -625,7 +628,7 @@ async fn a_start_whose_answer_is_lost_is_the_same_start_when_it_is_written_again
     assert_eq!(began(&serving), [(sequence, 42, 1)]);
 }
 
-/// Nothing gets through after the first START, nor does that if it is lost too.
+/// Returns faults that let nothing through after the first START, or lose that START too.
 fn silent_from_start(lost: bool) -> FaultPlan {
     let mut seen = false;
     let rule = When::Matching(Box::new(move |request| {
@@ -640,7 +643,7 @@ fn silent_from_start(lost: bool) -> FaultPlan {
 async fn a_start_that_is_lost_with_the_line_is_unknown_and_then_found_to_run() {
     let (serving, plan) = (serve(Kind::Cmm, 1.0, Faults::none()).await, plan(100));
     let (mut cmm, armed) = armed(&serving, &plan).await;
-    // It is carried out, and from then on nothing answers.
+    // The START is carried out, and from then on nothing answers.
     serving.faults().set(silent_from_start(false).once(When::Commanding(3), Fault::DropReply));
     let unknown = cmm.start(armed.clone()).await;
     assert!(matches!(&unknown, Err(DeviceError::StartUnknown { sequence, .. }) if *sequence == armed.start_sequence));
@@ -659,7 +662,7 @@ async fn a_start_that_never_arrived_is_seen_twice_not_to_have() {
     let unknown = cmm.start(armed.clone()).await;
     assert!(matches!(unknown, Err(DeviceError::StartUnknown { .. })), "{unknown:?}");
     serving.faults().set(FaultPlan::new(0));
-    // A client that has been started anew knows of the start from its journal only.
+    // A restarted client knows the start from its journal only.
     let mut after = connected(settings(&serving)).await;
     let asked = Instant::now();
     let found = after.reconcile(&armed).await.unwrap();
@@ -668,7 +671,7 @@ async fn a_start_that_never_arrived_is_seen_twice_not_to_have() {
     assert!(began(&serving).is_empty());
 }
 
-/// The START of a job that was prepared, as it would come out of a network in which it was delayed.
+/// Returns the START of a prepared job, as a network delivers it after a delay.
 fn delayed(armed: &Armed) -> SimFrame {
     let Armed { job, start_sequence: sequence, token, .. } = *armed;
     SimFrame { sequence, cycle: job.cycle, job: job.job, digest: job.digest, token, ..of_first(SimCommand::Start) }
@@ -687,7 +690,7 @@ async fn a_start_that_arrives_after_it_was_found_not_started_moves_nothing() {
     assert!(matches!(found, Reconciled::NotStarted(_)), "{found:?}");
     put(&serving, delayed(&lost));
     assert!(began(&serving).is_empty(), "the CLAIM has fenced it off");
-    // Prepared anew the same job starts, and the old frame is too old again.
+    // After another prepare the same job starts, and the old frame is too old again.
     cmm.stop().await.unwrap();
     cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
     let again = cmm.prepare(job_of(&plan, 1)).await.unwrap();

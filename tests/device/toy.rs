@@ -1,9 +1,9 @@
-//! A machine that does exactly what it is told, for tests of the wire, and a pass that it can be told.
+//! Machine that does exactly what a command says, for tests of the protocol, and a pass for it.
 
 use regrind::device::Pass;
 use regrind_sim::body::{self, Body, Kind, Payload, Payloads, Progress, Refusal};
 
-/// How a small part is ground.
+/// Returns a pass for a small part.
 pub fn pass() -> Pass {
     Pass {
         spark_out_passes: 1,
@@ -18,7 +18,7 @@ pub fn pass() -> Pass {
     }
 }
 
-/// A measuring machine whose probe touches exactly where it was told to, or a grinder that only says what it did.
+/// Measuring machine whose probe touches exactly the target, or a grinder that only reports its commands.
 pub struct Toy {
     kind: Kind,
     payloads: Payloads,
@@ -26,14 +26,14 @@ pub struct Toy {
     done: u32,
     points_a_second: f64,
     moved_s: f64,
-    /// Gives its points in counts of a nanometre.
+    /// True if the machine gives its points in counts of a nanometre.
     in_counts: bool,
-    /// Does not get further than so many.
+    /// Maximum number of points that it reaches.
     most: u32,
 }
 
 impl Toy {
-    /// A machine that measures, or works off thousandths of its path, at a speed.
+    /// Returns a machine that measures, or executes thousandths of its path, at this speed.
     pub fn new(kind: Kind, points_a_second: f64) -> Self {
         Self {
             kind,
@@ -47,12 +47,12 @@ impl Toy {
         }
     }
 
-    /// The same machine with its points in counts of a nanometre.
+    /// Returns the same machine with its points in counts of a nanometre.
     pub fn in_counts(self) -> Self {
         Self { in_counts: true, ..self }
     }
 
-    /// The same machine, which does not get further than so many points.
+    /// Returns the same machine, which stops after this number of points.
     pub fn up_to(self, most: u32) -> Self {
         Self { most, ..self }
     }
@@ -62,7 +62,7 @@ impl Toy {
         plan.map_or(1000, |plan| ((plan.bytes.len() - 64) / 56) as u32)
     }
 
-    /// Bytes of a point.
+    /// Returns the number of bytes of a point.
     fn size(&self) -> usize {
         if self.in_counts { 20 } else { 32 }
     }
@@ -86,7 +86,7 @@ impl Toy {
         records
     }
 
-    /// What is in the outbox, with these records.
+    /// Returns the content of the outbox, with these records.
     fn left(&self, bytes: Vec<u8>) -> body::Outcome {
         let cmm = self.kind == Kind::Cmm;
         let (format, scale_mm) = if self.in_counts { (2, 1e-6) } else { (1, 1.0) };

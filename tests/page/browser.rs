@@ -1,4 +1,4 @@
-//! A browser without a window, by the pipe on which Chromium listens: a message of JSON, then a zero byte.
+//! Headless browser, driven by the pipe of Chromium's remote debugging: a JSON message, then a zero byte.
 
 use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, Write};
@@ -16,16 +16,16 @@ pub struct Browser {
     to: File,
     from: Receiver<Value>,
     sent: u64,
-    /// What happened while something else was waited for.
+    /// Events that arrived during a wait for something else.
     pub events: Vec<Value>,
 }
 
 impl Browser {
-    /// Starts one that keeps what it keeps in a folder.
+    /// Starts a browser that keeps its profile in a folder.
     pub fn start(folder: &Path) -> Self {
         let [to, from] = ["to", "from"].map(|name| folder.join(name).display().to_string());
         assert!(Command::new("mkfifo").args([&to, &from]).status().unwrap().success());
-        // The shell gives it the two pipes as the descriptors on which it listens and speaks.
+        // The shell passes the two pipes as the descriptors on which the browser reads and writes.
         let command = "exec chromium --headless=new --no-sandbox --remote-debugging-pipe --user-data-dir=\"$3\" --no-first-run --disable-background-networking --disable-component-update --disable-sync \
                        --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader 3<\"$1\" 4>\"$2\"";
         let child = Command::new("sh")
@@ -35,7 +35,7 @@ impl Browser {
             .stderr(Stdio::null())
             .spawn()
             .unwrap();
-        // Each waits until the other end is opened, in the order in which the shell opens them.
+        // Each open blocks until the other end is opened, in the order in which the shell opens them.
         let to = OpenOptions::new().write(true).open(to).unwrap();
         let mut reader = BufReader::new(File::open(from).unwrap());
         let (heard, from) = channel();
@@ -89,7 +89,7 @@ impl Browser {
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        // It may have ended already.
+        // The process has possibly ended already.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
@@ -104,7 +104,7 @@ impl Tab {
         browser.send(Some(&self.session), method, params)
     }
 
-    /// What an expression comes to in the page; null where it cannot be had yet.
+    /// Returns the value of an expression in the page; null if it is not available yet.
     pub fn read(&self, browser: &mut Browser, expression: &str) -> Value {
         let params = json!({ "expression": expression, "awaitPromise": true, "returnByValue": true });
         self.send(browser, "Runtime.evaluate", params)["result"]["value"].clone()
@@ -122,7 +122,8 @@ impl Tab {
         }
     }
 
-    /// Clicks what there is as soon as it listens: what the page's scripts hang on it comes after what it shows.
+    /// Clicks an element as soon as it listens: the scripts of the page attach their handlers after the element is
+    /// visible.
     pub fn click(&self, browser: &mut Browser, selector: &str) {
         self.until(
             browser,
@@ -133,7 +134,7 @@ impl Tab {
         self.read(browser, &format!("document.querySelector('{selector}').click()"));
     }
 
-    /// Presses a key: its name, its code, and what it types.
+    /// Presses a key, given by its name, its code, and the text that it types.
     pub fn press(&self, browser: &mut Browser, key: &str, code: u32, text: &str) {
         self.until(browser, "document.readyState == 'complete'");
         for kind in ["keyDown", "keyUp"] {
@@ -145,7 +146,7 @@ impl Tab {
         }
     }
 
-    /// Errors of the scripts, what the console was told of them, and requests that left this computer.
+    /// Returns script errors, messages in the console, and requests that left this computer.
     pub fn problems(&self, browser: &Browser) -> Vec<String> {
         let of_this = browser.events.iter().filter(|event| event["sessionId"] == self.session.as_str());
         let problem = |event: &Value| {

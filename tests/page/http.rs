@@ -1,4 +1,4 @@
-//! A client that says exactly what it is told to, and keeps the cookies that it is given.
+//! HTTP client that sends exactly the given bytes, and keeps the cookies that it receives.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -10,7 +10,7 @@ use rustls::{ClientConfig, ClientConnection, StreamOwned};
 
 use serde_json::Value;
 
-/// An answer.
+/// HTTP response.
 #[derive(Debug)]
 pub struct Answer {
     pub status: u16,
@@ -23,19 +23,19 @@ impl Answer {
         String::from_utf8_lossy(&self.body).into_owned()
     }
 
-    /// The values of a header.
+    /// Returns the values of a header.
     pub fn header(&self, name: &str) -> Vec<&str> {
         let pairs = self.head.lines().filter_map(|line| line.split_once(':'));
         pairs.filter(|(known, _)| known.eq_ignore_ascii_case(name)).map(|(_, value)| value.trim()).collect()
     }
 }
 
-/// Sends a request as it stands, and reads the answer to its end.
+/// Sends a request unchanged, and reads the response to its end.
 pub fn raw(place: &str, request: &[u8]) -> Answer {
     asked(connected(place), request)
 }
 
-/// Sends a request over an encrypted line to a host that proves its name.
+/// Sends a request over TLS to a host that proves its name.
 pub fn raw_by_tls(place: &str, tls: &Arc<ClientConfig>, name: &str, request: &[u8]) -> Answer {
     let client = ClientConnection::new(Arc::clone(tls), ServerName::try_from(name.to_owned()).unwrap()).unwrap();
     asked(StreamOwned::new(client, connected(place)), request)
@@ -48,10 +48,10 @@ fn connected(place: &str) -> TcpStream {
 }
 
 fn asked(mut stream: impl Read + Write, request: &[u8]) -> Answer {
-    // A server that does not like the name says so by closing.
+    // A server that rejects the name closes the connection.
     let _ = stream.write_all(request);
     let mut bytes = Vec::new();
-    // A server may close on who says too much.
+    // A server closes the connection if a request is too long.
     let _ = stream.read_to_end(&mut bytes);
     let end = bytes.windows(4).position(|four| four == b"\r\n\r\n").map_or(bytes.len(), |at| at + 4);
     let head = String::from_utf8_lossy(&bytes[..end]).into_owned();
@@ -59,24 +59,24 @@ fn asked(mut stream: impl Read + Write, request: &[u8]) -> Answer {
     Answer { status, head, body: bytes[end..].to_vec() }
 }
 
-/// A browser, but for its eyes.
+/// Browser without a display.
 #[derive(Clone, Debug)]
 pub struct Visitor {
     pub place: String,
     pub cookies: String,
     pub language: String,
-    /// What it trusts, and the name by which it knows the page, where the line is encrypted.
+    /// Trusted certificates, and the name by which the client knows the page, if the connection is encrypted.
     pub tls: Option<(Arc<ClientConfig>, String)>,
 }
 
 impl Visitor {
-    /// One that has no key.
+    /// Returns a visitor without a key.
     pub fn stranger(url: &str) -> Self {
         let place = url.trim_start_matches("http://").split('/').next().unwrap().to_owned();
         Self { place, cookies: String::new(), language: "en".into(), tls: None }
     }
 
-    /// One that came by the address with the key.
+    /// Returns a visitor that opened the address with the key.
     pub fn with_key(url: &str) -> Self {
         let mut visitor = Self::stranger(url);
         let path = url.trim_start_matches("http://").trim_start_matches(&visitor.place).to_owned();
@@ -87,7 +87,7 @@ impl Visitor {
         visitor
     }
 
-    /// One that signs in with a name and a password; none where that is refused.
+    /// Returns a visitor that signed in with a name and a password; none if the page refuses.
     pub fn signed_in(url: &str, name: &str, password: &str) -> Option<Self> {
         let visitor = Self::stranger(url);
         visitor.sign_in(name, password)
@@ -107,7 +107,7 @@ impl Visitor {
         self.post("/sign-in", &[form, ("Origin", &self.origin())], body.as_bytes())
     }
 
-    /// The name and port by which it asks for the page.
+    /// Returns the host name and port of the requests.
     pub fn host(&self) -> String {
         let port = self.place.rsplit(':').next().unwrap();
         self.tls.as_ref().map_or(self.place.clone(), |(_, name)| format!("{name}:{port}"))
@@ -143,14 +143,14 @@ impl Visitor {
         self.ask(&[head.as_bytes(), body].concat())
     }
 
-    /// A token for the next order.
+    /// Returns a token for the next order.
     pub fn token(&self) -> String {
         let answer = self.get("/token");
         assert_eq!(answer.status, 200, "{answer:?}");
         answer.text()
     }
 
-    /// Gives an order as the page does; returns whether it was taken, and what was said to it.
+    /// Gives an order as the page does. Returns the status, whether the order was accepted, and the message.
     pub fn order(&self, run: &str, order: &Value) -> (u16, bool, String) {
         self.give(&format!("/runs/{run}/orders"), order.to_string().as_bytes())
     }

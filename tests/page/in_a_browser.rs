@@ -1,4 +1,4 @@
-//! The page as a person has it before them.
+//! The page in a browser, as a person sees it.
 
 use serde_json::json;
 
@@ -12,7 +12,7 @@ fn banner(word: &str) -> String {
     format!("document.querySelector('#banner').innerText.includes('{word}')")
 }
 
-/// How many different colours a canvas shows.
+/// Returns the expression for the number of different colours on a canvas.
 fn colours(canvas: &str) -> String {
     format!(
         "(() => {{ const c = document.querySelector('{canvas}'); const k = document.createElement('canvas'); k.width = c.width; \
@@ -41,7 +41,7 @@ fn a_cell_is_held_gone_on_with_and_aborted_and_every_tab_shows_it() {
     second.until(&mut browser, &banner("HELD"));
     tab.click(&mut browser, "[data-order=resume]");
     second.until(&mut browser, &banner("RUNNING"));
-    // On a telephone too all of it is on the screen.
+    // On a phone too, all of it is on the screen.
     let ends = second.read(&mut browser, "document.querySelector('.simulation').getBoundingClientRect().right");
     assert!(ends.as_f64().unwrap() <= 390.0, "{ends}");
     second.click(&mut browser, "[data-order=abort]");
@@ -58,7 +58,7 @@ fn a_cell_is_held_gone_on_with_and_aborted_and_every_tab_shows_it() {
 fn a_run_is_watched_to_its_acceptance_and_its_map_and_relief_are_drawn() {
     let home = tempfile::tempdir().unwrap();
     let mut shown = Shown::begin(home.path(), 200.0);
-    // So that it waits for the browser, however long that takes to start.
+    // Hold the run, so that it waits for the browser, however long that takes to start.
     let held = crate::program::run(&["hold", &shown.folder.display().to_string()], home.path());
     assert_eq!(held.0, 0, "{held:?}");
     let mut browser = Browser::start(home.path());
@@ -132,7 +132,7 @@ fn a_page_whose_cell_is_killed_says_so_and_offers_no_order() {
         &mut browser,
         "[...document.querySelectorAll('.orders [data-order]')].every((button) => button.disabled)",
     );
-    // A tab that is opened later says the same: data end where the record does, not where somebody began to look.
+    // A tab that opens later shows the same: data end with the record, not at the time of opening.
     let ended = "Date.parse(JSON.parse(document.getElementById('data').textContent).state.last)";
     tab.until(&mut browser, &format!("Date.now() - {ended} > 1500"));
     let later = browser.open(&format!("{}runs/{}", shown.visitor().origin() + "/", shown.id), SCREEN);
@@ -154,7 +154,7 @@ fn the_keyboard_alone_aborts_a_run() {
     tab.until(&mut browser, &banner("RUNNING"));
     tab.until(&mut browser, "!document.querySelector('[data-order=abort]').disabled");
     tab.send(&mut browser, "Page.bringToFront", json!({}));
-    // A window of a machine at its limits may come to the front late; the page is typed to all the same.
+    // On a computer at full load, a window can come to the front late. The page receives the keys anyway.
     tab.send(&mut browser, "Emulation.setFocusEmulationEnabled", json!({ "enabled": true }));
     let is_there = |browser: &mut Browser| tab.read(browser, "document.activeElement.dataset.order") == "abort";
     let mut presses = 0;
@@ -185,9 +185,9 @@ fn somebody_signs_in_over_tls_and_sees_what_their_role_may_order() {
     let url = url.replace("cell-2.example", "127.0.0.1");
     let mut browser = Browser::start(home.path());
     let tab = browser.open("about:blank", SCREEN);
-    // The certificate is one of the test's own making.
+    // The test made the certificate itself.
     tab.send(&mut browser, "Security.setIgnoreCertificateErrors", json!({ "ignore": true }));
-    // On a line on which scripts come later than what they hang on.
+    // On a connection on which scripts arrive later than the elements that they attach to.
     let slow = json!({ "offline": false, "latency": 150, "downloadThroughput": -1, "uploadThroughput": -1 });
     tab.send(&mut browser, "Network.emulateNetworkConditions", slow);
     tab.send(&mut browser, "Page.navigate", json!({ "url": url }));
@@ -246,7 +246,7 @@ fn axe_finds_nothing_serious_in_any_appearance() {
     }
 }
 
-/// The pictures in the documentation, as the page is now.
+/// Makes the pictures in the documentation from the current page.
 #[test]
 #[ignore = "writes into docs"]
 fn pictures_are_made() {
@@ -260,7 +260,7 @@ fn pictures_are_made() {
     tab.until(&mut browser, "document.querySelectorAll('#cycle option').length > 0");
     tab.until(&mut browser, "document.querySelector('progress') && document.querySelector('progress').value > 300");
     let picture = |tab: &Tab, browser: &mut Browser, name: &str| {
-        // A moment for the last bytes to be painted; the picture is looked at before it is kept.
+        // Wait for the last bytes to be painted. The picture is checked before it is kept.
         std::thread::park_timeout(std::time::Duration::from_secs(1));
         let shot = tab.send(browser, "Page.captureScreenshot", json!({ "format": "png" }));
         let decode = format!("base64 -d > '{}'", root().join("docs").join(name).display());

@@ -1,7 +1,7 @@
-//! The page of a cell: who is let in, what it shows, and what comes of its orders.
+//! The page of a cell: who has access, what it shows, and the effects of its orders.
 //!
-//! Every run here is the program itself with its simulated machines, every page the program that serves it. What needs a browser asks
-//! for one: Debian package chromium. Signals and modes are Unix's.
+//! Every run here is the program itself with its simulated machines, and every page is the program that serves it.
+//! Tests that need a browser look for Debian package chromium. Signals and file modes are Unix only.
 #![cfg(unix)]
 
 #[path = "../common/keep.rs"]
@@ -21,22 +21,22 @@ use std::path::{Path, PathBuf};
 use http::Visitor;
 use program::{Running, regrind, small_recipe};
 
-/// The line of a recipe behind which the speed of its machines may stand.
+/// Line of a recipe after which a test inserts the speed of its machines.
 const SPEED: &str = "[simulation]\nseed = 1";
 
-/// A cell that is at work, and its page.
+/// Cell at work, and its page.
 struct Shown {
     run: Running,
     page: Running,
-    /// The address that opens the page, with its key.
+    /// Address that opens the page, with its key.
     url: String,
     folder: PathBuf,
-    /// The name of the run.
+    /// Name of the run.
     id: String,
 }
 
 impl Shown {
-    /// Begins a run whose machines are so many times as fast as real ones.
+    /// Begins a run whose machines are `speed` times as fast as real ones.
     fn begin(home: &Path, speed: f64) -> Self {
         Self::of(home, &small_recipe(home, speed))
     }
@@ -57,7 +57,7 @@ impl Shown {
     }
 }
 
-/// Serves the page of the runs below a folder; returns the address that opens it.
+/// Serves the page of the runs below a folder. Returns the address that opens it.
 fn serve(home: &Path) -> (Running, String) {
     serve_with(home, &["--listen", "127.0.0.1:0"])
 }

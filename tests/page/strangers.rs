@@ -1,4 +1,4 @@
-//! Who is refused, what becomes of it, and that the cell does not notice.
+//! Refused requests: who is refused, with which answer, and that the cell is not affected.
 
 use std::io::Write;
 use std::net::TcpStream;
@@ -39,7 +39,7 @@ fn orders_that_do_not_come_from_the_page_are_refused_and_on_record_and_the_cell_
         who.post(&path, &headers, body).status
     };
     let own = [("Origin", origin.clone()), ("X-Regrind-Token", token.clone())];
-    // Nobody who lacks the key, the origin or the token; a token is that of one browser.
+    // Refuse a request without the key, the origin or the token. A token belongs to one browser.
     assert_eq!(post(&stranger, &own, stop), 401);
     assert_eq!(post(&visitor, &[], stop), 403);
     assert_eq!(post(&visitor, &with("http://evil.example", &token), stop), 403);
@@ -47,17 +47,17 @@ fn orders_that_do_not_come_from_the_page_are_refused_and_on_record_and_the_cell_
     assert_eq!(post(&visitor, &[("Origin", origin.clone())], stop), 403);
     let other = shown.visitor().token();
     assert_eq!(post(&visitor, &[("Origin", origin.clone()), ("X-Regrind-Token", other)], stop), 403);
-    // An order that somebody has seen on the wire and sends again, to the last byte.
+    // A replay of an order that was seen on the network, identical to the last byte.
     let again = br#"{"order":"clear","device":"cmm"}"#;
     assert_eq!(post(&visitor, &own, again), 200, "for the first time");
     assert_eq!(post(&visitor, &own, again), 403, "for the second");
     let own = || [("Origin", origin.clone()), ("X-Regrind-Token", visitor.token())];
-    // The address with the key, opened once more in the same browser, leaves its other tabs their token.
+    // The address with the key, opened again in the same browser, does not invalidate the token of its other tabs.
     let again = visitor.get(&shown.url[shown.url.find("/?").unwrap()..]);
     let same =
         again.header("set-cookie").iter().all(|cookie| visitor.cookies.contains(cookie.split(';').next().unwrap()));
     assert!(again.status == 303 && same, "{again:?}");
-    // What is no order of the page: those of programs, one that names no state, one too long, nonsense.
+    // Requests that are not orders of the page: those of programs, one that names no state, one too long, nonsense.
     for body in
         [&br#"{"order":"remark","what":"x"}"#[..], br#"{"order":"status"}"#, br#"{"order":"watch"}"#, b"{}", b"\xff\0"]
     {
@@ -111,7 +111,7 @@ fn who_has_no_key_sees_nothing_and_a_thousand_wrong_ones_keep_nobody_out() {
 fn the_pages_of_two_cells_on_one_computer_leave_each_other_their_keys() {
     let [one, other] = [(), ()].map(|()| tempfile::tempdir().unwrap());
     let ((_one, one), (_other, other)) = (serve(one.path()), serve(other.path()));
-    // A browser keeps its cookies by the name of the computer, whatever the port.
+    // A browser stores cookies by the host name, independent of the port.
     let (mut first, second) = (Visitor::with_key(&one), Visitor::with_key(&other));
     let names = |visitor: &Visitor| -> Vec<String> {
         visitor.cookies.split("; ").map(|cookie| cookie.split('=').next().unwrap().to_owned()).collect()
@@ -141,7 +141,7 @@ fn a_request_for_another_host_is_refused_and_what_is_outside_of_the_runs_is_not_
         let request = format!("GET /runs HTTP/1.1\r\nHost: {host}\r\nCookie: {cookies}\r\nConnection: close\r\n\r\n");
         assert_eq!(raw(&visitor.place, request.as_bytes()).status, 421, "{host}");
     }
-    // One of two hosts is none.
+    // A request with two hosts counts as one without.
     let request = format!(
         "GET /runs HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nHost: 127.0.0.1:{port}\r\nCookie: {cookies}\r\nConnection: close\r\n\r\n"
     );
@@ -179,7 +179,7 @@ fn clients_that_never_finish_a_request_do_not_keep_others_waiting() {
     drop(slow);
 }
 
-/// As many as the page once had room for, each with its header whole and its body never.
+/// Opens as many connections as the page once had room for, each with a complete header and an unfinished body.
 #[test]
 fn orders_that_are_never_finished_keep_nobody_out() {
     let home = tempfile::tempdir().unwrap();
@@ -195,7 +195,7 @@ fn orders_that_are_never_finished_keep_nobody_out() {
     let slow: Vec<_> = (0..512)
         .map(|_| {
             let mut stream = TcpStream::connect(&before.place).unwrap();
-            // The page may have given it up already.
+            // The page has possibly closed the connection already.
             let _ = stream.write_all(unfinished.as_bytes());
             stream
         })
@@ -221,7 +221,7 @@ fn one_screen_has_control_every_screen_makes_safe_and_taking_over_is_on_record()
     comes_to(&mut shown, "Held");
     assert!(one.order(&shown.id, &resume(&shown.folder)).1, "nobody had control");
     comes_to(&mut shown, "Execute");
-    // The other screen makes safe, and lets nothing move.
+    // The other screen can bring the cell to a safe state, but cannot make anything move.
     assert!(other.order(&shown.id, &json!({ "order": "hold", "reason": "" })).1);
     comes_to(&mut shown, "Held");
     let refused = other.order(&shown.id, &resume(&shown.folder));

@@ -1,4 +1,5 @@
-//! People who sign in, from this computer and from others: who is let in, what their roles let them order, and what is on record.
+//! People who sign in, from this computer and from others: who has access, which orders their roles allow, and what is
+//! on record.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -13,10 +14,10 @@ use crate::http::{Visitor, raw_by_tls};
 use crate::program::{Running, records_with, regrind, run, small_recipe};
 use crate::{Shown, serve_with};
 
-/// What somebody who was seen to type it cannot guess.
+/// Password that somebody who watched it being typed cannot guess.
 pub const PASSWORD: &str = "grindstone 17 öl";
 
-/// Adds a person as at a terminal, their password out of a pipe.
+/// Adds a person as at a terminal, with the password from a pipe.
 pub fn add(home: &Path, name: &str, role: &str, password: &str) -> (i32, String) {
     let mut command = regrind(&["users", "add", name, "--role", role], home);
     let mut child = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
@@ -25,7 +26,7 @@ pub fn add(home: &Path, name: &str, role: &str, password: &str) -> (i32, String)
     (ended.status.code().unwrap(), String::from_utf8(ended.stderr).unwrap())
 }
 
-/// A cell at work whose page has users, one of each role by the name of the role.
+/// Returns a cell at work whose page has users, one for each role, named after the role.
 fn shown_to_users(home: &Path) -> Shown {
     for role in ["viewer", "quality", "operator", "engineer"] {
         assert_eq!(add(home, role, role, PASSWORD).0, 0, "{role}");
@@ -48,7 +49,7 @@ fn a_list_of_users_is_kept_and_says_what_is_wrong_with_it() {
     assert!(written.contains("$argon2id$v=19$m=19456,t=2,p=1$") && !written.contains("grindstone"), "{written}");
     let (code, told, _) = run(&["users", "list"], home.path());
     assert_eq!((code, told.as_str()), (0, "engineer   A. Smith\noperator   王 芳\n"));
-    // What is no name and no password changes nothing.
+    // An invalid name or password changes nothing.
     for (name, password, expected) in
         [("A. Smith", "short", "10 to 256"), ("", PASSWORD, "1 to 64"), ("A\u{202e}B", PASSWORD, "turns what is read")]
     {
@@ -60,7 +61,7 @@ fn a_list_of_users_is_kept_and_says_what_is_wrong_with_it() {
     assert!(code == 2 && errors.contains("Nobody"), "{errors}");
     assert_eq!(run(&["users", "remove", "王 芳"], home.path()).0, 0);
     assert_eq!(run(&["users", "list"], home.path()).1, "engineer   A. Smith\n");
-    // A list that somebody has broken keeps the page shut.
+    // A damaged list of users keeps the page closed.
     for (text, expected) in [
         ("[[user]]\nname = \"a\"\nrole = \"king\"\nproof = \"\"", "unknown variant `king`"),
         ("[[user]]\nname = \"a\"\nrole = \"viewer\"\nproof = \"secret\"", "user 1 (\"a\")"),
@@ -146,7 +147,7 @@ fn a_thousand_wrong_passwords_let_nobody_in_are_on_record_and_leave_the_cell_alo
     shown.run.line("grinding", |line| line.contains("grinding"));
     let signed_in = Visitor::signed_in(&shown.url, "operator", PASSWORD).unwrap();
     let stranger = Visitor::stranger(&shown.url);
-    // Nothing of the page without signing in, and no key that would do instead.
+    // No part of the page is available without signing in, and no key replaces it.
     for path in ["/", "/runs", "/token", "/?key=0", &format!("/runs/{}/events", shown.id)] {
         let answer = stranger.get(path);
         assert!(answer.status == 401 && answer.text().contains("name=\"password\""), "{path}: {answer:?}");
@@ -160,9 +161,9 @@ fn a_thousand_wrong_passwords_let_nobody_in_are_on_record_and_leave_the_cell_alo
     assert!(tries[..10].iter().all(|status| *status == 401), "{:?}", &tries[..10]);
     assert!(tries[10..].iter().filter(|status| **status == 429).count() > 900, "{tries:?}");
     assert!(tries.iter().all(|status| [401, 429].contains(status)), "{tries:?}");
-    // Others at that place sign in, which is told where the page is served.
+    // Other users at that place can sign in; the process that serves the page logs this.
     assert!(Visitor::signed_in(&shown.url, "engineer", PASSWORD).is_some());
-    // Who has signed in stays in, and gives orders.
+    // A user who has signed in stays signed in, and gives orders.
     assert!(signed_in.order(&shown.id, &json!({ "order": "stop", "reason": "" })).1);
     assert_eq!(shown.run.end().0, 1);
     let remarks = records_with(&shown.folder, "remark");
@@ -194,13 +195,14 @@ fn who_is_taken_off_the_list_or_signs_out_is_out_at_once() {
     let token = stays.token();
     let out = stays.post("/sign-out", &[("Origin", &stays.origin()), ("X-Regrind-Token", &token)], b"");
     assert_eq!((out.status, stays.get("/runs").status), (204, 401));
-    // A list that cannot be read lets nobody in.
+    // If the list cannot be read, nobody has access.
     let stays = Visitor::signed_in(&url, "stays", PASSWORD).unwrap();
     std::fs::write(home.path().join("users.toml"), "broken").unwrap();
     assert_eq!(stays.get("/runs").status, 401);
 }
 
-/// A certificate for `cell-2.example` and its key, as files, and what trusts it alone.
+/// Returns a certificate for `cell-2.example` and its key, as files, and a configuration that trusts only this
+/// certificate.
 pub fn certificate(home: &Path) -> (String, String, Arc<ClientConfig>) {
     let made = rcgen::generate_simple_self_signed(["cell-2.example".to_owned(), "127.0.0.1".to_owned()]).unwrap();
     let [certificate, key] = ["cell.pem", "cell.key"].map(|name| home.join(name).display().to_string());
@@ -244,14 +246,14 @@ fn another_computer_comes_in_by_tls_under_the_names_of_the_certificate_alone() {
     let cookie = at("cell-2.example").try_to_sign_in("A. Smith", PASSWORD);
     assert!(cookie.header("set-cookie")[0].contains("; Secure"), "{cookie:?}");
     assert_eq!(cookie.header("strict-transport-security"), ["max-age=31536000"]);
-    // A name that leads here, and is none of the certificate's; another port; no encryption.
+    // A name that leads here but is not in the certificate; another port; no encryption.
     for host in [format!("evil.example:{port}"), "cell-2.example:1".into(), format!("localhost:{port}")] {
         let request = format!("GET / HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n");
         let answer = raw_by_tls(&visitor.place, &tls, "cell-2.example", request.as_bytes());
         assert_eq!(answer.status, 421, "{host}");
     }
     assert_eq!(Visitor::stranger(&format!("http://127.0.0.1:{port}")).get("/").status, 0);
-    // A certificate that does not go with its key, and files that are none.
+    // A certificate that does not match its key, and files that are not certificates or keys.
     let other = home.path().join("other");
     std::fs::create_dir(&other).unwrap();
     let (_, other_key, _) = self::certificate(&other);

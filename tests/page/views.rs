@@ -1,4 +1,4 @@
-//! What the pages hold, without a browser.
+//! Content of the pages, without a browser.
 
 use crate::http::Visitor;
 use crate::program::{replaced, run, run_folders, small_recipe};
@@ -55,7 +55,7 @@ fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
 
     let map = visitor.get(&format!("/runs/{}/cycles/1/map", ids[0]));
     let count = |at: usize| u32::from_le_bytes(map.body[at..at + 4].try_into().unwrap()) as usize;
-    // An error and its uncertainty a node.
+    // An error and its uncertainty per node.
     assert_eq!(map.body.len(), 40 + 8 * count(0) * count(4));
     let points = visitor.get(&format!("/runs/{}/cycles/1/points", ids[0]));
     assert_eq!(points.body.len(), 300 * 12);
@@ -63,7 +63,7 @@ fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
     assert_eq!(visitor.get(&format!("/runs/{}/cycles/9/map", ids[0])).status, 404);
 }
 
-/// The name of a run in an address, as a browser escapes it.
+/// Returns the name of a run in an address, as a browser escapes it.
 fn escaped(id: &str) -> String {
     id.bytes().map(|byte| format!("%{byte:02X}")).collect()
 }
@@ -105,7 +105,7 @@ fn a_page_for_other_computers_and_one_on_a_port_in_use_are_refused() {
     assert!(code == 2 && errors.contains("--listen"), "{errors}");
 }
 
-/// The probe's radius is told to be another than that on the sphere: the cell is held, and a person ends the run.
+/// The configured radius of the probe differs from that on the sphere: the cell is held, and a person ends the run.
 #[test]
 fn a_run_that_was_stopped_shows_the_alarms_that_it_ended_with() {
     let home = tempfile::tempdir().unwrap();

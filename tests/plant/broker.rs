@@ -1,4 +1,4 @@
-//! A broker of its own for each test: mosquitto, on a port that is kept from other tests meanwhile.
+//! Separate broker for each test: mosquitto, on a port that is reserved against other tests.
 
 use std::fs;
 use std::net::{TcpListener, TcpStream};
@@ -11,7 +11,8 @@ use tempfile::TempDir;
 
 use crate::program::PATIENCE;
 
-/// A port at which nothing listens, that the system gives to nobody by itself, and that is kept from other tests meanwhile.
+/// Port on which nothing listens, which the system does not assign by itself, and which is reserved against other
+/// tests.
 pub struct FreePort {
     pub port: u16,
     _kept: fs::File,
@@ -38,22 +39,22 @@ pub struct Broker {
 }
 
 impl Broker {
-    /// Starts one that lets everybody in.
+    /// Starts a broker that accepts everybody.
     pub fn start() -> Self {
         Self::with("allow_anonymous true\n", |_| {})
     }
 
-    /// Starts one with lines of its own, and files for them in its folder.
+    /// Starts a broker with additional configuration lines, and files for them in its folder.
     pub fn with(lines: &str, files: impl Fn(&Path)) -> Self {
         loop {
             let mut broker = Self { home: TempDir::new().unwrap(), port: FreePort::find(), server: None };
             let folder = broker.home.path();
             files(folder);
             let lines = lines.replace("FOLDER", &folder.display().to_string());
-            // It runs as who began it: its files are for nobody else.
+            // It runs as the user who started it: its files are private.
             let text = format!("user root\npersistence false\nlistener {} 127.0.0.1\n{lines}", broker.port());
             fs::write(folder.join("mosquitto.conf"), text).unwrap();
-            // Somebody else may have taken the port meanwhile.
+            // Another process can take the port in the meantime.
             if broker.try_to_go_on() {
                 return broker;
             }
@@ -64,15 +65,15 @@ impl Broker {
         self.port.port
     }
 
-    /// Starts it again that was killed.
+    /// Restarts the broker after a kill.
     pub fn go_on(&mut self) {
         assert!(self.try_to_go_on(), "{}", self.log());
     }
 
-    /// Kills it as a computer does that loses its power.
+    /// Kills the broker, as a loss of power does.
     pub fn kill(&mut self) {
         let Some(mut server) = self.server.take() else { return };
-        // It may have ended.
+        // The process has possibly ended already.
         let _ = server.kill();
         server.wait().unwrap();
     }
@@ -101,7 +102,7 @@ impl Broker {
         true
     }
 
-    /// What it has said.
+    /// Returns the log of the broker.
     pub fn log(&self) -> String {
         fs::read_to_string(self.home.path().join("log")).unwrap_or_default()
     }
@@ -116,7 +117,7 @@ impl Drop for Broker {
     }
 }
 
-/// Debian has it where only root looks by itself.
+/// Returns the path of the program; Debian installs it where only root's PATH has it.
 fn program() -> PathBuf {
     let there = PathBuf::from("/usr/sbin/mosquitto");
     if there.exists() { there } else { "mosquitto".into() }

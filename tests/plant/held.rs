@@ -1,4 +1,4 @@
-//! A run that stands still while it is looked at.
+//! Run that is held while a test examines it.
 
 use std::path::{Path, PathBuf};
 
@@ -7,7 +7,8 @@ use serde_json::Value;
 
 use crate::program::{Running, regrind, run, small_recipe};
 
-/// A run of the small recipe, its machines so fast, that is held behind its first cycle; its folder, and how it is then.
+/// Starts a run of the small recipe, with machines of this speed, and holds it after its first cycle. Returns the
+/// process, its folder, and its state.
 pub fn held_run(home: &Path, speed: f64) -> (Running, PathBuf, Value) {
     let recipe = small_recipe(home, speed).display().to_string();
     let mut running = Running::new(regrind(&["run", &recipe, "--cell", "sim", "--part", "SN-0042"], home));
@@ -20,7 +21,7 @@ pub fn held_run(home: &Path, speed: f64) -> (Running, PathBuf, Value) {
     (running, folder, held)
 }
 
-/// Waits until it is on record that somebody was refused something; returns where they are.
+/// Waits until a refusal of somebody is on record; returns the station of that record.
 pub fn until_recorded(running: &mut Running, folder: &Path, refused: &str) -> String {
     running.until(refused, |_| {
         let reader = Reader::open(folder).unwrap();
@@ -31,7 +32,7 @@ pub fn until_recorded(running: &mut Running, folder: &Path, refused: &str) -> St
     })
 }
 
-/// Waits until a run is so.
+/// Waits until the state of a run satisfies a condition.
 fn until(running: &mut Running, name: &str, home: &Path, is_so: impl Fn(&Value) -> bool) -> Value {
     running.until("a state", |_| {
         let (code, out, _) = run(&["status", name, "--json"], home);

@@ -1,7 +1,8 @@
-//! Many cells and one database: a real PostgreSQL beside the program itself, with its simulated machines, and whoever would do harm; and the
-//! live values of a cell, as other people's programs see them.
+//! Many cells and one database: a real PostgreSQL and the program itself, with its simulated machines and attackers;
+//! and the live values of a cell, as independent programs see them.
 //!
-//! Each test says what it asks for: PostgreSQL (Debian package postgresql), mosquitto, Python. Sockets in the file system and modes are Unix's.
+//! Each test names its requirement: PostgreSQL (Debian package postgresql), mosquitto, Python. Sockets in the file
+//! system and file modes are Unix only.
 #![cfg(unix)]
 
 #[path = "../common/keep.rs"]
@@ -34,7 +35,7 @@ use program::run;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// A plant that is laid out, and a folder for whoever is in it.
+/// Initialized plant, and a folder for its members.
 struct Plant {
     postgres: Postgres,
     home: TempDir,
@@ -54,7 +55,7 @@ impl Plant {
         self.home.path().join(name)
     }
 
-    /// Writes the plant file of somebody, whose password lies beside it.
+    /// Writes the plant file of a member, with the password in a file next to it.
     fn write_file(&self, name: &str, role: &str, more: &str) {
         let cell = if more.is_empty() { String::new() } else { format!("cell = \"{more}\"\n") };
         let socket = self.postgres.socket();
@@ -65,13 +66,13 @@ impl Plant {
         fs::write(self.path(&format!("{name}.toml")), text).unwrap();
     }
 
-    /// Enrols a cell; its plant file is called as it is.
+    /// Enrols a cell; its plant file has its name.
     fn cell(&self, name: &str, more: &[&str]) {
         self.enrol(name, "cell", more);
         self.write_file(name, &name.replace('-', "_"), name);
     }
 
-    /// Enrols somebody, whose plant file is called so.
+    /// Enrols a person, whose plant file has this name.
     fn somebody(&self, name: &str, what: &str) {
         self.enrol(name, what, &[]);
         self.write_file(name, &name.replace('-', "_"), "");
@@ -87,30 +88,30 @@ impl Plant {
         fs::read_to_string(self.path(&format!("{name}.password"))).unwrap().trim_end().to_owned()
     }
 
-    /// What the program says when it does what it is asked to.
+    /// Runs a command that must succeed; returns its output.
     fn does(&self, arguments: &[&str]) -> String {
         self.ends(arguments, 0).0
     }
 
-    /// What it says, and what on the error stream, when it ends with a code.
+    /// Runs a command that must end with this exit code; returns its output and its error stream.
     fn ends(&self, arguments: &[&str], code: i32) -> (String, String) {
         let (found, out, errors) = run(arguments, self.home.path());
         assert_eq!(found, code, "{arguments:?}: {out}{errors}");
         (out, errors)
     }
 
-    /// The answer to a question of the owner.
+    /// Returns the answer to a query of the owner.
     fn sql(&self, text: &str) -> String {
         self.postgres.sql("regrind", &format!("SET search_path = regrind; {text}"))
     }
 
-    /// The answer to a question that a cell or somebody asks by its own means.
+    /// Returns the answer to a query by a cell or a person with its own rights.
     fn asked_by(&self, name: &str, text: &str) -> Result<String, String> {
         let role = name.replace('-', "_");
         self.postgres.ask_as(&role, &self.password(name), "regrind", &format!("SET search_path = regrind; {text}"))
     }
 
-    /// What should not have been, the newest last.
+    /// Returns the recorded incidents, the newest last.
     fn incidents(&self) -> Vec<Value> {
         let told = self.does(&["plant", "incidents", "--json", "--plant", "owner.toml"]);
         let mut told: Vec<Value> = serde_json::from_str(&told).unwrap();
@@ -119,7 +120,7 @@ impl Plant {
     }
 }
 
-/// The only run below a folder.
+/// Returns the only run below a folder.
 fn only_run(runs: &Path) -> (PathBuf, String) {
     let run = program::only_run(runs);
     let name = run.file_name().unwrap().to_string_lossy().into_owned();

@@ -1,4 +1,4 @@
-//! A network between cells and their plant, which can be cut: a socket that hands on to another one while it is whole.
+//! Network between cells and their plant that a test can cut: a socket that forwards to another one while it is intact.
 
 use std::io::{Read, Write};
 use std::net::Shutdown;
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 
-/// What both ends of a network share.
+/// State that both ends of a network share.
 #[derive(Default)]
 struct Lines {
     is_cut: AtomicBool,
@@ -17,14 +17,14 @@ struct Lines {
 pub struct Network(Arc<Lines>);
 
 impl Network {
-    /// Listens at one socket and hands on to another. It ends with the test.
+    /// Listens at one socket and forwards to another. It ends with the test.
     pub fn between(here: &Path, there: PathBuf) -> Self {
         let lines = Arc::new(Lines::default());
         let listener = UnixListener::bind(here).unwrap();
         let shared = Arc::clone(&lines);
         std::thread::spawn(move || {
             for near in listener.incoming().map_while(Result::ok) {
-                // Whoever comes through a cut network finds nobody.
+                // A connection through a cut network is not accepted.
                 let Ok(far) = UnixStream::connect(&there) else { continue };
                 shared.join(near, far);
             }
@@ -32,11 +32,11 @@ impl Network {
         Self(lines)
     }
 
-    /// Cuts what is under way, in the middle of whatever it says, and lets nothing through.
+    /// Cuts all open connections, in the middle of a message if necessary, and accepts no new ones.
     pub fn cut(&self) {
         self.0.is_cut.store(true, Ordering::SeqCst);
         for line in self.0.open.lock().unwrap().drain(..) {
-            // It may have ended by itself.
+            // The connection has possibly ended by itself.
             let _ = line.shutdown(Shutdown::Both);
         }
     }
@@ -60,7 +60,7 @@ impl Lines {
     }
 }
 
-/// Hands on what comes until either end goes.
+/// Forwards data until either end closes.
 fn hand_on(mut from: UnixStream, mut to: UnixStream) {
     let mut some = [0; 1 << 14];
     while let Ok(read) = from.read(&mut some) {

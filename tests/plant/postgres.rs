@@ -1,4 +1,5 @@
-//! A PostgreSQL of its own for each test, in a folder that goes with it. It is reached by its socket alone, and by who has a password.
+//! Separate PostgreSQL for each test, in a folder that is deleted with it. It is reachable only by its socket, and only
+//! with a password.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -14,10 +15,10 @@ use tempfile::TempDir;
 
 use crate::program::PATIENCE;
 
-/// The owner of the cluster, and the password by which it signs in.
+/// Owner of the cluster, who signs in with the password below.
 pub const OWNER: &str = "owner";
 const PASSWORD: &str = "of-the-owner";
-/// Nothing listens on it unless somebody asks for TLS: it is a part of the name of the socket.
+/// Port number in the name of the socket. Nothing listens on this port unless a test asks for TLS.
 const PORT: u16 = 5432;
 
 pub struct Postgres {
@@ -25,14 +26,14 @@ pub struct Postgres {
     bin: PathBuf,
     server: Option<Child>,
     port: u16,
-    /// User and group that it runs as, where this is root, which it does not run as.
+    /// User and group that the server runs as if the test runs as root, because the server refuses root.
     runs_as: Option<(u32, u32)>,
-    /// What others may still be copied from.
+    /// Cluster that other servers can still be copied from.
     copied_from: Option<Arc<TempDir>>,
 }
 
 impl Postgres {
-    /// Starts one with an empty database.
+    /// Starts a server with an empty database.
     pub fn start() -> Self {
         let home = TempDir::new().unwrap();
         fs::set_permissions(home.path(), fs::Permissions::from_mode(0o755)).unwrap();
@@ -55,7 +56,7 @@ impl Postgres {
         postgres
     }
 
-    /// An empty cluster, made once for all that are copied from it side by side: making it takes seconds.
+    /// Makes an empty cluster, once for all parallel tests that copy it: making it takes seconds.
     fn made(&self, password: &Path) -> Arc<TempDir> {
         static MADE: Mutex<Weak<TempDir>> = Mutex::new(Weak::new());
         let mut kept = MADE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -74,7 +75,7 @@ impl Postgres {
         made
     }
 
-    /// Starts the server again that was stopped or killed.
+    /// Restarts the server after a stop or a kill.
     pub fn go_on(&mut self) {
         self.go_on_with(&[]);
         let began = Instant::now();
@@ -84,7 +85,7 @@ impl Postgres {
         }
     }
 
-    /// Starts the server anew so that it is reached from elsewhere by TLS as well, by a certificate and its key. Returns the port.
+    /// Restarts the server so that it is also reachable by TLS, with a certificate and its key. Returns the port.
     pub fn go_on_by_tls(&mut self, certificate: &Path, key: &Path) -> u16 {
         let kept = ["server.pem", "server.key"].map(|name| self.home.path().join(name));
         for (from, to) in [certificate, key].into_iter().zip(&kept) {
@@ -95,7 +96,7 @@ impl Postgres {
         let [certificate, key] = kept.map(|path| path.display().to_string());
         for _ in 0..50 {
             self.kill();
-            // Somebody else may have it by the time that the server asks for it: then another is tried.
+            // Another process can take the port before the server does: then try another one.
             let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
             let tls = format!("ssl_cert_file={certificate}");
             let key = format!("ssl_key_file={key}");
@@ -126,21 +127,21 @@ impl Postgres {
         self.server = Some(server);
     }
 
-    /// Kills the server as a computer does that loses its power, with all that belongs to it.
+    /// Kills the server with all its processes, as a loss of power does.
     pub fn kill(&mut self) {
         let Some(mut server) = self.server.take() else { return };
-        // Of itself it ends what it began: an immediate shutdown writes nothing more.
+        // The server ends its own child processes: an immediate shutdown writes nothing more.
         let ended = Command::new("sh").args(["-c", &format!("kill -QUIT {}", server.id())]).status().unwrap();
         assert!(ended.success());
         server.wait().unwrap();
     }
 
-    /// The answer to a question of the owner, a line a row.
+    /// Returns the answer to a query of the owner, one line per row.
     pub fn sql(&self, database: &str, text: &str) -> String {
         self.ask_as(OWNER, PASSWORD, database, text).unwrap_or_else(|error| panic!("{text}: {error}"))
     }
 
-    /// The answer to a question that somebody asks, or why there is none.
+    /// Returns the answer to a query of a role, or the error.
     pub fn ask_as(&self, role: &str, password: &str, database: &str, text: &str) -> Result<String, String> {
         let mut psql = Command::new(self.bin.join("psql"));
         psql.args([
@@ -163,7 +164,7 @@ impl Postgres {
         if asked.status.success() { Ok(text(asked.stdout)) } else { Err(text(asked.stderr)) }
     }
 
-    /// A program of PostgreSQL, signed in as the owner.
+    /// Returns a command of PostgreSQL, signed in as the owner.
     pub fn tool(&self, name: &str) -> Command {
         let mut tool = Command::new(self.bin.join(name));
         tool.args(["-U", OWNER, "-p", &self.port.to_string()]).arg("-h").arg(self.socket());
@@ -171,17 +172,17 @@ impl Postgres {
         tool
     }
 
-    /// The folder of the socket, which is its host.
+    /// Returns the folder of the socket, which is its host.
     pub fn socket(&self) -> PathBuf {
         self.home.path().join("socket")
     }
 
-    /// The socket itself.
+    /// Returns the path of the socket.
     pub fn socket_file(&self) -> PathBuf {
         self.socket().join(format!(".s.PGSQL.{}", self.port))
     }
 
-    /// Where the password of the owner stands.
+    /// Writes the password of the owner to a file.
     pub fn write_owner_password(&self, file: &Path) {
         fs::write(file, PASSWORD).unwrap();
         fs::set_permissions(file, fs::Permissions::from_mode(0o600)).unwrap();
@@ -195,7 +196,7 @@ impl Postgres {
         self.home.path().join("data")
     }
 
-    /// Whether it lets somebody in: its socket is there before it does.
+    /// Returns true if the server accepts connections: its socket exists before it does.
     fn answers(&self) -> bool {
         UnixStream::connect(self.socket_file()).is_ok() && self.ask_as(OWNER, PASSWORD, "postgres", "SELECT 1").is_ok()
     }
@@ -206,12 +207,12 @@ impl Postgres {
         }
     }
 
-    /// A program of the server, as who may run it.
+    /// Returns a program of the server, run as the user that is allowed to.
     fn program(&self, name: &str) -> Command {
         self.as_server(self.bin.join(name))
     }
 
-    /// Any program, as the server's user.
+    /// Returns any program, run as the server's user.
     fn as_server(&self, path: impl AsRef<OsStr>) -> Command {
         let Some((user, group)) = self.runs_as else { return Command::new(path) };
         let mut command = Command::new("setpriv");
@@ -230,7 +231,7 @@ impl Drop for Postgres {
     }
 }
 
-/// The folder of the newest server, where Debian has it; else the one whose programs are found.
+/// Returns the folder of the newest server, as Debian installs it; otherwise the one whose programs are on the PATH.
 fn bin() -> PathBuf {
     let versions = fs::read_dir("/usr/lib/postgresql").into_iter().flatten().flatten();
     let newest =
@@ -238,7 +239,7 @@ fn bin() -> PathBuf {
     newest.map(|(_, path)| path.join("bin")).expect("Debian package postgresql")
 }
 
-/// The user `postgres`, where this one is root.
+/// Returns the user `postgres` if the test runs as root.
 fn user() -> Option<(u32, u32)> {
     let id = |of: &str, who: &[&str]| {
         let said = Command::new("id").arg(of).args(who).output().unwrap();
@@ -247,7 +248,7 @@ fn user() -> Option<(u32, u32)> {
     (id("-u", &[]) == 0u32).then(|| (id("-u", &["postgres"]), id("-g", &["postgres"])))
 }
 
-/// Waits for a program that has to succeed.
+/// Waits for a program that must succeed.
 fn done(command: &mut Command) {
     let done = command.output().unwrap();
     assert!(done.status.success(), "{command:?}: {}", String::from_utf8_lossy(&done.stderr));

@@ -1,4 +1,4 @@
-//! Programs that exist already, corrected by a map: `regrind compensate`.
+//! Tests of `regrind compensate`: existing programs, corrected by a map.
 
 use std::fs;
 use std::path::PathBuf;
@@ -13,7 +13,7 @@ use regrind_sim::program::Control;
 const GRID: Grid = Grid { columns: 121, rows: 81, first_mm: [-30.0, -20.0], spacing_mm: [0.5, 0.5] };
 const PART: [u8; 32] = [0xab; 32];
 
-/// A folder with a map of the error over 60 x 40 mm and a program.
+/// Folder with a map of the error over 60 x 40 mm and a program.
 pub struct Shop {
     folder: tempfile::TempDir,
 }
@@ -26,7 +26,7 @@ impl Shop {
         bench
     }
 
-    /// Writes the map as a run does it.
+    /// Writes the map as a run does.
     fn save_error(&self, error: impl Fn(f64, f64) -> f64, ground_with: Option<[u8; 32]>) {
         let values_mm = (0..GRID.len()).map(|k| GRID.place_mm(k)).map(|[x, y]| error(x, y)).collect();
         let map = ErrorMap::known(GRID, values_mm, vec![true; GRID.len()]);
@@ -34,7 +34,7 @@ impl Shop {
         write_error_map(&self.path("map.csv"), &map, &origin, true).unwrap();
     }
 
-    /// Writes a correction as a run does it, which has this map's identity.
+    /// Writes a correction as a run does, with this map's identity.
     fn save_correction(&self, map: [u8; 32]) {
         let identities = CorrectionIdentities { part: PART, map, replaces: [1; 32] };
         write_correction(&self.path("map.csv"), &Correction::none(GRID, 0.02), (&identities, &[]), true).unwrap();
@@ -64,12 +64,13 @@ impl Shop {
     }
 }
 
-/// Steps at feed.
+/// Returns the end points of the moves at feed.
 fn feeds(text: &str) -> Vec<[f64; 3]> {
     read(text).into_iter().filter(|s| s.feed).map(|s| s.at).collect()
 }
 
-/// The largest distance of a polyline from the corrected path over it: z less the error, at every x and y on the way.
+/// Returns the largest distance of a polyline from the corrected path above it: z minus the error, at every x and y on
+/// the way.
 fn worst_mm(points: &[[f64; 3]], z: f64, error: impl Fn(f64, f64) -> f64) -> f64 {
     let mut worst = 0.0f64;
     for pair in points.windows(2) {
@@ -117,7 +118,7 @@ fn rapid_moves_and_machine_coordinates_stay_as_they_are() {
             && text.contains("M8\nG0 Z2.500000\n")
             && text.contains("F200 S3000\n")
     );
-    // After the rapid move the tool is brought to where the corrected path begins.
+    // After the rapid move, the tool moves to the start of the corrected path.
     let points = feeds(&text);
     assert!((points[0][2] - (2.5 - error_mm(0.0, 0.0))).abs() < 1e-6 && points[0][0] == 0.0);
     assert!(worst_mm(&points, 2.5, error_mm) < 1.1e-4);
@@ -222,7 +223,7 @@ fn what_is_in_force_is_written_and_nothing_is_lost() {
         text
     };
     let begin = "G21 G90\nG0 X10 Y0 Z1\nG1 Z0 F300\n";
-    // Lines that many programs begin with, and that change nothing.
+    // Lines at the beginning of many programs that do not change the motion.
     kept(
         "\n%\nN10 G00G21G17G90G40G49G80\nG92.1\nX10Y10Z5\nG1Z0F100\nX20\n%\nnotes: &c.\n",
         &["G1 X20.000000 Y10.000000 Z-0.004000"],
@@ -238,7 +239,7 @@ fn what_is_in_force_is_written_and_nothing_is_lost() {
     let old = Shop::new(|_, _| 0.004, "");
     fs::write(old.path("base.ngc"), [b"(T1 Fr\xe4ser)\n", begin.as_bytes(), b"X20\nM2\n"].concat()).unwrap();
     assert!(old.compensate(&[]).unwrap().contains("(T1 Fr\u{e4}ser)"));
-    // A circle where the map is all but zero begins where it ends.
+    // A circle in a region where the map is almost zero ends at its start.
     let hardly = Shop::new(|_, _| 0.000_04, "G21 G90 G18\nG0 X10 Y10 Z5\nG0 X20 Y20 Z0\nG2 I5 K0 F100\nM2\n");
     assert_eq!(hardly.compensate(&[]).unwrap().matches("\nG2 ").count(), 1);
     // A whole circle under a G3 in force, without an axis.
@@ -259,7 +260,7 @@ fn what_is_in_force_is_written_and_nothing_is_lost() {
 
 #[test]
 fn arcs_of_three_decimals_stay_arcs() {
-    // Ends that rounding puts half a micrometre beside the circle.
+    // Ends that rounding moves half a micrometre off the circle.
     let mut program = String::from("G21 G90 G17\nG0 X14.142 Y0 Z1\nG1 Z0 F300\n");
     for k in 1..=8 {
         let (sine, cosine) = (f64::from(k) * std::f64::consts::FRAC_PI_4).sin_cos();
@@ -316,11 +317,11 @@ fn a_foreign_map_is_used_where_it_is_valid_and_within_reason() {
             .collect();
         fs::write(bench.path("map.csv"), format!("x_mm,y_mm,error_mm,valid\n{rows}")).unwrap();
     };
-    // To the right nothing was measured, and the number there means nothing.
+    // On the right nothing was measured, and the number there has no meaning.
     map(&|i| if i < 2 { "0.004,1".into() } else { "NaN,0".into() });
     let points = feeds(&bench.compensate(&[]).unwrap());
     assert!(points.iter().all(|point| (point[2] + 0.004).abs() < 1e-6 || point[2] > 0.5), "{points:?}");
-    // So it is in a map that names its part, with a mark of Excel's and words of others before it.
+    // The same holds for a map that names its part, with a byte order mark from Excel and other comments before it.
     let text =
         fs::read_to_string(bench.path("map.csv")).unwrap().replace(",valid\n", ",Valid\n").replace(",1\n", ",True\n");
     let named = format!("\u{feff}# part: sha256 {}\n{text}", "ab".repeat(32));
@@ -374,7 +375,7 @@ fn a_map_is_applied_once_and_only_to_its_part() {
     bench.compensate(&[]).unwrap();
     let again = bench.correct("out.ngc", "twice.ngc", &[]).unwrap_err();
     assert!(again.contains("already applied") && !bench.path("twice.ngc").exists(), "{again}");
-    // Another map of the same part goes on top.
+    // A second map of the same part adds to the first.
     let first = fs::read_to_string(bench.path("map.csv")).unwrap();
     fs::write(bench.path("map.csv"), first.replacen(",1\n", ",0\n", 1)).unwrap();
     let both = bench.correct("out.ngc", "both.ngc", &[]).unwrap();
@@ -393,14 +394,14 @@ fn a_map_goes_only_onto_the_program_that_it_was_made_for() {
         fs::write(bench.path("base.ngc"), program(comments)).unwrap();
         bench.compensate(&[]).map(|_| ())
     };
-    // An error that was measured after a pass with a correction belongs on the program with that correction.
+    // An error measured after a pass with a correction applies to the program with that correction.
     bench.save_error(|_, _| 0.001, Some([1; 32]));
     after(&has(&one)).unwrap();
     for comments in [has(&other), String::new(), has(&one) + "(map: 0 everywhere)\n"] {
         let said = after(&comments).unwrap_err();
         assert!(said.contains("another correction than the program has"), "{said}");
     }
-    // A correction is absolute: it does not come on top of another.
+    // A correction is absolute: it does not add to another.
     bench.save_correction([3; 32]);
     after("").unwrap();
     after(&(has(&other) + "(map: 0 everywhere)\n")).unwrap();
@@ -466,7 +467,7 @@ fn along_the_normals_the_ball_leaves_the_corrected_surface() {
         let segments = steps.windows(2).filter(|pair| pair[1].feed && !pair[0].at[0].is_nan());
         let off = segments.map(|pair| {
             let (a, b) = (pair[0].at, pair[1].at);
-            // The centre stands over the tip by the radius.
+            // The centre is above the tip by the radius.
             let from = [q[0] - a[0], q[1] - a[1], q[2] - a[2] - radius];
             let along = [0, 1, 2].map(|k| b[k] - a[k]);
             let length2 = along.iter().map(|c| c * c).sum::<f64>().max(1e-18);

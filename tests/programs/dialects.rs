@@ -1,4 +1,5 @@
-//! Programs in every dialect, read back by controls that share nothing with who wrote them: the simulator's, from what their makers say.
+//! Programs in every dialect, read back by controls that share no code with the writer: those of the simulator, written
+//! from the manufacturers' documentation.
 
 use std::path::Path;
 
@@ -10,10 +11,10 @@ use regrind::formats::gcode::Dialect;
 use regrind_sim::program::{Control, Program, Stop};
 
 const DIALECTS: [&str; 4] = ["linuxcnc", "fanuc", "sinumerik", "heidenhain"];
-/// What a touching place may be off in a program whose points are whole, in millimetres.
+/// Tolerance of a touching place in a program with unrounded points, in millimetres.
 const WITHIN_MM: f64 = 2e-4;
 
-/// How far arcs may be from the path, in millimetres: as far as lines are in these recipes.
+/// Tolerance of arcs from the path, in millimetres: the same as for lines in these recipes.
 const ARCS_WITHIN_MM: f64 = 1e-4;
 
 fn dialect(name: &str) -> Dialect {
@@ -21,7 +22,7 @@ fn dialect(name: &str) -> Dialect {
     read_dialect(&file).unwrap_or_else(|problems| panic!("{problems}")).0
 }
 
-/// Writes the program of a part in a dialect, and has its control read it.
+/// Writes the program of a part in a dialect, and reads it with the control of that dialect.
 fn read_back(part: &mut Part, name: &str) -> (Program, String) {
     part.programs.dialect = dialect(name);
     part.programs.controller_tolerance_mm = Some(part.programs.path_tolerance_mm);
@@ -33,7 +34,7 @@ fn read_back(part: &mut Part, name: &str) -> (Program, String) {
     (program, text)
 }
 
-/// Half of the last digit that a dialect writes.
+/// Returns half of the last digit that a dialect writes.
 fn half_a_step_mm(name: &str) -> f64 {
     0.5 * 10f64.powi(-i32::from(dialect(name).numbers.decimals))
 }
@@ -46,7 +47,7 @@ fn every_control_reads_the_path_of_the_plan_to_half_of_the_last_digit() {
         let (program, text) = read_back(&mut part, name);
         let (path, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
         assert_eq!(program.stops.len() as u64, summary.moves, "{name}");
-        // Both are read from the dialect's file: once, and not for each of a hundred thousand lines.
+        // Read both from the dialect's file once, not for each of a hundred thousand lines.
         let (within_mm, longest_line) = (half_a_step_mm(name) * (1.0 + 1e-6), dialect(name).text.longest_line);
         let mut at = [f64::NAN; 3];
         for (planned, stop) in path.moves().zip(&program.stops) {
@@ -75,13 +76,13 @@ fn every_control_reads_the_path_of_the_plan_to_half_of_the_last_digit() {
     }
 }
 
-/// How far a place is from the way between two stops.
+/// Returns the distance of a place from the path between two stops.
 fn off_the_way(stop: &Stop, from: [f64; 3], place: [f64; 3]) -> f64 {
     let off = |share: f64| {
         let at = stop.on_the_way(from, share);
         (0..3).map(|k| (at[k] - place[k]).powi(2)).sum::<f64>().sqrt()
     };
-    // Along so short a way there is one nearest place.
+    // On such a short path there is only one nearest place.
     let (mut low, mut high) = (0.0, 1.0);
     for _ in 0..60 {
         let (u, v) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
@@ -124,7 +125,7 @@ fn along_its_arcs_every_control_passes_all_points_of_the_plan_within_the_toleran
                 ended = (0..3).all(|k| (at[k] - stop.at_mm[k]).abs() <= 0.51 * step_mm);
                 if stop.turn.is_some() {
                     let off = off_the_way(stop, last, at.into());
-                    // What controls do between two radii that differ is theirs.
+                    // The behaviour of controls between two different radii is their own.
                     assert!(off < ARCS_WITHIN_MM + 2.0 * step_mm, "{name}: {off} at {at}");
                 } else {
                     assert!(ended, "{name}: {at} {stop:?}");

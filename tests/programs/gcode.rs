@@ -1,4 +1,4 @@
-//! What stands in a program, and which parts have none.
+//! Contents of a program, and which parts have none.
 
 use crate::path::{correction, part, part_from_below, read};
 use std::fs;
@@ -47,6 +47,6 @@ fn a_header_says_what_a_person_needs_and_counts_right() {
         let within = |v: f64| v >= summary.least_mm[k] - 1e-6 && v <= summary.most_mm[k] + 1e-6;
         assert!(steps.iter().all(|s| s.at[k].is_nan() || within(s.at[k])));
     }
-    // The wheel comes down and goes up beyond the edge of the part, and travels above it.
+    // The wheel lowers and lifts beyond the edge of the part, and travels above it.
     assert!(text.lines().filter(|line| line.starts_with("G0")).count() > 100);
 }

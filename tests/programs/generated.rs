@@ -1,8 +1,8 @@
-//! Programs that are drawn move by move, with what each move is: whatever `regrind compensate` makes of them is that and the map, or they are
-//! refused.
+//! Random programs, drawn move by move with the truth of each move. `regrind compensate` either adds exactly the map,
+//! or refuses the program.
 //!
-//! The truth of a program comes from the draw, in absolute millimetres; its text says the same by modes, units, planes and centres. Which
-//! programs have something in them that must be refused is known from the draw too.
+//! The truth of a program comes from the draw, in absolute millimetres. Its text expresses the same by modes, units,
+//! planes and centres. The draw also determines which programs contain something that must be refused.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -13,11 +13,11 @@ use crate::sample::seeds;
 use rand::RngExt;
 use regrind_sim::Rng;
 
-/// Beyond the tolerance asked for, a tenth of it, and what six decimals round.
+/// Tolerance, in mm: the requested one, a tenth of it, and the rounding to six decimals.
 const TOLERANCE_MM: f64 = 1.1e-5;
 const DIGIT_MM: f64 = 2e-6;
 
-/// A way at feed: straight, or about a centre in the plane of two axes.
+/// Path at feed: straight, or about a centre in the plane of two axes.
 #[derive(Clone, Copy, Debug)]
 pub struct Way {
     pub from: [f64; 3],
@@ -39,7 +39,7 @@ impl Way {
         at
     }
 
-    /// How far a place is from it.
+    /// Returns the distance of a place from the path.
     fn off(&self, place: [f64; 3]) -> f64 {
         let along: [f64; 3] = std::array::from_fn(|k| self.to[k] - self.from[k]);
         let arm: [f64; 3] = std::array::from_fn(|k| place[k] - self.from[k]);
@@ -49,7 +49,7 @@ impl Way {
             Some(([a, b, _], centre, angle)) => {
                 let turned = |at: [f64; 3]| (at[b] - centre[1]).atan2(at[a] - centre[0]);
                 let turn = (turned(place) - turned(self.from)).rem_euclid(std::f64::consts::TAU);
-                // The end of a whole turn is its beginning too.
+                // The end of a full turn is its beginning too.
                 let forth = if angle > 0.0 { turn } else { (std::f64::consts::TAU - turn) % std::f64::consts::TAU };
                 let near = |share: f64| distance(self.at(share.clamp(0.0, 1.0)), place);
                 let share = forth / angle.abs();
@@ -64,21 +64,21 @@ fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// What a program does, move by move.
+/// Move of a program.
 #[derive(Clone, Debug)]
 pub enum Move {
-    /// Not at feed, to these axes.
+    /// Rapid move to these axes.
     Rapid([Option<f64>; 3]),
-    /// In coordinates of the machine, or to its reference point.
+    /// Move in machine coordinates, or to the reference point.
     Elsewhere,
     Feed(Way),
 }
 
-/// A program that was drawn.
+/// Random program.
 pub struct Drawn {
     pub text: String,
     pub moves: Vec<Move>,
-    /// The line that must be refused, in words, if there is one.
+    /// Description of the line that must be refused, if there is one.
     pub refused: Option<&'static str>,
 }
 
@@ -110,14 +110,14 @@ impl Draw {
         if self.inch { 25.4 } else { 1.0 }
     }
 
-    /// A number as it is written, and what it is in millimetres.
+    /// Returns a number as written, and its value in millimetres.
     fn written(&self, value_mm: f64) -> (String, f64) {
         let text = format!("{:.*}", self.decimals, value_mm / self.unit());
         let value: f64 = text.parse().unwrap();
         (text, value * self.unit())
     }
 
-    /// Axis words for a target, and where they lead.
+    /// Returns the axis words for a target, and the point that they lead to.
     fn axes(&mut self, to: [Option<f64>; 3]) -> (String, [f64; 3]) {
         let (mut text, mut target) = (String::new(), self.at);
         for k in 0..3 {
@@ -129,7 +129,7 @@ impl Draw {
         (text, target)
     }
 
-    /// The word of a motion, which may be left out where it is in force.
+    /// Returns the word of a motion, which can be omitted while it is modal.
     fn word(&mut self, motion: u8) -> String {
         let in_force = self.motion == Some(motion) && self.chance(0.6);
         self.motion = Some(motion);
@@ -201,7 +201,7 @@ impl Draw {
             let half: [f64; 2] = [0.5 * (target[a] - self.at[a]), 0.5 * (target[b] - self.at[b])];
             let chord = half[0].hypot(half[1]);
             let height = (radius * radius - chord * chord).max(0.0).sqrt();
-            // To the left of the chord for the short way to the left.
+            // The centre is to the left of the chord for the short arc to the left.
             let side = if left == (radius > 0.0) { height / chord } else { -height / chord };
             given = [self.at[a] + half[0] - side * half[1], self.at[b] + half[1] + side * half[0]];
         } else {
@@ -227,7 +227,7 @@ impl Draw {
         self.at = target;
     }
 
-    /// Comes down anew, in absolute coordinates.
+    /// Approaches again, in absolute coordinates.
     fn approach(&mut self) {
         if std::mem::replace(&mut self.relative, false) {
             self.line("G90");
@@ -282,7 +282,7 @@ impl Draw {
         }
     }
 
-    /// Writes a line that no control takes as it is meant, or that hides where the tool goes.
+    /// Writes a line that controls interpret differently than intended, or that hides the tool's destination.
     fn slip(&mut self) -> &'static str {
         let slips = [
             ("G1 X1 Y1 I2", "no meaning"),
@@ -346,7 +346,7 @@ pub fn drawn(seed: u64) -> Drawn {
     Drawn { text: draw.text, moves: draw.moves, refused }
 }
 
-/// Reads a program that was corrected: absolute, every move with its motion.
+/// Reads a corrected program: absolute, with a motion word in every move.
 pub fn read(text: &str) -> Vec<Move> {
     let (mut moves, mut at, mut unit, mut plane, mut absolute) = (Vec::new(), [f64::NAN; 3], 1.0, 0, false);
     for line in text.lines().map(|line| line.split(['(', ';']).next().unwrap()) {
@@ -400,7 +400,7 @@ pub fn read(text: &str) -> Vec<Move> {
     moves
 }
 
-/// Holds what came out against what was drawn and the map.
+/// Compares the corrected program with the drawn one plus the map.
 fn assert_is_corrected(drawn: &Drawn, text: &str, error: fn(f64, f64) -> f64, seed: u64) {
     let found = read(text);
     let mut k = 0;
@@ -413,7 +413,7 @@ fn assert_is_corrected(drawn: &Drawn, text: &str, error: fn(f64, f64) -> f64, se
                     at[2] -= error(at[0], at[1]);
                     at
                 };
-                // A first line brings the tool to where the corrected way begins.
+                // A first line moves the tool to the start of the corrected path.
                 if let Some(Move::Feed(first)) = found.get(k)
                     && distance(first.from, at(0.0)) > 2.0 * TOLERANCE_MM
                     && distance(first.to, at(0.0)) < TOLERANCE_MM
@@ -428,7 +428,7 @@ fn assert_is_corrected(drawn: &Drawn, text: &str, error: fn(f64, f64) -> f64, se
                         _ => f64::INFINITY,
                     };
                     let mut best = off(k);
-                    // The way goes forth only.
+                    // The path only goes forward.
                     for next in k + 1..found.len() {
                         if best < TOLERANCE_MM + DIGIT_MM || off(next).is_infinite() {
                             break;

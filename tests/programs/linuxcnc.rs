@@ -11,13 +11,13 @@ use regrind::compensation::path::{Lean, PathMode, PathOptions, Pattern, Rotary, 
 use regrind::geometry::Vector;
 use regrind_sim::program::Control;
 
-/// Lets the interpreter read a program; returns what it would have the machine do, or what it said against it. It writes files into the
+/// Runs the interpreter on a program. Returns its canonical commands, or its error message. It writes files into the
 /// program's folder.
 fn interpret(program: &Path) -> Result<String, String> {
     let folder = program.parent().expect("a program stands in a folder");
     let mut command = Command::new("rs274");
-    // It keeps its tools in a file that it maps into memory in the home folder: two at once with one home kill each other (SIGBUS).
-    // A tool without a length, so that G43 finds one.
+    // The interpreter maps its tool file in the home folder into memory: two processes with the same home kill each
+    // other (SIGBUS). The tool has no length, so that G43 finds one.
     fs::write(folder.join("tool.tbl"), "T1 P1 Z0.0 D1.0\n").unwrap();
     command.args(["-t", "tool.tbl", "-g"]).arg(program).current_dir(folder).env("HOME", folder).stdin(Stdio::null());
     let output = command.output().expect("rs274 starts: apt-get install linuxcnc-uspace");
@@ -28,10 +28,10 @@ fn interpret(program: &Path) -> Result<String, String> {
     }
 }
 
-/// Where a straight feed (true) or a rapid (false) ends.
+/// End of a straight feed (true) or of a rapid (false).
 type End = ([f64; 3], bool);
 
-/// Where the interpreter's moves end, or what it says against the program.
+/// Returns the ends of the interpreter's moves, or its error message.
 fn interpreted(file: &Path) -> Result<Vec<End>, String> {
     let ends = |text: String| {
         let ends = text.lines().filter_map(|line| {
@@ -64,7 +64,7 @@ fn every_program_of_every_recipe_is_read_point_by_point() {
                 let ours: Vec<_> = read(&text);
                 assert_eq!(ends.len(), ours.len(), "{name}, {wheel_name}, {pattern:?}");
                 for (theirs, step) in ends.iter().zip(&ours).filter(|(_, step)| !step.at[0].is_nan()) {
-                    // It prints four decimals.
+                    // The interpreter prints four decimals.
                     let off = (0..3).map(|k| (theirs.0[k] - step.at[k]).abs()).fold(0.0, f64::max);
                     assert!(off < 0.6e-4 && theirs.1 == step.feed, "{name}, {wheel_name}: {theirs:?} {step:?}");
                 }
@@ -73,7 +73,7 @@ fn every_program_of_every_recipe_is_read_point_by_point() {
     }
 }
 
-/// The arcs of the interpreter in order: the numbers of its call, which has them plane by plane.
+/// Returns the arcs of the interpreter in order: the numbers of its call, which are ordered by plane.
 fn arcs(said: &str) -> Vec<([usize; 3], Vec<f64>)> {
     let mut axes = [0, 1, 2];
     let mut found = Vec::new();
@@ -114,7 +114,8 @@ fn the_interpreter_turns_where_the_simulated_control_does() {
         assert!(turns.len() == theirs.len() && turns.len() > 100, "{name}: {} {}", turns.len(), theirs.len());
         for (pair, ([a, b, c], arc)) in turns.iter().zip(&theirs) {
             let (from, to) = (pair[0].at_mm, pair[1].at_mm);
-            // It prints four decimals: ends first, then the centre, the turns (counter-clockwise is positive) and the third axis.
+            // The interpreter prints four decimals: ends first, then the centre, the turns (counter-clockwise is
+            // positive) and the third axis.
             let near = |x: f64, y: f64| (x - y).abs() < 0.6e-4;
             assert!(near(arc[0], to[*a]) && near(arc[1], to[*b]) && near(arc[5], to[*c]), "{name}: {arc:?} {to:?}");
             let middle = pair[1].on_the_way(from, 0.5);
@@ -162,7 +163,7 @@ fn programs_of_a_wheel_that_tilts_are_read_point_by_point_with_their_angles() {
         let ours = Control::Linuxcnc.read(&fs::read_to_string(&file).unwrap()).unwrap().stops;
         assert_eq!(theirs.len(), ours.len(), "{letter}");
         for (theirs, stop) in theirs.iter().zip(&ours).filter(|(_, stop)| stop.turn_deg.is_some()) {
-            // It prints four decimals.
+            // The interpreter prints four decimals.
             let [x, y, z] = stop.at_mm;
             let off =
                 [x, y, z, stop.turn_deg.unwrap()].iter().zip(theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
@@ -212,7 +213,7 @@ fn corrected_programs_are_read_by_the_interpreter_of_linuxcnc() {
     }
 }
 
-/// Where the interpreter's moves at feed end, in millimetres.
+/// Returns the ends of the interpreter's moves at feed, in millimetres.
 fn ends_of_feeds(said: &str) -> Vec<[f64; 3]> {
     let (mut unit, mut axes, mut found) = (1.0, [0, 1, 2], Vec::new());
     for line in said.lines() {
@@ -246,13 +247,13 @@ fn drawn_programs_are_corrected_as_the_interpreter_of_linuxcnc_reads_them() {
     for seed in 0..crate::sample::seeds(25) {
         let drawn = crate::generated::drawn(seed);
         let bench = Shop::new(error_mm, &drawn.text);
-        // What the interpreter does not take (another rule for a small arc) is not a base to correct.
+        // A program that the interpreter refuses (it has another rule for a small arc) is not a base to correct.
         let Ok(base) = interpret(&bench.path("base.ngc")) else { continue };
         let Ok(text) = bench.compensate(&["--tolerance-um", "0.1"]) else {
             assert!(drawn.refused.is_some(), "seed {seed}\n{}", drawn.text);
             continue;
         };
-        // It reads the base as it was drawn.
+        // The interpreter reads the base as it was drawn.
         let ends = |moves: &[Move]| -> Vec<[f64; 3]> {
             let ways = moves.iter().filter_map(|step| match step {
                 Move::Feed(way) => Some(way.to),
@@ -266,7 +267,7 @@ fn drawn_programs_are_corrected_as_the_interpreter_of_linuxcnc_reads_them() {
             let theirs = ends_of_feeds(said);
             assert_eq!(theirs.len(), ours.len(), "seed {seed}, {name}\n{}", drawn.text);
             for (is, should) in theirs.iter().zip(&ours) {
-                // It prints four decimals, of an inch too.
+                // The interpreter prints four decimals, in inches too.
                 let off = (0..3).map(|k| (is[k] - should[k]).abs()).fold(0.0, f64::max);
                 assert!(off < 0.6e-4 * 25.4, "seed {seed}, {name}: {is:?} {should:?}\n{}", drawn.text);
             }

@@ -13,7 +13,7 @@ use regrind::setup;
 use regrind_sim::shape::Shape;
 use regrind_sim::spec::WorldSpec;
 
-/// A part: how its programs are made, and what it truly should be.
+/// Part: the options of its programs, and its true target surface.
 pub struct Part {
     pub programs: Programs,
     pub shape: Box<dyn Shape>,
@@ -26,7 +26,7 @@ pub fn part(name: &str) -> Part {
     prepared(&Recipe::read(&root.join(format!("recipes/{name}.toml"))).unwrap())
 }
 
-/// The same part, measured and worked on from below.
+/// Returns the same part, measured and machined from below.
 pub fn part_from_below(name: &str) -> Part {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let recipes = root.join("recipes");
@@ -55,12 +55,12 @@ pub fn wheels(steepest_rad: f64) -> [(&'static str, Wheel); 3] {
     ]
 }
 
-/// 10 um over 10 mm, and a little of its own across.
+/// Returns an error of 10 um over 10 mm, plus a small independent part across.
 pub fn error_mm(x: f64, y: f64) -> f64 {
     0.005 * (0.3 * x + 0.4).sin() * (0.25 * y).cos() + 1e-4 * x
 }
 
-/// The correction for a part, known well beyond its edges.
+/// Returns the correction for a part, defined well beyond its edges.
 pub fn correction(half_mm: [f64; 2]) -> Correction {
     let reach = half_mm.map(|h| h + 4.0);
     let corners = [[-reach[0], -reach[1]], reach];
@@ -69,14 +69,14 @@ pub fn correction(half_mm: [f64; 2]) -> Correction {
     Correction { grid, values_mm, cycle: 2, level_mm: 0.02, set: None }
 }
 
-/// The surface that is wanted, by closed forms: the shape moved along its normals by level and correction.
+/// Returns a point of the target surface in closed form: the shape moved along its normals by level and correction.
 pub fn truth(part: &Part, level_mm: f64, [x, y]: [f64; 2]) -> [f64; 3] {
     let (p, n) = (part.shape.point(x, y), part.shape.normal(x, y));
     let d = level_mm + error_mm(x, y);
     std::array::from_fn(|k| p[k] + d * n[k])
 }
 
-/// The same of the lower side, which is moved the other way.
+/// Returns the same for the lower side, which moves in the opposite direction.
 pub fn truth_below(part: &Part, level_mm: f64, [x, y]: [f64; 2]) -> [f64; 3] {
     let (p, n) = (part.shape.point(x, y), part.shape.normal(x, y));
     let d = level_mm + error_mm(x, y);
@@ -89,14 +89,14 @@ pub fn with(options: &PathOptions, wheel: Wheel, track_mm: f64) -> PathOptions {
     PathOptions { wheel, spacing: TrackSpacing::Distance(track_mm), ..*options }
 }
 
-/// A move of a program: where it ends, and whether it is at feed.
+/// Move of a program: its end, and whether it is at feed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ProgramStep {
     pub at: [f64; 3],
     pub feed: bool,
 }
 
-/// Reads a program of G0 and G1 by itself: words and what stays in force.
+/// Reads a program of G0 and G1 with an independent reader: words and modal state.
 pub fn read(text: &str) -> Vec<ProgramStep> {
     let (mut steps, mut at, mut feed) = (Vec::new(), [f64::NAN; 3], false);
     for line in text.lines().filter(|line| !line.starts_with('(')) {

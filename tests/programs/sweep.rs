@@ -1,16 +1,18 @@
-//! The wheel, swept along a program as it stands in the file, leaves the corrected surface: checked by closed forms alone.
+//! Sweeps the wheel along the program in the file and checks by closed forms alone that it leaves the corrected
+//! surface.
 //!
-//! The surface is that of the simulator's shapes, the wheel a distance of its own, the program is read back from its text.
+//! The surface is that of the simulator's shapes. The wheel has an independent distance function. The program is read
+//! back from its text.
 
 use crate::path::{Part, ProgramStep, correction, part, part_from_below, read, truth, truth_below, wheels, with};
 use crate::sample::{cases, seeds};
 use regrind::compensation::path::{PathOptions, Pattern, TrackSpacing, Wheel};
 
 const PARTS: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"];
-/// What a touching place may be off, in millimetres.
+/// Tolerance of a touching place, in millimetres.
 const WITHIN_MM: f64 = 2e-4;
 
-/// How far a point is from a wheel, from its centre.
+/// Returns the distance of a point from a wheel; `d` is relative to the wheel's centre.
 pub fn distance(wheel: &Wheel, d: [f64; 3]) -> f64 {
     let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
     match *wheel {
@@ -26,21 +28,21 @@ pub fn distance(wheel: &Wheel, d: [f64; 3]) -> f64 {
     }
 }
 
-/// A program as the wheel goes through it, and the boxes that so many moves one after the other stay in.
+/// Program as swept by the wheel, and the bounding boxes of groups of successive moves.
 pub struct Swept {
     pub steps: Vec<ProgramStep>,
     boxes: Vec<[[f64; 3]; 2]>,
 }
 
-/// Moves in a box.
+/// Number of moves in a box.
 const IN_A_BOX: usize = 64;
 
 impl Swept {
     pub fn new(steps: Vec<ProgramStep>) -> Self {
-        // Each box has the place, too, from which its first move begins.
+        // Each box also contains the start of its first move.
         let boxes = (0..steps.len()).step_by(IN_A_BOX).map(|first| {
             let of = &steps[first..(first + IN_A_BOX + 1).min(steps.len())];
-            // The first move knows no x and y: what is no number makes no box larger.
+            // The first move has no x and y: NaN does not enlarge a box.
             let bound = |start: f64, of_two: fn(f64, f64) -> f64| {
                 [0, 1, 2].map(|k| of.iter().map(|step| step.at[k]).fold(start, of_two))
             };
@@ -49,7 +51,7 @@ impl Swept {
         Self { boxes: boxes.collect(), steps }
     }
 
-    /// Returns the moves of all boxes that a wheel may touch a point from.
+    /// Returns the moves of all boxes from which a wheel can touch a point.
     fn near(&self, q: [f64; 3], reach_mm: f64) -> impl Iterator<Item = [[f64; 3]; 2]> {
         let is_near = move |[least, most]: &[[f64; 3]; 2]| {
             (0..3).all(|k| q[k] >= least[k] - reach_mm && q[k] <= most[k] + reach_mm)
@@ -60,7 +62,7 @@ impl Swept {
     }
 }
 
-/// How far a point stays from a wheel that goes through a program, rapid moves included.
+/// Returns the minimum distance of a point from a wheel that follows a program, rapid moves included.
 pub fn clearance(wheel: &Wheel, program: &Swept, q: [f64; 3]) -> f64 {
     let reach = wheel.reach_mm() + 0.1;
     let mut nearest = f64::INFINITY;
@@ -70,13 +72,13 @@ pub fn clearance(wheel: &Wheel, program: &Swept, q: [f64; 3]) -> f64 {
         if beyond(0) || beyond(1) || beyond(2) {
             continue;
         }
-        // The first move knows no x and y.
+        // The first move has no x and y.
         if a.iter().any(|v| v.is_nan()) {
             continue;
         }
         let at = |t: f64| distance(wheel, [0, 1, 2].map(|k| q[k] - a[k] - t * (b[k] - a[k])));
         let (mut from, mut to) = (0.0, 1.0);
-        // Along so short a way the distance has one least value; a long rapid one is far away or passes once.
+        // On such a short path the distance has one minimum; a long rapid move is far away or passes once.
         let length = (0..3).map(|k| (b[k] - a[k]).powi(2)).sum::<f64>().sqrt();
         if at(0.5) > nearest + length {
             continue;
@@ -100,7 +102,7 @@ fn program(part: &Part) -> (Swept, f64) {
     (Swept::new(read(&std::fs::read_to_string(file).unwrap())), path.track_mm())
 }
 
-/// Places on some tracks of a raster, and beside them by a share of their distance.
+/// Returns places on some tracks of a raster, offset sideways by a fraction of the track distance.
 pub fn places(part: &Part, track_mm: f64, beside: f64) -> Vec<[f64; 2]> {
     let [a, b] = part.half_mm;
     let rows = (2.0 * b / track_mm).round() as usize;
@@ -115,7 +117,7 @@ pub fn places(part: &Part, track_mm: f64, beside: f64) -> Vec<[f64; 2]> {
         .collect()
 }
 
-/// Each wheel on each part, or every second one of these: all parts and all wheels are among them.
+/// Returns each wheel on each part, or every second combination: all parts and all wheels are among them.
 fn parts_and_wheels() -> impl Iterator<Item = (&'static str, (&'static str, Wheel))> {
     cases(PARTS.into_iter().flat_map(|name| wheels(0.8).map(|wheel| (name, wheel))), 2)
 }
@@ -144,7 +146,7 @@ fn from_below_every_wheel_leaves_the_corrected_lower_side() {
         for (wheel_name, wheel) in wheels(0.8) {
             part.programs.options = with(&plain, wheel, 4.0);
             let (swept, track_mm) = program(&part);
-            // As it stands in the model frame: its spindle points the other way.
+            // In the model frame the spindle points the other way.
             let stands = wheel.mirrored();
             for place in places(&part, track_mm, 0.0) {
                 let off = clearance(&stands, &swept, truth_below(&part, 0.02, place));
@@ -154,7 +156,7 @@ fn from_below_every_wheel_leaves_the_corrected_lower_side() {
                 let off = clearance(&stands, &swept, truth_below(&part, 0.02, place));
                 assert!(off > -WITHIN_MM, "{name}, {wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
             }
-            // It travels under everything that it grinds.
+            // The wheel travels below everything that it grinds.
             let least =
                 |feed: bool| swept.steps.iter().filter(|s| s.feed == feed).fold(f64::INFINITY, |z, s| z.min(s.at[2]));
             assert!(least(false) < least(true), "{name}, {wheel_name}");
@@ -175,7 +177,7 @@ fn between_tracks_the_ridges_are_as_high_as_stated_and_nothing_is_cut_deeper() {
             for place in places(&part, track_mm, beside) {
                 let off = clearance(&wheel, &swept, truth(&part, 0.02, place));
                 assert!(off > -WITHIN_MM, "{name}, {wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
-                // The formula takes the ridge for a parabola; the next order is a few percent of it here.
+                // The formula approximates the ridge by a parabola; the next order is a few percent of it here.
                 assert!(
                     off < 1.05 * height_mm + WITHIN_MM,
                     "{name}, {wheel_name}: a ridge of {:.3} um at {place:?}",
@@ -225,7 +227,7 @@ fn the_scallops_told_of_a_path_are_those_that_the_wheel_leaves() {
         let found = [highest, (squares / grooves).sqrt(), sum / grooves];
         let of = [told.height_mm, told.rms_mm, told.mean_mm];
         let close = |k: usize, within: f64| (found[k] / of[k] - 1.0).abs() < within;
-        // The highest of all need not be among the places that were looked at.
+        // The highest place of all need not be among the sampled places.
         assert!(close(0, 0.1) && close(1, 0.03) && close(2, 0.03), "{name}, {wheel_name}: {found:?} for {told:?}");
     }
 }
@@ -264,7 +266,7 @@ fn no_spiral_cuts_deeper_anywhere() {
 
 #[test]
 fn with_the_normals_of_the_nominal_surface_it_would_not_hold() {
-    // The check must be able to fail: a ball whose correction was added along z alone is seen at once.
+    // The check must be able to fail: it detects a ball whose correction was added along z alone.
     let part = part("freeform-mirror");
     let correction = correction(part.half_mm);
     let flat = regrind::compensation::Correction { values_mm: vec![0.0; correction.grid.len()], ..correction };

@@ -1,5 +1,5 @@
-//! Programs of a wheel that a head tilts, read back by controls that share nothing with who wrote them, the turn of the head undone from the
-//! machine's own measures, and the tilted wheel swept over the part.
+//! Programs of a wheel on a tilting head. Independent controls read them back, the rotation of the head is undone from
+//! the machine's own dimensions, and the tilted wheel is swept over the part.
 
 use std::path::Path;
 
@@ -10,12 +10,12 @@ use regrind::config::read_dialect;
 use regrind::geometry::{Aperture, Grid, Vector};
 use regrind_sim::program::{Control, Program, Stop};
 
-/// What a touching place may be off, in millimetres.
+/// Tolerance of a touching place, in millimetres.
 const WITHIN_MM: f64 = 2e-4;
-/// From the wheel's centre to the pivot.
+/// Vector from the wheel's centre to the pivot.
 const PIVOT_MM: [f64; 3] = [12.0, -7.0, 180.0];
 
-/// A head with a wide range.
+/// Returns a head with a wide range.
 fn head(about: TurnAxis, pivot_mm: Option<[f64; 3]>, angle_decimals: i32) -> Rotary {
     Rotary {
         letter: if about == TurnAxis::X { 'A' } else { 'B' },
@@ -28,7 +28,7 @@ fn head(about: TurnAxis, pivot_mm: Option<[f64; 3]>, angle_decimals: i32) -> Rot
     }
 }
 
-/// Writes the program of a part in a dialect, and has its control read it.
+/// Writes the program of a part in a dialect, and reads it with the control of that dialect.
 fn written(part: &mut Part, name: &str) -> (Program, String) {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("config/dialects/{name}.toml"));
     part.programs.dialect = read_dialect(&file).unwrap_or_else(|problems| panic!("{problems}")).0;
@@ -41,13 +41,14 @@ fn written(part: &mut Part, name: &str) -> (Program, String) {
     (program, text)
 }
 
-/// A vector turned by an angle about x for an A, about y for a B.
+/// Returns a vector rotated by an angle about x for an A axis, about y for a B axis.
 fn turned(letter: char, [x, y, z]: [f64; 3], angle: f64) -> [f64; 3] {
     let (s, c) = angle.sin_cos();
     if letter == 'A' { [x, c * y - s * z, s * y + c * z] } else { [c * x + s * z, y, c * z - s * x] }
 }
 
-/// How far a place is from the wheel at a share of the way between two stops, where slides and head move in proportion.
+/// Returns the distance of a place from the wheel at a fraction of the path between two stops, along which slides and
+/// head move in proportion.
 fn off_mm(
     wheel: &Wheel,
     pivot_mm: Option<[f64; 3]>,
@@ -56,7 +57,7 @@ fn off_mm(
     share: f64,
     q: [f64; 3],
 ) -> f64 {
-    // The scale of an A counts left-handed here.
+    // The A axis counts left-handed here.
     let hand = if letter == 'A' { -1.0 } else { 1.0 };
     let [a, b] = [from, to].map(|stop| hand * stop.turn_deg.unwrap_or(0.0).to_radians());
     let angle = a + share * (b - a);
@@ -69,7 +70,7 @@ fn off_mm(
     distance(wheel, turned(letter, from_centre, -angle))
 }
 
-/// How far a place stays from the tilted wheel, all along a program.
+/// Returns the minimum distance of a place from the tilted wheel along a program.
 fn clearance(wheel: &Wheel, pivot_mm: Option<[f64; 3]>, program: &Program, q: [f64; 3]) -> f64 {
     let letter = program.axis.expect("a head that turns");
     let mut nearest = f64::INFINITY;
@@ -135,7 +136,7 @@ fn in_every_dialect_every_tilted_wheel_leaves_the_corrected_surface() {
     }
 }
 
-/// A ridge whose flank falls by 3.4 mm a millimetre at its foot: z = -0.1 y^2 for y to 17 mm.
+/// Ridge whose flank falls by 3.4 mm per millimetre at its foot: z = -0.1 y^2 for y to 17 mm.
 const FALL_PER_MM: f64 = 0.1;
 
 fn steep(part: &mut Part) {
@@ -185,7 +186,7 @@ fn a_flank_too_steep_for_an_upright_wheel_is_ground_by_one_that_follows() {
     }
 }
 
-/// The steep surface moved along its normals by level and correction.
+/// Returns a point of the steep surface, moved along its normals by level and correction.
 fn steep_truth(x: f64, y: f64) -> [f64; 3] {
     let slope = -2.0 * FALL_PER_MM * y;
     let w = 1.0 / (1.0 + slope * slope).sqrt();
@@ -210,8 +211,7 @@ fn a_tilt_of_nothing_writes_the_upright_program_and_the_words_of_the_axis() {
         } else {
             format!("B{:.decimals$}", 0.0, decimals = decimals as usize)
         };
-        // Numbers of blocks count the lines of the axis too.
-        // No comments, no names, and no words that only tell of the head.
+        // Block numbers count the lines of the axis too. Ignore comments, names, and words that only concern the head.
         let is_move = |line: &&str| {
             let is_told =
                 ["PGM", "ORI", "TCPM", "; "].iter().any(|word| line.contains(word)) || line.starts_with(['(', ';']);
@@ -247,13 +247,13 @@ fn a_program_that_turns_is_no_program_for_a_machine_that_does_not() {
     ] {
         assert!(program.clone().on(Some(head)).unwrap_err().contains(what));
     }
-    // Arcs are for wheels that stand upright.
+    // Arcs are for wheels without tilt.
     assert!(part.programs.check_dialect().is_ok());
     part.programs.arcs_within_mm = Some(1e-4);
     let refused = part.programs.check_dialect().unwrap_err().to_string();
     assert!(refused.contains("grinder.program.arcs_within_um") && refused.contains("grinding.tilt"), "{refused}");
     part.programs.arcs_within_mm = None;
-    // A control that has no words for it.
+    // A control that has no words for the tilt.
     part.programs.dialect =
         read_dialect(&Path::new(env!("CARGO_MANIFEST_DIR")).join("config/dialects/heidenhain.toml")).unwrap().0;
     let refused = part.programs.check_dialect().unwrap_err().to_string();
@@ -268,9 +268,9 @@ fn a_feed_by_time_takes_as_long_as_the_wheel_at_its_feed() {
     let (program, _) = written(&mut part, "linuxcnc");
     let minutes: f64 = program.stops.iter().filter_map(|stop| stop.minutes).sum();
     let (_, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
-    // The header has the time without the way down, a millimetre for each track.
+    // The header has the time without the descent, a millimetre for each track.
     let down = part.programs.path(&correction(part.half_mm)).unwrap().0.tracks() as f64 / summary.feed_mm_min;
     assert!((minutes - down - summary.seconds / 60.0).abs() < 1e-6 * minutes, "{minutes} {}", summary.seconds / 60.0);
-    // The slides themselves go far where the head turns.
+    // The slides themselves travel far while the head turns.
     assert!(program.stops.iter().filter_map(|stop| stop.feed_mm_min).fold(0.0, f64::max) > 1.2 * summary.feed_mm_min);
 }

@@ -1,4 +1,5 @@
-//! A touch that no neighbour agrees with is made again before anybody is called, and the part judged by what it finds then.
+//! A touch that no neighbour agrees with is repeated before any person is called, and the part is judged by the
+//! repeated touch.
 
 use std::fs;
 use std::path::Path;
@@ -7,7 +8,7 @@ use crate::outlived::{began_once, follow, on_serial_lines};
 use crate::program::{Running, changed, records_with, regrind, replaced, run};
 use serde_json::Value;
 
-/// The free-form recipe on its simulated cell, whose probe gives a false trigger now and then.
+/// Returns the free-form recipe on its simulated cell, whose probe gives a false trigger now and then.
 fn recipe(home: &Path, seed: u64, speed: f64) -> String {
     let text = changed(
         "recipes/freeform-mirror.toml",
@@ -28,7 +29,7 @@ fn registered(folder: &Path) -> Vec<Value> {
     records_with(folder, "figures").into_iter().filter(|event| event["event"] == "registered").collect()
 }
 
-/// The rows of a file of points.
+/// Returns the rows of a file of points.
 fn rows(path: &Path) -> Vec<String> {
     fs::read_to_string(path).unwrap().lines().filter(|line| !line.starts_with(['#', 'x'])).map(str::to_owned).collect()
 }
@@ -52,7 +53,7 @@ fn a_false_trigger_is_touched_again_and_the_part_accepted_without_anybody() {
     assert!(after["outliers"].as_u64().unwrap() < alone, "{after}");
     assert_eq!(figures.len(), first + 2, "accepted at once");
 
-    // Only those touches are replaced; those around follow behind all others.
+    // Only those touches are replaced. The touches around them are appended after all others.
     let cycle = figures.len() - 1;
     let [whole, again] =
         ["", "/attempt-2"].map(|attempt| rows(&folder.join(format!("cycle-{cycle}{attempt}/measured.csv"))));
@@ -75,7 +76,7 @@ fn a_run_that_is_killed_while_it_touches_again_goes_on_with_what_it_had() {
         ("accuracy_nm = 0.5", "spacing_mm = 0.5"),
         ("cutoff_mm = 5.0", "cutoff_mm = 11.0"),
         ("outlier_share = 0.002", "outlier_share = 0.02"),
-        // So few touches say little of what lies between them.
+        // With so few touches, the form between them is poorly known.
         ("pv_um = 7.0", "pv_um = 10.0"),
     ];
     let text = fs::read_to_string(recipe(home.path(), 1, 2_000.0)).unwrap();
@@ -91,7 +92,7 @@ fn a_run_that_is_killed_while_it_touches_again_goes_on_with_what_it_had() {
     running.end();
     let mut resumed = Running::new(regrind(&["resume", &folder.display().to_string(), "--json"], home.path()));
     assert_eq!(follow(&mut resumed, &|| Some(folder.clone()), usize::MAX), Some(0), "{}", resumed.told);
-    // Each job that was begun was commanded, and none of them twice.
+    // Each job that started was commanded, and no job was commanded twice.
     let commands = records_with(&folder, "command");
     let starts = commands.iter().filter(|of| of["command"] == "start_machine").count();
     let (began, measured) = (began_once(home.path()), registered(&folder).len());

@@ -1,4 +1,4 @@
-//! The simulated machines in one process and the run in another, over Modbus TCP and over Modbus RTU on pseudo-terminals.
+//! Simulated machines in one process and the run in another, over Modbus TCP and over Modbus RTU on pseudo-terminals.
 
 use std::fs;
 use std::path::Path;
@@ -7,7 +7,8 @@ use crate::program::{Running, changed, records_with, regrind, small_recipe};
 use regrind::journal::verify;
 use serde_json::Value;
 
-/// Runs to the end in another process than the machines and returns the time a point took on the wire, in milliseconds.
+/// Runs to the end in a process other than that of the machines. Returns the transfer time per point on the wire, in
+/// ms.
 fn run_against(home: &Path, recipe: &str, cell: &str, serving: &mut Running) -> f64 {
     let mut running = Running::new(regrind(&["run", recipe, "--cell", cell, "--runs", "runs", "--part", "SN-2"], home));
     let folder = running.folder(home);
@@ -60,7 +61,7 @@ fn over_modbus_rtu_on_pseudo_terminals() {
     assert!(serving.said.iter().any(|line| line.contains("115200 baud") && line.starts_with("SIMULATION")));
     let ms = run_against(home.path(), recipe, "cell.toml", &mut serving);
     println!("Modbus RTU, 115,200 baud: {ms:.3} ms a point");
-    // The three coordinates alone are 24 bytes of 10 bits: no line of this speed brings them in less.
+    // The three coordinates alone are 24 bytes of 10 bits. A line of this speed cannot transfer them in less time.
     assert!(ms > 24.0 * 10.0 / 115.2, "{ms} ms a point is faster than the line");
     assert!(fs::symlink_metadata(home.path().join("cmm.tty")).is_err(), "the links go with the simulation");
 }

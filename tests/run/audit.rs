@@ -1,4 +1,5 @@
-//! The record of a run as quality reads it: proven, shown, exported; and the table of states beside its picture.
+//! The record of a run as the quality department uses it: verified, shown and exported; and the table of states with
+//! its picture.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,12 +14,12 @@ use regrind::report::state_picture;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// What a command prints when it ends with a code.
+/// Returns the standard output of a command that ends with this exit code.
 fn printed(folder: &Path, arguments: &[&str], code: i32) -> String {
     ended(folder, arguments, code).0
 }
 
-/// What a command says of its failure when it ends with a code.
+/// Returns the error output of a command that ends with this exit code.
 fn refused(folder: &Path, arguments: &[&str], code: i32) -> String {
     ended(folder, arguments, code).1
 }
@@ -79,11 +80,11 @@ fn orders() -> Vec<Order> {
     ]
 }
 
-/// A map of two by two nodes, one of them without a measurement.
+/// Map of two by two nodes, one of them without a measurement.
 const MAP: &str =
     "# cycle: 1\nx_mm,y_mm,error_mm,sigma_mm,valid\n0,0,0.001,0,1\n1,0,-0.002,0,1\n0,1,0.0005,0,1\n1,1,0.5,0,0\n";
 
-/// A folder with one run in `runs/`, as a drive would have recorded it.
+/// Creates a folder with one run in `runs/`, as a drive would have recorded it.
 fn recorded(simulation: bool) -> (TempDir, PathBuf) {
     let home = tempfile::tempdir().unwrap();
     let folder = home.path().join("runs/mirror-1");
@@ -102,7 +103,7 @@ fn recorded(simulation: bool) -> (TempDir, PathBuf) {
         let payload = serde_json::to_value(event).unwrap();
         journal.append(Entry::new(Kind::Event, 10 + k as u64, 1, payload)).unwrap();
     }
-    // Only what is answered is an intent; what the cell tells beside it is a note.
+    // Only a command that gets an answer is an intent. The cell's other notifications are notes.
     for order in orders() {
         let payload = serde_json::to_value(&order).unwrap();
         if matches!(order, Order::StartMachine { .. }) {
@@ -262,7 +263,7 @@ fn what_is_exported_proves_itself() {
     }
 }
 
-/// Reads CSV as RFC 4180 says, and nothing that it does not say.
+/// Parses CSV strictly by RFC 4180.
 fn rows_of_csv(text: &str) -> Vec<Vec<String>> {
     let (mut rows, mut row, mut field) = (Vec::new(), Vec::new(), String::new());
     let mut letters = text.chars().peekable();
@@ -311,7 +312,7 @@ fn a_record_in_csv_is_exact() {
     assert!(refused(home.path(), &["audit", "export", "--format", "xml"], 2).contains("jsonl"));
 }
 
-/// What a command prints and says where REGRIND_KEY names a file, and its exit code.
+/// Returns the output, the error output and the exit code of a command with REGRIND_KEY set to a file.
 fn with_key(home: &Path, key: &Path, arguments: &[&str]) -> (i32, String, String) {
     let done = regrind(arguments, home).env("REGRIND_KEY", key).output().unwrap();
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
@@ -330,7 +331,7 @@ fn the_key_of_a_computer_is_made_once_and_its_public_half_is_told_again() {
     let value: Value = serde_json::from_str(&said).unwrap();
     assert_eq!((&value["public_key"], &value["made"]), (&json!(public), &json!(false)));
     assert_eq!(AuditKey::read(&path).unwrap().public(), public);
-    // The usual place, and a place that is named.
+    // The default place, and a place that is named.
     let done = regrind(&["audit", "key", "--json"], home.path())
         .env_remove("REGRIND_KEY")
         .env("XDG_CONFIG_HOME", home.path())
@@ -390,7 +391,7 @@ fn a_run_signs_its_record_and_quality_proves_it_with_the_key_that_it_kept() {
     assert!(fs::read_to_string(report_in(home.path())).unwrap().contains(&public.to_string()));
 }
 
-/// The report of the one run of a folder.
+/// Returns the report of the only run in a folder.
 fn report_in(home: &Path) -> PathBuf {
     let run = only_run(&home.join("runs"));
     run.join("report.html")
@@ -515,19 +516,19 @@ fn who_holds_the_lock_of_a_run_does_not_make_it_sound() {
     let key = AuditKey::new();
     let public = key.public().to_string();
     drop(Journal::create_with(&folder, header(), Some(key)).unwrap());
-    // Gone on with, and brought to its end, by somebody without the key.
+    // Somebody without the key continued the run and ended it.
     Journal::open(&folder).unwrap().close(9, 1, json!("accepted")).unwrap();
     let path = folder.display().to_string();
     let verified = |arguments: &[&str]| run(&[&["audit", "verify", &path], arguments].concat(), home.path()).0;
     assert_eq!((verified(&[]), verified(&["--key", &public])), (1, 1));
-    // Anybody who may read the folder may hold its lock.
+    // Anybody who can read the folder can hold its lock.
     let lock = fs::File::open(folder.join(".lock")).unwrap();
     lock.lock_shared().unwrap();
     lock.unlock().unwrap();
     lock.lock().unwrap();
     assert_eq!(verified(&["--key", &public]), 1, "with the key at hand an end that nobody signed is not believed");
     assert_eq!(verified(&[]), 4, "without it the seal may still be on its way");
-    // A run that broke off is not proven whole by it either.
+    // This does not prove a run complete that broke off.
     let broken_off = home.path().join("runs/s");
     drop(Journal::create(&broken_off, header()).unwrap());
     let path = broken_off.display().to_string();
@@ -568,12 +569,12 @@ fn the_picture_names_every_state_once_and_is_well_formed() {
         let words = step.split(", ").last().unwrap();
         assert!(texts.contains(&words), "{step}");
     }
-    // With a table of nothing there are boxes and no arrows but those that explain the colours.
+    // With an empty table there are boxes, and no arrows except those of the colour legend.
     let empty = state_picture(&[]);
     assert_eq!(empty.matches("<path").count(), 6);
 }
 
-/// A folder of signed runs, as many as there are parts, in the order of their numbers.
+/// Creates a folder of signed runs, one for each part, in order of their numbers.
 fn runs_of(home: &Path, key: &Path, parts: &[&str]) -> Vec<PathBuf> {
     let recipe = small_recipe(home, 1e5).display().to_string();
     for part in parts {
@@ -609,7 +610,7 @@ fn a_run_that_is_removed_renamed_or_exchanged_is_missed_in_its_folder() {
     // Removed.
     fs::rename(&runs[1], &aside).unwrap();
     assert!(flaws().iter().any(|flaw| flaw.contains("number 2 is missing")), "{:?}", flaws());
-    // Another sound one of its number in its place, signed with the same key.
+    // Another valid run with the same number in its place, signed with the same key.
     let others = runs_of(elsewhere, &key, &["SN-1", "SN-2"]);
     let in_its_place = home.join("runs").join("another");
     for (from, to) in [(&others[1], home.join("runs").join(others[1].file_name().unwrap())), (&others[1], in_its_place)]
@@ -627,15 +628,15 @@ fn a_run_that_is_removed_renamed_or_exchanged_is_missed_in_its_folder() {
     assert!(flaws().iter().any(|flaw| flaw.contains("its folder was renamed")), "{:?}", flaws());
     fs::rename(home.join("runs").join("renamed"), &runs[1]).unwrap();
     assert_eq!(flaws(), Vec::<String>::new());
-    // An anchor is of one run.
+    // An anchor belongs to one run.
     assert_eq!(run(&["audit", "verify", "runs", "--anchor", "runs"], home).0, 2);
-    // Held by anybody, the folder keeps nobody from a run.
+    // A lock on the runs folder, held by anybody, does not block a run.
     let held = fs::File::open(home.join("runs")).unwrap();
     held.lock().unwrap();
     let recipe = small_recipe(home, 1e5).display().to_string();
     assert_eq!(with_key(home, &key, &["run", &recipe, "--cell", "sim", "--part", "SN-4"]).0, 0);
     held.unlock().unwrap();
-    // A missing anchor is a flaw, whoever holds the lock of the run.
+    // A missing anchor is a flaw, no matter who holds the lock of the run.
     let lock = fs::File::options().read(true).write(true).open(runs[0].join(".lock")).unwrap();
     lock.lock().unwrap();
     fs::rename(runs[0].join("journal.anchor"), &aside).unwrap();

@@ -1,5 +1,5 @@
-//! What can be wrong with a run folder, a wire, a cell file and a recipe before and while a cell runs: a clear error, the exit code,
-//! a bounded time, and a journal that verifies.
+//! Errors in a run folder, a wire, a cell file and a recipe, before and while a cell runs. Each gives a clear error,
+//! the right exit code, a bounded time, and a journal that verifies.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use crate::program::{Running, changed, only_run, records_with, regrind, root, run, run_folders, small_recipe};
 use regrind::journal::verify;
 
-/// No wrong input may keep anybody longer, on the busiest computer.
+/// Upper bound of the time until a wrong input is reported, even on the busiest computer.
 const BOUNDED: Duration = Duration::from_secs(60);
 
 fn in_time(arguments: &[&str], home: &Path) -> (i32, String, String) {
@@ -66,7 +66,7 @@ fn runs_that_begin_in_one_second_have_folders_of_their_own() {
         .collect();
     let codes: Vec<_> = both.iter_mut().map(Running::end).collect();
     for (code, errors) in codes {
-        // The one that found its folder taken a moment ago says so and harms nothing.
+        // The program that found its folder taken a moment before reports it and harms nothing.
         assert!(code == 0 || code == 2 && errors.contains("runs/"), "{code} {errors}");
     }
     for folder in run_folders(&home.path().join("runs")) {
@@ -88,16 +88,18 @@ fn a_folder_that_may_not_be_written() {
     assert!(errors.contains("locked"), "{errors}");
 }
 
-/// A cell whose record cannot be written any more says so, holds, and can be aborted; what was written verifies.
+/// Checks a cell whose record can no longer be written: it reports this, holds, and can be aborted. The journal up to
+/// then verifies.
 fn fills_up(command: Command, home: &Path, named: &str, fill: impl FnOnce()) {
     let mut running = Running::new(command);
     let folder = running.folder(home);
     fill();
     let words = running.line("what failed", |line| line.starts_with("RECORD"));
     assert!(words.contains(named), "{words}");
-    // The cell is told, whatever it was that could not be written.
+    // The cell raises an alarm, no matter which write failed.
     running.line("alarm", |line| line.starts_with("ALARM"));
-    // An abort needs no disk; that it is not on record is said, unless there was room for just that.
+    // An abort needs no disk. The program reports that the abort is not on record, unless there was just enough room
+    // for it.
     let (code, _, errors) = run(&["abort", folder.to_str().unwrap()], home);
     let is_said = errors.contains("carried out") && errors.contains("not on record");
     assert!(code == 0 || code == 3 && is_said, "{code} {errors}");
@@ -114,13 +116,13 @@ fn a_journal_that_cannot_grow_holds_the_cell_and_loses_nothing() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 2000.0);
     let mut command = Command::new("bash");
-    // Blocks of 1,024 bytes; the signal that comes with it is ignored, so that the write itself fails.
+    // The unit is blocks of 1,024 bytes. The signal SIGXFSZ is ignored, so that the write itself fails.
     command.args(["-c", "trap '' XFSZ; ulimit -f 120; exec \"$@\"", "regrind", env!("CARGO_BIN_EXE_regrind"), "run"]);
     command.args([&recipe, "--cell", &sim_cell(), "--runs", "runs"]).current_dir(home.path());
     fills_up(command, home.path(), "runs/small-", || ());
 }
 
-/// A disk of so many kB.
+/// Mounted disk of a given size in kB.
 struct SmallDisk(PathBuf);
 
 impl SmallDisk {
@@ -132,7 +134,7 @@ impl SmallDisk {
         Self(folder)
     }
 
-    /// Leaves so many bytes of it free, or fewer where somebody else writes meanwhile.
+    /// Fills the disk until `left` bytes are free, or fewer if another process writes meanwhile.
     fn fill_to(&self, left: u64) {
         let free = regrind::journal::free_bytes(&self.0).unwrap();
         let filled = fs::write(self.0.join("filler"), vec![0; free.saturating_sub(left) as usize]);
@@ -142,7 +144,7 @@ impl SmallDisk {
 
 impl Drop for SmallDisk {
     fn drop(&mut self) {
-        // What stays mounted is gone with the machine.
+        // If the unmount fails, the mount ends with the machine.
         let _ = Command::new("umount").arg("-l").arg(&self.0).status();
     }
 }
@@ -167,7 +169,7 @@ fn a_disk_that_fills_up_without_room_for_a_cycle_begins_none() {
     let (code, _, errors) = in_time(&arguments, home.path());
     assert!(code == 2 && errors.contains("small: the disk has 0 MB left") && errors.contains("--runs"), "{errors}");
     drop(disk);
-    // One that fills up while the first part is ground holds the cell before the measurement, with room for the record still.
+    // A disk that fills up while the first part is ground holds the cell before the measurement. The record still fits.
     let disk = SmallDisk::at(home.path().join("other"), 40_000);
     let arguments = ["run", &recipe, "--cell", &sim_cell(), "--runs", "other"];
     let mut running = Running::new(regrind(&arguments, home.path()));
@@ -185,7 +187,7 @@ fn a_disk_that_fills_up_without_room_for_a_cycle_begins_none() {
     assert!(verify(&folder).unwrap().closed);
 }
 
-/// A file system of its own in a file, which the kernel turns read-only at its first error, as it does with a disk that fails.
+/// Separate file system in a file. The kernel turns it read-only at its first error, as it does with a disk that fails.
 struct BrokenDisk {
     folder: PathBuf,
     device: String,
@@ -210,7 +212,7 @@ impl BrokenDisk {
 
 impl Drop for BrokenDisk {
     fn drop(&mut self) {
-        // What stays mounted is gone with the machine.
+        // If the unmount fails, the mount ends with the machine.
         let _ = Command::new("umount").arg("-l").arg(&self.folder).status();
     }
 }
@@ -255,7 +257,7 @@ fn a_file_stands_where_a_serial_device_should_be_linked() {
 fn machines_that_are_not_there() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 1e4);
-    // A port that is taken and not listened on.
+    // A port that is bound but does not listen.
     let taken = tokio::net::TcpSocket::new_v4().unwrap();
     taken.bind("127.0.0.1:0".parse().unwrap()).unwrap();
     let free = taken.local_addr().unwrap().port().to_string();
@@ -277,7 +279,7 @@ fn machines_that_are_not_there() {
     }
 }
 
-/// A serial port that is not there is told at once, with those that are; nothing has begun.
+/// A missing serial port is reported at once, with the list of existing ports. Nothing has started.
 #[test]
 fn a_serial_port_that_is_not_there() {
     let home = tempfile::tempdir().unwrap();

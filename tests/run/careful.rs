@@ -1,4 +1,5 @@
-//! After a measurement that a gate refused the part may have been seated anew: the next plan begins with few targets, and slowly.
+//! After a measurement that a gate refused, the part may have a new seating: the next plan begins with few targets, and
+//! slowly.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
@@ -12,7 +13,7 @@ use regrind::device::{
 };
 use regrind::drive::{Drive, Notice, Request};
 
-/// A measuring machine whose first measurement says something else than it should, and which keeps the plans that it is given.
+/// Measuring machine whose first measurement is wrong. It stores the plans that it receives.
 struct Odd {
     cmm: ModbusCmm,
     first: Option<fn(&mut Measurement)>,
@@ -38,13 +39,13 @@ impl Cmm for Odd {
     }
 }
 
-/// The places of the part's targets, to the last bit.
+/// Returns the positions of the part's targets, exact to the last bit.
 fn places(plan: &Plan) -> BTreeSet<[u64; 3]> {
     let part = plan.targets.iter().filter(|target| target.what == TargetKind::Part);
     part.map(|target| target.point_mm.map(f64::to_bits)).collect()
 }
 
-/// The least distance between two of some targets.
+/// Returns the minimum distance between any two of the first `of` targets, in mm.
 fn least_apart_mm(plan: &Plan, of: usize) -> f64 {
     let at = |k: usize| plan.targets[k].point_mm;
     let apart = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt();
@@ -79,7 +80,7 @@ async fn after_a_measurement_that_was_refused_the_first_touches_are_few_and_slow
     assert_eq!((careful.targets, careful.speed_mm_s), (9, 0.2 * again.speed_mm_s));
     assert!(again.targets[..9].iter().all(|target| target.what == TargetKind::Part));
     assert!(again.targets.iter().enumerate().all(|(k, target)| target.index as usize == k));
-    // The same places, the first of them far apart.
+    // The same positions, with the first of them far apart.
     assert_eq!((places(again), again.targets.len()), (places(first), first.targets.len()));
     let wide = least_apart_mm(again, 9);
     assert!(wide > 10.0, "{wide} mm apart");

@@ -1,6 +1,7 @@
-//! What one correction takes back of what comes back in every pass, and how near the floor cycles end, by the truth of the world.
+//! Share of the repeatable error that one correction removes, and how close to the floor the cycles end, by the truth
+//! of the world.
 //!
-//! A few worlds only; `cargo run --release --example convergence` draws fifty for each recipe and prints the figures.
+//! Only a few worlds: `cargo run --release --example convergence` draws fifty for each recipe and prints the figures.
 
 use crate::sample::seeds;
 use crate::study::{After, Bench, RECIPES, Way};
@@ -11,7 +12,7 @@ const PASSES: u16 = 3;
 
 fn runs(way: Way, parts: usize) -> Vec<(String, Vec<Vec<After>>)> {
     let benches: Vec<Bench> = RECIPES.iter().map(|name| Bench::new(name)).collect();
-    // Worlds of each recipe.
+    // Number of worlds of each recipe.
     let drawn = seeds(2);
     let each = (0..benches.len() as u64 * drawn).into_par_iter().map(|k| {
         let (bench, seed) = (&benches[(k / drawn) as usize], 1 + k % drawn);
@@ -20,7 +21,7 @@ fn runs(way: Way, parts: usize) -> Vec<(String, Vec<Vec<After>>)> {
     each.collect()
 }
 
-/// Root of the mean square over many passes.
+/// Returns the root mean square over many passes.
 fn rms(values: impl Iterator<Item = f64> + Clone) -> f64 {
     let count = values.clone().count() as f64;
     (values.map(|v| v * v).sum::<f64>() / count).sqrt()

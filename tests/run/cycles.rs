@@ -1,4 +1,5 @@
-//! Whole cycles over real sockets: what the paper says of them, and what the simulated world's truth says of the result.
+//! Whole cycles over real sockets: compares the recorded figures, and the result, with the truth of the simulated
+//! world.
 
 #![cfg(unix)]
 
@@ -12,26 +13,26 @@ use nalgebra::{Matrix6, Vector6};
 use regrind::cell::Ending;
 use regrind::geometry::Pose;
 
-/// One cycle of one run, as it was found and as it was.
+/// One cycle of one run: what was measured, and the truth.
 struct Cycle {
     cycle: u32,
     found_pv_um: f64,
     found_rms_um: f64,
     true_pv_um: f64,
     true_rms_um: f64,
-    /// Whether the intervals of PV and RMS hold what is true of the form.
+    /// True if the intervals of PV and RMS contain the true values of the form.
     held: [bool; 2],
-    /// How often the deviation of a point is within k = 2 of the truth's, of how many.
+    /// Number of points whose deviation is within k = 2 of the truth, and the number of points.
     within: [usize; 2],
-    /// Mean square of (found - true) / stated uncertainty over the points.
+    /// Mean square of (measured - true) / stated uncertainty over the points.
     point_z2: f64,
-    /// Found less true pose, each over its stated standard uncertainty.
+    /// Measured minus true pose, each component divided by its stated standard uncertainty.
     pose_z: [f64; 6],
     /// Squared Mahalanobis distance of the pose from the truth.
     pose_d2: f64,
 }
 
-/// A run of one seed.
+/// Run of one seed.
 struct Report {
     seed: u64,
     ending: Ending,
@@ -39,11 +40,11 @@ struct Report {
     tolerance_um: [f64; 2],
     grinds: Vec<usize>,
     cycles: Vec<Cycle>,
-    /// The files of the first cycle that are missing.
+    /// Files of the first cycle that are missing.
     missing: Vec<&'static str>,
 }
 
-/// Holds every measured cycle of a run against the truth.
+/// Compares every measured cycle of a run with the truth.
 fn report(seed: u64, ran: &Ran) -> Report {
     let rows = ran.rows();
     let cycles = ran.snapshots.iter().map(|seen| {
@@ -65,7 +66,7 @@ fn report(seed: u64, ran: &Ran) -> Report {
     Report { seed, ending: ran.ending.clone(), told: ran.told(), tolerance_um, grinds, cycles, missing }
 }
 
-/// The files of the first cycle that are missing.
+/// Returns the files of the first cycle that are missing.
 fn missing(ran: &Ran) -> Vec<&'static str> {
     let written = |file: &&str| ran.folder.join("cycle-1").join(file).is_file();
     ["correction.csv", "toolpath.ngc", "toolpath_z.csv"].into_iter().filter(|file| !written(file)).collect()
@@ -105,7 +106,7 @@ fn compare(ran: &Ran, cycle: u32, best: &Truth, [found_pv_um, found_rms_um]: [f6
     }
 }
 
-/// The default recipe with a few seeds, two at a time; run once for all tests of this file.
+/// Runs the default recipe with a few seeds, two at a time. Runs once for all tests of this file.
 fn drawn() -> &'static [Report] {
     static REPORTS: OnceLock<Vec<Report>> = OnceLock::new();
     REPORTS.get_or_init(|| {
@@ -132,7 +133,7 @@ fn drawn() -> &'static [Report] {
     })
 }
 
-/// Prints what came of a cycle over all seeds.
+/// Prints the results of a cycle over all seeds.
 fn summary(reports: &[Report], number: usize) {
     let cycles: Vec<&Cycle> = reports.iter().filter_map(|r| r.cycles.get(number - 1)).collect();
     let spread = |what: &str, of: fn(&Cycle) -> f64| {
@@ -181,7 +182,7 @@ fn every_seed_ends_as_the_truth_says() {
             Ending::Accepted { .. } => {
                 assert!(good, "seed {}: PV {:.3}, RMS {:.3} um\n{}", r.seed, last.true_pv_um, last.true_rms_um, r.told);
             }
-            // The verdict adds its uncertainty, so a part just within may be refused.
+            // The verdict adds its uncertainty, so a part that is just within its limits may be refused.
             Ending::NotAccepted { .. } => {
                 let near = last.true_pv_um > 0.7 * pv || last.true_rms_um > 0.9 * rms;
                 assert!(near, "seed {}: PV {:.3}, RMS {:.3} um\n{}", r.seed, last.true_pv_um, last.true_rms_um, r.told);
@@ -196,7 +197,8 @@ fn intervals_of_the_figures_hold_the_truth() {
     let cycles: Vec<&Cycle> = drawn().iter().flat_map(|report| &report.cycles).collect();
     for k in [0, 1] {
         let held = cycles.iter().filter(|cycle| cycle.held[k]).count();
-        // 95 of 100 where the form is one of a smooth field; the first tracks of a wheel that breaks in are none.
+        // The coverage is 95 of 100 where the form is a smooth field. The first tracks of a wheel that breaks in are
+        // not smooth.
         assert!(held as f64 >= 0.9 * cycles.len() as f64 - 1.0, "{held} of {}", cycles.len());
     }
 }
@@ -225,7 +227,7 @@ fn the_pose_agrees_with_the_truth_within_its_uncertainty() {
         let within = cycles.iter().filter(|c| c.pose_z[k].abs() <= 2.0).count();
         assert!(within as f64 >= 0.95 * cycles.len() as f64, "direction {k}: {within} of {}", cycles.len());
     }
-    // 95 % of a chi-squared of six degrees of freedom.
+    // 95 % quantile of chi-squared with six degrees of freedom.
     let within = cycles.iter().filter(|c| c.pose_d2 <= 12.592).count();
     assert!(within as f64 >= 0.95 * cycles.len() as f64, "all six together: {within} of {}", cycles.len());
 }

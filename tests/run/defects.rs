@@ -1,5 +1,5 @@
-//! A chip, a broken corner, a pit, a bump or a scratch comes onto a part between a pass and its measurement: no part is accepted that is
-//! beyond its limits where it was touched, and what two targets lie on is in the map.
+//! A chip, a broken corner, a pit, a bump or a scratch appears on a part between a pass and its measurement. No part is
+//! accepted that exceeds its limits where it was touched. A defect that two targets touch is in the map.
 
 use std::fmt::Write;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -13,7 +13,7 @@ use crate::worlds::{Ran, Setup, Snapshot, run, table};
 
 const RECIPES: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "biconic", "shallow-wave"];
 const HEIGHTS_UM: [f64; 3] = [3.0, 10.0, 50.0];
-/// Standard deviation of the scatter of the simulated probe.
+/// Standard deviation of the noise of the simulated probe, in µm.
 const SCATTER_UM: f64 = 0.3;
 
 #[derive(Clone, Copy, Debug)]
@@ -25,7 +25,7 @@ enum Kind {
     Scratch,
 }
 
-/// A part with a defect, by its number.
+/// Part with a defect, identified by its number.
 #[derive(Clone, Copy, Debug)]
 struct Case {
     recipe: &'static str,
@@ -89,13 +89,14 @@ struct Told {
     case: Case,
     ending: String,
     accepted: bool,
-    /// PV and RMS of the truth at every place that was touched last.
+    /// PV and RMS of the truth at all positions of the last measurement, in µm.
     truth_um: [f64; 2],
-    /// What is wrong with it.
+    /// Description of every check that failed.
     faults: String,
 }
 
-/// The true deviations at the places that were touched, but for what a motion of the part would do and for the depth of the pass.
+/// Returns the true deviations at the touched positions, without the part that a rigid motion explains and without the
+/// depth of the pass.
 fn best_fitted(ran: &Ran, seen: &Snapshot) -> DVector<f64> {
     let rows: Vec<[f64; 6]> = seen
         .places_mm
@@ -106,14 +107,14 @@ fn best_fitted(ran: &Ran, seen: &Snapshot) -> DVector<f64> {
             [n[0], n[1], n[2], turn(1, 2), turn(2, 0), turn(0, 1)]
         })
         .collect();
-    // Motions along the surface itself change nothing. A height that all have is one of the pass.
+    // Motions along the surface itself change nothing. A height common to all is the depth of the pass.
     let motions = DMatrix::from_fn(rows.len(), 7, |r, c| if c < 6 { rows[r][c] } else { 1.0 });
     let found = DVector::from_column_slice(&seen.heights_mm);
     let by = motions.clone().svd(true, true).solve(&found, 1e-7).unwrap();
     found - motions * by
 }
 
-/// Whether a target has another one that satisfies a condition within 1.5 local distances of the targets.
+/// Returns true if another target that satisfies a condition lies within 1.5 local target distances of this one.
 fn has_neighbour(places_mm: &[[f64; 2]], k: usize, is: &dyn Fn(&usize) -> bool) -> bool {
     let away = |other: usize| (places_mm[other][0] - places_mm[k][0]).hypot(places_mm[other][1] - places_mm[k][1]);
     let others: Vec<usize> = (0..places_mm.len()).filter(|&other| other != k).collect();
@@ -137,7 +138,8 @@ fn told(case: Case) -> Told {
             continue;
         }
         let height_mm = 1e-3 * defect.height_um;
-        // Two neighbours agree. A target that no other one near it agrees with is touched again, and is no form until then.
+        // Two neighbours agree. A target that no near target agrees with is touched again, and does not count as form
+        // until then.
         let is_on = |k: &usize| {
             let at_mm = defect.height_mm(seen.places_mm[*k]);
             at_mm / height_mm >= 0.5 && 1e3 * at_mm.abs() >= 6.0 * SCATTER_UM
@@ -156,9 +158,9 @@ fn told(case: Case) -> Told {
         };
         let k = *on.iter().max_by(tallest).unwrap();
         let own_mm = defect.height_mm(seen.places_mm[k]);
-        // The map has the height of the whole part, which the best fit takes off.
+        // The map contains the height of the whole part, which the best fit removes.
         let beside_mm = deviations_mm[k] - own_mm;
-        // At the four nodes about that target.
+        // At the four nodes around that target.
         let mut map = table(&folder.join("error_map.csv"));
         let away = |row: &[f64]| (row[0] - seen.places_mm[k][0]).hypot(row[1] - seen.places_mm[k][1]);
         map.sort_by(|a, b| away(a).total_cmp(&away(b)));
@@ -177,7 +179,7 @@ fn told(case: Case) -> Told {
     }
     let limits_um = ran.tolerance_mm.map(|mm| 1e3 * mm);
     let accepted = ran.accepted();
-    // Touches that are chosen lie where the part is worst: their own RMS is not that of the part.
+    // Chosen touches lie where the part is worst, so their RMS is not that of the part.
     let judged = if case.adaptive { 0..1 } else { 0..2 };
     if accepted && judged.into_iter().any(|k| truth_um[k] > limits_um[k]) {
         write!(faults, " accepted with PV {:.2} and RMS {:.3} um where it was touched;", truth_um[0], truth_um[1])
@@ -190,7 +192,7 @@ fn told(case: Case) -> Told {
 fn no_part_is_accepted_that_is_beyond_its_limits_where_it_was_touched() {
     let count = 8 * seeds(1);
     let one: Option<u64> = std::env::var("REGRIND_CASE").ok().map(|of| of.parse().expect("the number of a case"));
-    // Where few are drawn each recipe has one part, the whole pattern and chosen touches by turns.
+    // If few cases are drawn, each recipe has one part, and whole pattern and chosen touches alternate.
     let drawn: Vec<u64> = match one {
         Some(one) => vec![one],
         None => (0..count).filter(|number| all() || (number / 2 + number) % 2 == 0).collect(),
@@ -218,6 +220,6 @@ fn no_part_is_accepted_that_is_beyond_its_limits_where_it_was_touched() {
     }
     let wrong: Vec<_> = parts.iter().filter(|part| !part.faults.is_empty()).collect();
     assert!(wrong.is_empty(), "{} of {}", wrong.len(), parts.len());
-    // No defect of 3 um brings a part beyond 7 um by itself.
+    // A defect of 3 µm alone does not bring a part beyond 7 µm.
     assert!(one.is_some() || parts.iter().any(|part| part.accepted), "no part was accepted");
 }

@@ -1,18 +1,18 @@
-//! Whole parts whose grinder works by programs in a folder, each in the dialect of another control.
+//! Whole parts on a grinder that runs programs from a folder, each in the dialect of another control.
 
 use std::fs;
 
 use crate::program::{changed, only_run, run, small_recipe};
 use crate::sample::cases;
 
-/// The simulated cell with a program's section, and patience: the grinder reads megabytes of a program before it answers, and no stall of the
-/// computer is taken for a machine that is gone.
+/// Returns the simulated cell with a `program` section and long timeouts. The grinder reads megabytes of a program
+/// before it answers, and a stall of the computer must not look like a machine that is gone.
 fn cell(program: &str) -> String {
     let patience = "[grinder.timing]\nrequest_timeout_ms = 10000\nlost_after_ms = 60000";
     changed("config/sim.toml", &[("[grinder.timing]", patience), ("[grinder.limits]", program)])
 }
 
-/// Makes the small mirror in a simulated cell whose control finds its programs in a folder.
+/// Makes the small mirror in a simulated cell whose control reads its programs from a folder.
 fn made(dialect: &str, more: &str) -> (tempfile::TempDir, i32, String, String) {
     let home = tempfile::tempdir().unwrap();
     fs::create_dir(home.path().join("programs")).unwrap();
@@ -33,7 +33,7 @@ fn a_part_is_ground_by_the_programs_of_every_dialect_until_it_is_accepted() {
         assert!(said.contains("SIMULATION  ACCEPTED"), "{dialect}: {said}");
         let there = fs::read_dir(home.path().join("programs")).unwrap().map(|entry| entry.unwrap().path());
         let programs: Vec<_> = there.filter(|file| file.extension().is_some_and(|e| e == extension)).collect();
-        // One for each pass.
+        // One program for each pass.
         assert!(programs.len() >= 2, "{dialect}: {programs:?}");
         let kept = only_run(&home.path().join("runs"));
         let of_first = fs::read(kept.join(format!("cycle-0/toolpath.{extension}"))).unwrap();
@@ -41,7 +41,7 @@ fn a_part_is_ground_by_the_programs_of_every_dialect_until_it_is_accepted() {
     }
 }
 
-/// Makes the small mirror with a wheel that leans, in a simulated cell with this head.
+/// Makes the small mirror with a tilted wheel, in a simulated cell with this head.
 fn tilted(tilt: &str, dialect: &str, rotary: &str) -> (tempfile::TempDir, i32, String, String) {
     let home = tempfile::tempdir().unwrap();
     fs::create_dir(home.path().join("programs")).unwrap();
@@ -71,7 +71,7 @@ fn a_part_is_ground_by_a_ball_that_leans_until_it_is_accepted() {
         let program = fs::read_dir(home.path().join("programs")).unwrap().next().unwrap().unwrap().path();
         let text = fs::read_to_string(program).unwrap();
         assert!(text.lines().filter(|line| line.contains("B-")).count() > 1000, "{dialect}");
-        // A table of Z knows of no tilt.
+        // A table of Z values contains no tilt.
         let kept = only_run(&home.path().join("runs"));
         assert!(!kept.join("cycle-0/toolpath_z.csv").exists());
     }
@@ -113,7 +113,7 @@ fn a_part_is_ground_along_arcs_until_it_is_accepted() {
 
 #[test]
 fn arcs_that_cannot_be_written_so_exactly_are_refused_before_anything_moves() {
-    // Four decimals move points by 0.087 um; and the lines of the recipe are within 0.1 um.
+    // Four decimals move points by 0.087 µm. The lines of the recipe are within 0.1 µm.
     for (dialect, um, told) in
         [("heidenhain", "0.05", "grinder.program.arcs_within_um"), ("sinumerik", "0.2", "grinding.chord_error_um")]
     {

@@ -1,5 +1,5 @@
-//! What can be wrong with a cell, each put into the simulated world: every one is caught before or at the first bad cycle, in
-//! words that a person can act on, and no part is accepted.
+//! Faults of a cell, each put into the simulated world. Every fault is caught before or at the first bad cycle, with a
+//! message that a person can act on, and no part is accepted.
 
 #![cfg(unix)]
 
@@ -10,7 +10,8 @@ use regrind_sim::spec::{Faults, Mirrored, Misreported};
 
 const RECIPE: &str = "freeform-mirror";
 
-/// The whole pattern tells no more of what is wrong than a quarter of it, and takes three times as long.
+/// Returns the usual setup. The whole pattern shows no more of a fault than a quarter of it, and takes three times as
+/// long.
 fn usual() -> Setup {
     Setup { coarse: !all(), ..Setup::new(RECIPE, 1) }
 }
@@ -19,7 +20,8 @@ fn broken(faults: Faults) -> Setup {
     usual().with(move |world| world.faults = faults.clone())
 }
 
-/// The first alarm must be this one, say these words, and come after so many passes; nothing is accepted, and no further pass is begun.
+/// Checks that the first alarm is this one, contains these words and comes after this number of passes; that nothing is
+/// accepted; and that no further pass starts.
 fn caught(what: &str, setup: Setup, alarm: AlarmId, words: &[&str], passes: usize) -> Ran {
     let ran = run(setup);
     let told = format!("{what}: {}", ran.told());
@@ -41,7 +43,7 @@ fn caught(what: &str, setup: Setup, alarm: AlarmId, words: &[&str], passes: usiz
     ran
 }
 
-/// What is wrong in words and as a fault of the world, the first alarm, and words that it says.
+/// Name of the fault, the fault of the world, the first alarm, and the words that it contains.
 type Case = (&'static str, Faults, AlarmId, &'static [&'static str]);
 
 fn each_is_caught<const N: usize>(cases: [Case; N], passes: usize) {
@@ -143,12 +145,12 @@ fn a_measurement_outside_its_window_of_temperature_is_not_used() {
 
 #[test]
 fn a_warm_part_is_judged_by_what_it_is_at_20_degrees() {
-    // Ten kelvins at 8e-6 a kelvin: a curved part swells out of its own shape.
+    // Ten kelvins at 8e-6 a kelvin: a curved part grows out of its nominal shape.
     let at = |temperature_c: f64, expansion_um_m_k: Option<f64>| {
         let setup = Setup { expansion_um_m_k, ..usual() };
         let setup = setup.with(move |world| {
             (world.cmm.part_temperature_c, world.cmm.cte_per_k, world.cmm.noise_um) = (temperature_c, 8e-6, 0.05);
-            // A part that has grown is touched at other places of its scallops.
+            // A part that has grown is touched at other positions of its scallops.
             world.grinder.scallops = false;
         });
         let ran = run(setup);
@@ -182,7 +184,8 @@ fn a_probe_that_is_10_um_off_is_told_from_the_reference_sphere() {
 #[test]
 fn a_part_that_lies_turned_round_is_told() {
     let faults = Faults { part_turned_180: true, ..Faults::default() };
-    // The probe meets the steep part in the air, and the machine stops by itself; the alarm must still send a person to the part.
+    // The probe meets the steep part during a free move, and the machine stops by itself. The alarm must still send a
+    // person to the part.
     let words = ["see how the part lies", "turned round"];
     let ran = caught("a steep part", broken(faults.clone()), AlarmId::MachineFault, &words, 1);
     assert!(matches!(ran.ending, Ending::Aborted { cycle: 1, confirmed: true, .. }), "{}", ran.told());

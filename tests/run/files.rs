@@ -1,4 +1,4 @@
-//! What docs/file-exchange.md says to type, typed.
+//! Runs the commands of docs/file-exchange.md as they are written there.
 
 use std::fs;
 use std::io::Write;
@@ -13,7 +13,8 @@ use serde::Deserialize as _;
 use crate::first_touches::{file_cell, hand_in, measured, open_plan};
 use crate::program::{Running, only_run, regrind, replaced, root, run, small_recipe};
 
-/// A folder with all that ships, prepared as the page says; returns the arguments of the run that it begins.
+/// Creates a folder with all shipped files, prepared as the page says. Returns the arguments of the run that the page
+/// starts.
 fn shop() -> (tempfile::TempDir, Vec<String>) {
     let home = tempfile::tempdir().unwrap();
     for folder in ["config", "recipes"] {
@@ -32,7 +33,7 @@ fn shop() -> (tempfile::TempDir, Vec<String>) {
     (home, arguments)
 }
 
-/// Waits until the plan lies in the outbox.
+/// Waits until the plan is in the outbox.
 fn until_handed_over(running: &mut Running, home: &Path) {
     let outbox = home.join("exchange/cmm/out");
     running.until("a plan in the outbox", |_| {
@@ -62,7 +63,7 @@ fn the_commands_of_the_page_begin_a_run_that_hands_over_its_first_plan() {
 fn enter_at_the_terminal_that_asks_confirms_the_part() {
     let (home, arguments) = shop();
     let program = regrind(&[], home.path());
-    // `script` gives it a terminal of its own.
+    // `script` gives the program its own terminal.
     let typed = format!("{} {}", program.get_program().display(), arguments.join(" "));
     let mut command = Command::new("script");
     command.args(["-qec", &typed, "/dev/null"]).current_dir(home.path()).env("REGRIND_KEY", "").stdin(Stdio::piped());
@@ -78,7 +79,7 @@ fn enter_at_the_terminal_that_asks_confirms_the_part() {
     assert_eq!(running.end().0, 1);
 }
 
-/// Each wrong result is left alone, and the plan stays open for the right one.
+/// Each wrong result is ignored, and the plan stays open for the right one.
 #[test]
 fn a_wrong_or_short_result_uses_up_no_cycle() {
     let home = tempfile::tempdir().unwrap();
@@ -91,7 +92,7 @@ fn a_wrong_or_short_result_uses_up_no_cycle() {
     let world = World::new(WorldSpec::deserialize(toml::Value::Table(table)).unwrap()).unwrap();
     let mut running = Running::new(regrind(&["run", "small.toml", "--cell", "cell.toml", "--loaded", "--json"], home));
 
-    // The plan's own places instead of what was found, a file that broke off, the rows in another order.
+    // The plan's own positions instead of the measured ones, a truncated file, and rows in another order.
     let given_back = |plan: &Path, _: &str| {
         let rows = fs::read_to_string(plan.join("plan.csv")).unwrap();
         let rows = rows.lines().filter(|row| !row.starts_with('#')).skip(1);
@@ -114,7 +115,7 @@ fn a_wrong_or_short_result_uses_up_no_cycle() {
         assert_eq!(open_plan(&mut running, home), plan, "{what}");
     }
     hand_in(home, &right);
-    // It is judged, and the next pass is handed over.
+    // The result is judged, and the next pass is handed over.
     let outbox = home.join("exchange/grinder/out");
     running.until("a pass in the outbox of the grinder", |_| {
         let mut names = fs::read_dir(&outbox).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());

@@ -1,4 +1,5 @@
-//! What is wrong with a measurement whose touches are chosen is found at the first ten, whatever brings them: a serial line, or files.
+//! With chosen touches, a fault of the measurement is found within the first ten, whether the results come over a
+//! serial line or as files.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,7 +14,7 @@ use regrind_sim::world::World;
 use serde::Deserialize as _;
 use serde_json::Value;
 
-/// What is wrong, by what of the recipe's world is exchanged for it, and the alarm that tells it.
+/// Fault, the replacement in the recipe's world that causes it, and the alarm that reports it.
 const WRONG: [(&str, [&str; 2], &str); 4] = [
     (
         "mirrored",
@@ -29,7 +30,8 @@ const WRONG: [(&str, [&str; 2], &str); 4] = [
     ("wrong part", ["i = 3, j = 0, value_mm = 2.6", "i = 3, j = 0, value_mm = 3.4"], "registration_failed"),
 ];
 
-/// The free-form recipe with touches that are chosen, of a part that is measured first, in such a world.
+/// Returns the free-form recipe with chosen touches, for a part that is measured first, in a world with this
+/// replacement.
 fn recipe([from, to]: [&str; 2]) -> String {
     changed(
         "recipes/freeform-mirror.toml",
@@ -42,7 +44,7 @@ fn recipe([from, to]: [&str; 2]) -> String {
     )
 }
 
-/// Waits for the alarm of a run, ends it, and returns how many targets of the part it had touched by then.
+/// Waits for the alarm of a run and ends the run. Returns how many targets of the part were touched by then.
 fn touched_until(running: &mut Running, folder: &Path, alarm: &str, what: &str) -> u64 {
     let name = format!("\"{alarm}\"");
     running.line("alarm", |line| line.contains("\"clears\""));
@@ -56,7 +58,7 @@ fn touched_until(running: &mut Running, folder: &Path, alarm: &str, what: &str) 
     collected.map(|event| event["targets"].as_u64().unwrap()).sum()
 }
 
-/// Waits for the run below a home.
+/// Waits for the run below a home folder and returns its folder.
 fn begun_run(home: &Path, running: &mut Running) -> PathBuf {
     running.until("a run folder", |_| run_folders(&home.join("runs")).pop())
 }
@@ -92,7 +94,7 @@ fn by_files() {
     }
 }
 
-/// A cell by files beside the recipe, its machines where those of the simulation stand.
+/// Writes a cell file with file-exchange machines next to the recipe, aligned as the simulated machines are.
 pub(crate) fn file_cell(home: &Path) {
     for folder in ["cmm/in", "cmm/out", "grinder/in", "grinder/out"] {
         fs::create_dir_all(home.join("exchange").join(folder)).unwrap();
@@ -114,7 +116,7 @@ pub(crate) fn file_cell(home: &Path) {
     fs::write(home.join("cell.toml"), text).unwrap();
 }
 
-/// Does what the person at the measuring machine does: takes the plan, touches, and hands in what was found.
+/// Does the work of the person at the measuring machine: takes the plan, touches, and hands in the result.
 fn measure_once(running: &mut Running, home: &Path, world: &World) {
     let handed_over = open_plan(running, home);
     let result = measured(&handed_over, world);
@@ -126,12 +128,12 @@ pub(crate) fn open_plan(running: &mut Running, home: &Path) -> PathBuf {
     let outbox = home.join("exchange/cmm/out");
     running.until("a plan in the outbox", |_| {
         let names = fs::read_dir(&outbox).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
-        // It gets its name when it is whole, and another end of it when it is over.
+        // The folder gets its final name when it is complete, and another suffix when it is finished.
         names.filter(|name| !name.contains('.')).map(|name| outbox.join(name)).next()
     })
 }
 
-/// Touches what a plan asks for and returns the result file: a row a point, index and centre.
+/// Touches the targets of a plan and returns the result file: one row per point, with index and ball centre.
 pub(crate) fn measured(handed_over: &Path, world: &World) -> String {
     let told: Value = serde_json::from_slice(&fs::read(handed_over.join("plan.json")).unwrap()).unwrap();
     let rows = fs::read_to_string(handed_over.join("plan.csv")).unwrap();
@@ -153,13 +155,13 @@ pub(crate) fn measured(handed_over: &Path, world: &World) -> String {
     format!("# plan: {}\nindex,x,y,z\n{}", told["plan"].as_str().unwrap(), found.map(row).collect::<String>())
 }
 
-/// Puts a result into the inbox, named when it is whole.
+/// Puts a result into the inbox, and gives it its final name when it is complete.
 pub(crate) fn hand_in(home: &Path, result: &str) {
     fs::write(home.join("result.csv"), result).unwrap();
     fs::rename(home.join("result.csv"), home.join("exchange/cmm/in/result.csv")).unwrap();
 }
 
-/// A row of a plan: index, point, normal, what it is on.
+/// Parses a row of a plan: index, point, normal, and the object that it belongs to.
 fn target(row: &str) -> Target {
     let cells: Vec<&str> = row.split(',').collect();
     let three = |from: usize| std::array::from_fn(|k| cells[from + k].parse().unwrap());

@@ -1,11 +1,12 @@
-//! Files of a run that somebody moves away while it is on: nothing is started without its record, and nothing is lost where they come back.
+//! Files of a run that somebody moves away while it is active: nothing starts without its record, and nothing is lost
+//! if they come back.
 
 use std::fs;
 use std::path::Path;
 
 use crate::program::{Running, records_with, regrind, root, run, small_recipe};
 
-/// A run that grinds, and its folder.
+/// Starts a run that grinds, and returns it with its folder.
 fn grinding(home: &Path) -> (Running, std::path::PathBuf) {
     let recipe = small_recipe(home, 400.0).display().to_string();
     let cell = root().join("config/sim.toml").display().to_string();
@@ -57,7 +58,7 @@ fn a_record_that_is_deleted_ends_with_the_run_and_no_further_pass_is_started() {
     running.line("the alarm", |line| line.contains("was deleted, renamed or exchanged"));
     let path = folder.display().to_string();
     running.until("a held cell", |_| run(&["status", &path], home.path()).1.contains("Held").then_some(()));
-    // The order that makes safe is carried out, and the person is told that it is not on record.
+    // The safety order is carried out, and the person learns that it is not on record.
     let (code, _, told) = run(&["abort", &path], home.path());
     assert!(code == 3 && told.contains("not on record"), "{told}");
     let (code, errors) = running.end();
@@ -73,12 +74,12 @@ fn a_control_socket_that_is_deleted_is_told_and_made_again_and_orders_come_in_me
     let (mut running, folder) = grinding(home.path());
     let (socket, path) = (folder.join("control.sock"), folder.display().to_string());
     fs::remove_file(&socket).unwrap();
-    // By the door beside the lock of the machines, for as long as there is none in the folder.
+    // While the folder has no socket, the order goes through the socket next to the lock of the machines.
     let (code, told, errors) = run(&["hold", &path, "--reason", "the socket is gone"], home.path());
     assert_eq!(code, 0, "{told}{errors}");
     running.line("the alarm", |line| line.contains("The way by which orders reach the cell was taken away"));
     running.until("a socket that is made again", |_| socket.exists().then_some(()));
-    // Something else in its place is no door, and is left alone.
+    // Another file in place of the socket is not a socket, and is left alone.
     fs::remove_file(&socket).unwrap();
     fs::write(&socket, "mine").unwrap();
     running.until("another alarm", |said| {
@@ -100,7 +101,8 @@ fn a_cell_whose_runs_folder_is_deleted_takes_orders_all_the_same() {
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path());
     fs::rename(home.path().join("runs"), home.path().join("moved")).unwrap();
-    // Found without its name, by its machines; what is not on record is told, and done.
+    // The run is found by its machines, without its name. The abort is carried out, and the person learns that it is
+    // not on record.
     let (code, told, errors) = run(&["abort"], home.path());
     assert!(code == 3 && errors.contains("not on record"), "{code} {told}{errors}");
     let (code, errors) = running.end();

@@ -1,7 +1,8 @@
-//! Nothing that is computed delays what is said to the machines: beats and orders while 451,401 points are registered and compensated.
+//! No computation delays the communication with the machines: heartbeats and orders while 451,401 points are registered
+//! and compensated.
 //!
-//! The machines, their wires and the drive are those of every simulated run. Only the points do not all come over the wire: between
-//! driver and drive stands a measuring machine that measures the first few targets and makes up the rest.
+//! The machines, their wires and the drive are those of every simulated run. Only the points do not all come over the
+//! wire: between driver and drive is a measuring machine that measures the first few targets and synthesizes the rest.
 
 use std::time::Duration;
 
@@ -14,10 +15,10 @@ use regrind::device::{
 use regrind::drive::{Drive, Request};
 
 const POINTS: usize = 451_401;
-/// Targets that are really measured: the reference sphere and a few.
+/// Number of targets that are really measured: the reference sphere and a few more.
 const FEW: usize = 40;
 
-/// A measuring machine that makes most of its points up.
+/// Measuring machine that synthesizes most of its points.
 struct Generous {
     cmm: ModbusCmm,
     wanted: Option<Plan>,
@@ -45,7 +46,7 @@ impl Cmm for Generous {
         let plan = self.wanted.as_ref().expect("a plan was loaded");
         let sample = measured.points[0];
         let points = plan.targets.iter().map(|t| {
-            // Waves of 10 um, so that there is something to compensate.
+            // Waves of 10 µm, so that there is something to compensate.
             let [x, y, _] = t.point_mm;
             let proud_mm = if (t.index as usize) < FEW { 0.0 } else { 0.01 * (x / 9.0).sin() * (y / 7.0).cos() };
             let out_mm = plan.probe_radius_mm + proud_mm;
@@ -67,7 +68,7 @@ fn recipe() -> regrind::recipe::Recipe {
     ])
 }
 
-/// How many beats have come to each machine.
+/// Returns the number of heartbeats that have arrived at each machine.
 fn beats(rig: &Rig) -> [usize; 2] {
     [CMM, GRINDER].map(|machine| rig.came[machine].lock().unwrap().iter().filter(|came| came.beat).count())
 }
@@ -81,7 +82,7 @@ async fn beats_and_orders_stay_on_time_while_451_401_points_are_computed() {
     let cmm = Generous { cmm: ready.cmm, wanted: None, few: 0 };
     let (drive, _orders) = Drive::new(ready.run, cmm, ready.grinder).unwrap();
     let running = tokio::spawn(drive.run());
-    // From the acknowledgement of the measurement on the points are registered.
+    // Registration of the points starts with the acknowledgement of the measurement.
     event(&mut notices, "acknowledged", 2).await;
     let (reply, ..) = order(&folder, Request::Hold { reason: "while it computes".into() }).await;
     assert!(reply.message.starts_with("Holding (Register"), "{}", reply.message);
@@ -99,7 +100,7 @@ async fn beats_and_orders_stay_on_time_while_451_401_points_are_computed() {
     }
     until(&folder, |words| words.starts_with("Held")).await;
     order(&folder, Request::Resume { reason: String::new(), seen: None }).await;
-    // Judged at once; now the map is made of 451,401 deviations.
+    // The judgement is immediate. Now the map is computed from 451,401 deviations.
     let (reply, asked, _) = order(&folder, Request::Abort { reason: "while it computes".into() }).await;
     assert!(reply.taken, "{reply:?}");
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();

@@ -1,4 +1,5 @@
-//! A map of heights as the measurement: from an interferometer's file through the folders of a measuring machine to an accepted part.
+//! A height map as the measurement: from an interferometer's file, through the folders of a measuring machine, to an
+//! accepted part.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -31,31 +32,32 @@ use serde::Deserialize;
 use serde_json::Value;
 use tokio::sync::mpsc;
 
-/// No run takes so long, however loaded the computer is.
+/// Upper bound of the duration of a run, even on a loaded computer.
 const PATIENCE: Duration = Duration::from_secs(300);
 const SPEED: f64 = 50_000.0;
 
 // ---- the interferometer -------------------------------------------------------------------------------------------------------------
 
-/// Samples along x and y, and their distance; the part is 102 x 62 mm.
+/// Number of samples along x and y. The part is 102 x 62 mm.
 const SIZE: [usize; 2] = [120, 80];
 const PITCH_MM: f64 = 0.9;
-/// Where the picture's lower left sample is in the frame of the fixture.
+/// Position of the picture's lower left sample in the frame of the fixture, in mm.
 const CORNER_MM: [f64; 2] = [-53.5, -35.5];
 
-/// Metres as MetroPro writes them: single precision.
+/// Rounds a length to single precision, as MetroPro stores metres.
 fn real(value: f64) -> f32 {
     value as f32
 }
 
-/// An interferometer that looks down on the part: heights in the fixture's frame, each picture at a height of its own.
+/// Interferometer that looks down on the part. Its heights are in the fixture's frame, and each picture has its own
+/// height offset.
 struct Interferometer {
     world: World,
     pictures: u32,
 }
 
 impl Interferometer {
-    /// The height of the real surface over a place of the fixture's frame; none off the part.
+    /// Returns the height of the real surface at a position in the fixture's frame, or `None` off the part.
     fn height(&self, [x, y]: [f64; 2]) -> Option<f64> {
         let placement = self.world.placement();
         let [mut u, mut v] = [x, y];
@@ -74,7 +76,7 @@ impl Interferometer {
         (u.abs() < 50.7 && v.abs() < 30.7).then_some(p[2])
     }
 
-    /// Takes a picture: rows from the top, in millimetres; some samples are lost to dust and dark spots.
+    /// Takes a picture: rows from the top, in mm. Some samples are lost to dust and dark spots.
     fn picture(&mut self) -> Vec<Option<f64>> {
         self.pictures += 1;
         let piston_mm = 0.137 * f64::from(self.pictures) - 0.4;
@@ -89,7 +91,7 @@ impl Interferometer {
     }
 }
 
-/// A MetroPro file of the first header format, written by its description alone.
+/// Writes a MetroPro file of the first header format, from the format's description alone.
 fn metropro([columns, rows]: [usize; 2], pitch_mm: f64, heights_mm: &[Option<f64>]) -> Vec<u8> {
     let mut header = vec![0u8; 834];
     let mut put = |at: usize, bytes: &[u8]| header[at..at + bytes.len()].copy_from_slice(bytes);
@@ -97,7 +99,7 @@ fn metropro([columns, rows]: [usize; 2], pitch_mm: f64, heights_mm: &[Option<f64
     put(0, &0x881b_036fu32.to_be_bytes());
     put(4, &1u16.to_be_bytes());
     put(6, &834u32.to_be_bytes());
-    // A block of intensities of 3 by 2 stands before the phases.
+    // A block of intensities of 3 by 2 precedes the phases.
     for (at, v) in [(52, 3), (54, 2), (56, 1), (68, columns), (70, rows)] {
         put(at, &half(v));
     }
@@ -144,7 +146,8 @@ fn serve_maps(shop: PathBuf, world: World, over: Arc<AtomicBool>, taken: Arc<Mut
     }
 }
 
-/// The shipped mirror, measured wherever the picture shows it; its start is searched for, as no picture says where it was taken.
+/// Returns the shipped mirror, measured wherever the picture shows it. The start pose is searched for, because a
+/// picture does not contain its position.
 fn recipe() -> Recipe {
     let text = changed(
         "recipes/freeform-mirror.toml",
@@ -164,7 +167,7 @@ fn recipe() -> Recipe {
     Recipe::parse(&root().join("recipes/freeform-mirror.toml"), &text).unwrap_or_else(|problems| panic!("{problems}"))
 }
 
-/// A measuring machine by files beside a grinder on Modbus TCP.
+/// Returns a cell with a file-exchange measuring machine and a grinder on Modbus TCP.
 fn cell(shop: &Path, port: u16) -> CellConfig {
     let (inbox, outbox) = (shop.join("in"), shop.join("out"));
     let wire = format!(
@@ -181,7 +184,7 @@ fn cell(shop: &Path, port: u16) -> CellConfig {
     );
     let (head, rest) = text.split_once("[cmm.registers]").unwrap();
     let rest = rest.split_once("[cmm.fixture]").unwrap().1;
-    // The picture's corner is the origin of what it shows.
+    // The corner of the picture is the origin of its frame.
     let fixture = format!("\ntranslation_mm = [{}, {}, 0.0]", -CORNER_MM[0], -CORNER_MM[1]);
     let rest = rest.replacen("\ntranslation_mm = [0.0, 0.0, 0.0]", &fixture, 1);
     let text = format!("{head}[cmm.fixture]{rest}");
@@ -244,7 +247,7 @@ async fn run(seed: u64) -> Ran {
             match notice {
                 Notice::Finished { cycles: rows, .. } => cycles = rows,
                 Notice::Progress { .. } | Notice::State { .. } => {}
-                // A held cell waits for a person, and there is none.
+                // A held cell waits for a person, and this test has no person.
                 Notice::Alarm(alarm) if alarm.clears != Role::Nobody => panic!("{}: {said:#?}", alarm.what),
                 other => said.push(format!("{other:?}")),
             }
@@ -259,8 +262,8 @@ async fn run(seed: u64) -> Ran {
     Ran { ending, cycles, said, folder, world, pictures, _home: home }
 }
 
-/// What stands on the part at the end once the best fit of its pose is taken off, which no measurement can tell from a shift: rms in
-/// micrometres, from the truth alone.
+/// Returns the RMS of the true form error at the end, in µm. It leaves out the best-fit pose, which no measurement can
+/// distinguish from a shift.
 fn true_rms_um(world: &World) -> f64 {
     let places: Vec<[f64; 2]> =
         (0..40 * 30).map(|k| [f64::from(k % 40) * 2.5 - 48.75, f64::from(k / 40) * 2.0 - 29.0]).collect();
@@ -296,9 +299,9 @@ async fn an_interferometers_maps_close_the_loop() {
     assert!(ran.cycles.len() >= 2 && ran.pictures as usize == ran.cycles.len(), "{:?}", ran.cycles);
     let (first, last) = (&ran.cycles[0], ran.cycles.last().unwrap());
     assert!(first.rms_um > 4.0 * last.rms_um && last.rms_um < 1.0 && first.points > 5000, "{:?}", ran.cycles);
-    // What was accepted is what lies there.
+    // The accepted figures agree with the true surface.
     assert!(true_um < 1.0 && (true_um / last.rms_um - 1.0).abs() < 0.2, "{true_um}");
-    // The record holds what was measured and what was made of it.
+    // The record contains the measurement and the results computed from it.
     let cycle = ran.folder.join(format!("cycle-{}", last.cycle));
     let X3pFile::Map(map) = read_x3p(cycle.join("error_map.x3p")).unwrap() else { panic!("a map") };
     assert!(map.grid.columns > 90 && map.measured_count() > 5000 && map.rms_mm() < 1e-3);
@@ -315,7 +318,7 @@ async fn an_interferometers_maps_close_the_loop() {
     for name in ["error_map.csv", "error_map.svg", "error_map.png", "deviations.ply"] {
         assert!(cycle.join(name).is_file(), "{name}");
     }
-    // The report proves the record, and shows them.
+    // The report verifies the record and shows these results.
     let report = fs::read_to_string(regrind::report::write_run_report(&ran.folder).unwrap()).unwrap();
     let notation = figures["iso_10110_5"]["notation"].as_str().unwrap();
     println!("{notation}");
@@ -326,7 +329,7 @@ async fn an_interferometers_maps_close_the_loop() {
 
 // ---- the folders --------------------------------------------------------------------------------------------------------------------
 
-/// What an X3P file says of its map.
+/// Returns the metadata of a map in an X3P file.
 fn record() -> MapRecord {
     MapRecord {
         date: "2026-03-01T12:00:00Z".into(),
@@ -336,7 +339,7 @@ fn record() -> MapRecord {
     }
 }
 
-/// The maps of a small surface in each format, with one sample that was not measured.
+/// Returns the maps of a small surface in each format, with one sample that was not measured.
 fn small_maps(folder: &Path) -> Vec<(PathBuf, HeightMap)> {
     let sample = |k: usize| (k != 7).then_some(1e-3 * (k as f64 - 5.0));
     let map = HeightMap::new(
@@ -380,7 +383,8 @@ fn every_kind_of_map_is_a_measurement_of_contact_points() {
     }
 }
 
-/// Lets the folders of a measuring machine find a map as the answer to a plan.
+/// Puts a map into the folders of a measuring machine as the answer to a plan. Returns the measurement, if there is
+/// one, and the messages.
 fn exchanged(map: &Path, content: Content) -> (Option<Measurement>, Vec<String>) {
     let home = tempfile::tempdir().unwrap();
     let [inbox, outbox] = ["in", "out"].map(|name| home.path().join(name));
@@ -455,7 +459,7 @@ fn a_map_is_registered_from_the_command_line_as_contact_points() {
     let truth: [f64; 3] = [dx, dy, dz];
     assert!((0..3).all(|k| (pose.translation_mm[k] - truth[k]).abs() < 1e-3) && pose.angle_rad() < 1e-4, "{pose:?}");
     assert_eq!(json["points"], map.measured_count());
-    // A ball that never was there must not be taken off.
+    // No probe radius must be subtracted, because a map has no probe ball.
     let (code, _, told) = register(&["--probe-radius", "1.5"]);
     assert_eq!(code, 2, "{told}");
     assert!(told.contains("--method contact"), "{told}");

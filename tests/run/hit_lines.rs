@@ -1,4 +1,4 @@
-//! A whole run with a measuring machine that prints its hits on a serial line without hardware.
+//! A whole run, without hardware, with a measuring machine that prints its hits on a serial line.
 #![cfg(unix)]
 
 use std::fs;
@@ -22,7 +22,7 @@ fn a_part_is_made_by_the_lines_of_a_machine_that_hears_nothing() {
     let (code, errors) = program.end();
     assert_eq!(code, 0, "{}\n{errors}", program.said.join("\n"));
     assert!(program.said.iter().any(|line| line.contains("cycle-1/plan.csv")), "{}", program.said.join("\n"));
-    // Each line is kept as it came, with the target that it was taken for.
+    // Each line is stored as it arrived, with the target that it was assigned to.
     let lines = fs::read_to_string(folder.join("cycle-1/hits.jsonl")).unwrap();
     let targets = fs::read_to_string(folder.join("cycle-1/plan.csv")).unwrap();
     let targets = targets.lines().filter(|line| line.starts_with(|c: char| c.is_ascii_digit())).count();

@@ -1,4 +1,4 @@
-//! A whole run with a measuring machine behind I++ DME, and one that is only looked at.
+//! A whole run with a measuring machine that is connected by I++ DME, and a machine that is only inspected.
 
 use serde_json::Value;
 

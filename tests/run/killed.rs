@@ -1,4 +1,5 @@
-//! The program is killed in the middle of a run, as often as is drawn, and `regrind resume` goes on with it to its end.
+//! The program is killed in the middle of a run, a random number of times, and `regrind resume` continues it to its
+//! end.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -15,10 +16,10 @@ use rand::{RngExt as _, SeedableRng as _};
 use regrind::journal::{Kind, Reader, verify};
 use regrind_sim::seen::What;
 
-/// How often a part's program is killed at most.
+/// Maximum number of kills of a part's program.
 const MOST_KILLS: usize = 3;
 
-/// A cell whose machines outlive the program, and files for the program to run it by.
+/// Starts a cell whose machines outlive the program, and writes the files that the program needs to run it.
 async fn cell_that_stays() -> (Rig, PathBuf) {
     let rig = Rig::new(small(12, 8, 5000.0)).await;
     let home = rig.home.path().to_owned();
@@ -29,7 +30,7 @@ async fn cell_that_stays() -> (Rig, PathBuf) {
     (rig, home)
 }
 
-/// Runs a part whose program is killed at drawn moments. Returns its folder and how often it was killed.
+/// Runs a part whose program is killed at random moments. Returns its folder and the number of kills.
 pub fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
     let mut chance = StdRng::seed_from_u64(seed);
     let runs = format!("runs-{seed}");
@@ -52,7 +53,7 @@ pub fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
             Some(code) => assert!(running.has_been_told("begin a new run"), "seed {seed}, {code}: {:#?}", running.told),
             None => kills += 1,
         }
-        // It may have been killed before it had begun its record, or asked anything of a machine.
+        // The program may have been killed before it started its record, or before it sent anything to a machine.
         let run = folder().filter(|_| ended.is_none());
         let arguments = match &run {
             Some(run) => vec!["resume", run.to_str().unwrap(), "--json"],
@@ -65,7 +66,7 @@ pub fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
     }
 }
 
-/// The record is whole and all on it, and no START was taken twice.
+/// Checks that the record is complete and contains every file, and that no START was accepted twice.
 fn is_whole(folder: &Path, seed: u64) {
     let verified = verify(folder).unwrap();
     assert!(
@@ -81,7 +82,7 @@ fn is_whole(folder: &Path, seed: u64) {
     assert_eq!(started.len(), all, "seed {seed}: a START was taken twice");
 }
 
-/// Every pass and every measurement began at most once, in the record and at the machines.
+/// Checks that every pass and every measurement started at most once, in the record and at the machines.
 fn hold_against(rig: &Rig, folder: &Path, seed: u64) {
     is_whole(folder, seed);
     let begun = &Reader::open(folder).unwrap().records(0).next().unwrap().unwrap().value()["content"];
@@ -130,11 +131,11 @@ fn over_a_serial_line_too() {
     let (folder, kills) = run_with_kills(home.path(), 21);
     println!("{kills} kills");
     is_whole(&folder, 21);
-    // Two machines, two passes at least; the first program may have been killed before it had a record of its part.
+    // Two machines and at least two passes. The first program may have been killed before it had a record of its part.
     assert!(began_once(home.path()) >= 4);
 }
 
-/// A run that was killed as it ground, and the folder of it.
+/// Runs a part whose program is killed while it grinds, and returns the folder of the run.
 fn killed_at_work(home: &Path) -> PathBuf {
     let arguments = ["run", "part.toml", "--cell", "cell.toml", "--json"];
     let mut running = Running::new(regrind(&arguments, home));
@@ -148,7 +149,7 @@ async fn a_file_that_is_on_no_record_decides_nothing() {
     let (_rig, home) = cell_that_stays().await;
     tokio::task::spawn_blocking(move || {
         let folder = killed_at_work(&home);
-        // Somebody lays there what a run begins with that has learned from another one.
+        // Somebody adds the file with which a run starts that has learned from another run.
         fs::write(folder.join("learned_from.json"), "{}").unwrap();
         let path = folder.to_str().unwrap();
         let mut running = Running::new(regrind(&["resume", path, "--json"], &home));
@@ -178,7 +179,7 @@ async fn a_record_whose_last_lines_are_lost_is_not_gone_on_with_unasked() {
             assert!(code == 1 && told.contains("may be lost") && told.contains("regrind recover"), "{name}: {told}");
             fs::rename(&away, &there).unwrap();
         }
-        // A cycle of which the record knows nothing.
+        // A cycle that is not in the record.
         fs::create_dir(folder.join("cycle-7")).unwrap();
         let (code, told) = resumed(&[]);
         assert!(code == 1 && told.contains("files of cycle 7"), "{told}");
@@ -215,7 +216,7 @@ fn killed_while(home: &Path, moment: &str) -> PathBuf {
 fn recover(home: &Path, typed: &str) -> (i32, String) {
     let mut command = regrind(&["recover", "--cell", "cell.toml"], home);
     let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    // It may need none of it.
+    // The program may read none of the input.
     let _ = child.stdin.take().unwrap().write_all(typed.as_bytes());
     let output = child.wait_with_output().unwrap();
     let said = [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap()).join("");
@@ -229,13 +230,13 @@ async fn machines_that_hold_what_no_run_knows_are_brought_home_step_by_step() {
         let run = killed_while(&home, "\"event\":\"started\"");
         let name = run.file_name().unwrap().to_str().unwrap().to_owned();
         fs::rename(&run, home.join("kept")).unwrap();
-        // Nothing is done by a word that is none.
+        // An invalid confirmation has no effect.
         let (code, said) = recover(&home, "yes\nyes\n");
         assert_eq!(code, 3, "{said}");
         assert!(!said.contains(&name), "{said}");
         let (code, said) = recover(&home, &"STOP\nACKNOWLEDGE\nCLEAR\n".repeat(4));
         assert!(code == 0 || code == 3, "{said}");
-        // Whatever the CMM had come to by then: each word given in turn brings it home in the end.
+        // In whatever state the CMM is by then, one confirmation after the other recovers it in the end.
         for _ in 0..4 {
             for word in ["STOP\n", "ACKNOWLEDGE\n", "CLEAR\n"] {
                 recover(&home, word);
@@ -265,7 +266,7 @@ async fn what_cannot_be_taken_up_again_is_refused_before_anything_is_commanded()
         crate::program::run(&all, &home)
     };
     let run = run.to_str().unwrap();
-    // Another part than the one that the run began with.
+    // Another part than the one that the run started with.
     let recipe = Path::new(run).join("recipe.toml");
     let text = fs::read_to_string(&recipe).unwrap();
     fs::write(&recipe, text.replacen("rows = 8", "rows = 9", 1)).unwrap();
@@ -276,7 +277,7 @@ async fn what_cannot_be_taken_up_again_is_refused_before_anything_is_commanded()
     assert!(code == 2 && said.contains("nowhere"), "{said}");
     assert_eq!(commands(&rig), before, "nothing was commanded");
 
-    // A run whose machines lived in the program itself.
+    // A run whose machines were part of the program itself.
     let own = crate::program::changed("config/sim.toml", &[]);
     fs::write(home.join("sim.toml"), own).unwrap();
     let mut running =

@@ -1,4 +1,5 @@
-//! From part to part: what one run found to come back in every pass is what the next one begins with, or it says why not.
+//! Learning from part to part: the repeatable error that one run estimated is the start of the next run, or the next
+//! run reports why not.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,7 +8,7 @@ use serde_json::Value;
 
 use crate::program::{replaced, root, run, run_folders};
 
-/// A folder of runs, and a recipe that learns.
+/// A folder of runs, and a recipe with learning.
 struct Shop {
     home: tempfile::TempDir,
     recipe: String,
@@ -22,7 +23,7 @@ impl Shop {
         Self { home: tempfile::tempdir().unwrap(), recipe }
     }
 
-    /// Runs a recipe, or plans it; returns the exit code and all that was said.
+    /// Runs or plans a recipe. Returns the exit code and all output.
     fn give(&self, command: &str, recipe: &str) -> (i32, String) {
         fs::write(self.home.path().join("wave.toml"), recipe).unwrap();
         let cell = root().join("config/sim.toml");
@@ -30,7 +31,7 @@ impl Shop {
         (code, format!("{out}\n{err}"))
     }
 
-    /// Runs a recipe to its end and returns its folder.
+    /// Runs a recipe to its end. Returns its folder and all output.
     fn ran(&self, recipe: &str) -> (PathBuf, String) {
         let before = self.folders();
         let (code, said) = self.give("run", recipe);
@@ -45,7 +46,7 @@ impl Shop {
     }
 }
 
-/// RMS of the part after the first pass, as it was measured.
+/// Returns the measured RMS of the part after the first pass, in mm.
 fn first_rms_mm(run: &Path) -> f64 {
     let document: Value = serde_json::from_slice(&fs::read(run.join("cycle-1/registration.json")).unwrap()).unwrap();
     document["rms_mm"].as_f64().expect("registration.json tells rms_mm")
@@ -62,7 +63,7 @@ fn a_part_begins_with_what_the_one_before_it_told() {
     assert!(said.contains(&format!("begins with what {name} found")), "{said}");
     let [before, after] = [&first, &second].map(|run| first_rms_mm(run));
     assert!(after < 0.5 * before, "the first pass left {before} mm, and that of the next part {after} mm");
-    // The record holds what it began with, and what the first pass was ground by.
+    // The record contains the initial state, and the correction of the first pass.
     let recorded = |folder: &Path| run(&["audit", "export", folder.to_str().unwrap()], shop.home.path()).1;
     for name in ["correction.csv", "toolpath.ngc", "toolpath_z.csv"] {
         for (run, cycle, there) in [(&first, 0, false), (&first, 1, true), (&second, 0, true)] {
@@ -75,12 +76,12 @@ fn a_part_begins_with_what_the_one_before_it_told() {
     let (code, _, errors) = run(&["audit", "verify", second.to_str().unwrap()], shop.home.path());
     assert_eq!(code, 0, "{errors}");
 
-    // A plan does not know which run that will be.
+    // A plan does not know which run it will start from.
     let plan = |recipe: &str| shop.give("plan", recipe).1;
     assert!(plan(&shop.recipe).contains("begins with the correction that the last one like it left"));
     assert!(!plan(&replaced(&shop.recipe, "learn = true", "learn = false")).contains("begins with"));
 
-    // Another way of choosing the gain is another thing to learn.
+    // Another rule for the gain makes the learned state incompatible.
     let (_, said) = shop.ran(&replaced(&shop.recipe, "learn = true", "learn = true\ngain = 0.8"));
     assert!(said.contains("begins from nothing"), "{said}");
 }
@@ -100,7 +101,7 @@ fn what_cannot_be_begun_with_is_refused() {
     refused(&small, &["more than the 0.50 um", "raise largest_correction_um", "learn = false"]);
     let measured_first = replaced(&shop.recipe, "most_cycles = 2", "most_cycles = 2\nbegin_with = \"measure\"");
     refused(&measured_first, &["compensation.learn", "leave one of the two out"]);
-    // A file that has come to harm is told, and in nobody's way.
+    // A damaged file is reported, and blocks nothing.
     fs::write(first.join("learned.json"), "{").unwrap();
     let (_, said) = shop.ran(&shop.recipe);
     assert!(

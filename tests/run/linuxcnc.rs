@@ -1,8 +1,8 @@
-//! A whole part that LinuxCNC itself grinds: it runs the program of every pass, the simulated wheel follows the path that it executed, and the
-//! simulated probe touches what that left.
+//! LinuxCNC grinds a whole part: it runs the program of every pass, the simulated wheel follows the path that LinuxCNC
+//! executed, and the simulated probe touches the resulting surface.
 //!
-//! Each test runs itself again in namespaces of its own, where ports, shared memory, locks and processes are nobody else's and end with it.
-//! LinuxCNC goes by its own clock: nothing here is judged by time.
+//! Each test runs itself again in its own namespaces, where ports, shared memory, locks and processes are private and
+//! end with it. LinuxCNC uses its own clock, so nothing here is judged by time.
 
 use std::fs;
 use std::io::Write;
@@ -18,11 +18,12 @@ use serde_json::Value;
 use crate::namespaces::{ACCOUNT, in_namespaces};
 use crate::program::{Running, changed, only_run, regrind, replaced, root, run, run_folders};
 
-/// LinuxCNC does not run as root, and that account has a home of its own.
+/// LinuxCNC does not run as root, and its account has its own home.
 const AT_HOME: [&str; 2] = ["env", "HOME=/tmp/home"];
 const FOLDER: &str = "/tmp/regrind-linuxcnc";
 
-/// Runs a test beside a controller of its own, for every controller here has the same address; `name` is its path in this program.
+/// Runs a test with its own controller. It needs its own namespaces because every controller here has the same address.
+/// `name` is the path of the test in this program.
 fn beside_linuxcnc(name: &str, test: impl FnOnce(&Path)) {
     in_namespaces(name, |home| {
         let _controller = controller();
@@ -30,9 +31,9 @@ fn beside_linuxcnc(name: &str, test: impl FnOnce(&Path)) {
     });
 }
 
-/// Starts LinuxCNC as it is shipped, by an account of its own.
+/// Starts LinuxCNC with the shipped configuration, under its own account.
 fn controller() -> Running {
-    // Where that account finds it.
+    // A place that this account can read.
     let shipped = root().join("config/linuxcnc");
     let script = format!(
         "cp -r {} /tmp/linuxcnc; chmod -R a+rX /tmp/linuxcnc; mkdir /tmp/home {FOLDER}; chown 65534:65534 /tmp/home {FOLDER}",
@@ -46,7 +47,8 @@ fn controller() -> Running {
     controller
 }
 
-/// The middle of the shipped free-form mirror, in a fixture that holds it to microns, with a feed at which a pass takes seconds.
+/// Returns the middle of the shipped free-form mirror, in a fixture that is accurate to micrometres, with a feed at
+/// which a pass takes seconds.
 fn recipe(home: &Path, [pv_um, rms_um]: [f64; 2]) -> String {
     let limits = (format!("pv_um = {pv_um:.1}"), format!("rms_um = {rms_um:.1}"));
     let changes = [
@@ -66,7 +68,7 @@ fn recipe(home: &Path, [pv_um, rms_um]: [f64; 2]) -> String {
         ("spark_out_passes = 1", "spark_out_passes = 0"),
         ("radius_mm = 12.5", "radius_mm = 25.0"),
         ("stock_um = 200.0", "stock_um = 60.0"),
-        // The lag goes with the feed, which is twenty times the usual one.
+        // The lag is proportional to the feed, which is twenty times the usual one.
         ("[simulation]\nseed = 1", &format!("[simulation]\nseed = 1\nspeed = 2000.0\n\n{SIMULATION}")),
     ];
     let path = home.join("part.toml");
@@ -85,7 +87,7 @@ loading_shift_um = 1.0
 loading_turn_deg = 0.0005
 ";
 
-/// The shipped cell, whose programs are run by another account here.
+/// Returns the shipped cell, whose programs another account runs here.
 fn cell(home: &Path) -> String {
     let words: Vec<String> =
         ACCOUNT.iter().chain(&AT_HOME).chain(&["/tmp/linuxcnc/executed-path"]).map(|w| format!("{w:?}")).collect();
@@ -96,7 +98,7 @@ fn cell(home: &Path) -> String {
     path.display().to_string()
 }
 
-/// What the programs wrote of themselves while LinuxCNC ran them, in the order of their cycles.
+/// Returns the records that the programs wrote while LinuxCNC ran them, in order of their cycles.
 fn records() -> Vec<String> {
     let entries = fs::read_dir(format!("{FOLDER}/programs")).unwrap().map(|entry| entry.unwrap().path());
     let mut files: Vec<_> = entries.filter(|path| path.extension().is_some_and(|e| e == "log")).collect();
@@ -104,14 +106,14 @@ fn records() -> Vec<String> {
     files.iter().map(|file| fs::read_to_string(file).unwrap()).collect()
 }
 
-/// Whether a program began and ended once, after one preparation.
+/// Returns true if a program started and ended exactly once, after one preparation.
 fn ran_once(record: &str) -> bool {
     let words: Vec<&str> = record.lines().collect();
     matches!(words[..], [prepared, "begin", "end"] if prepared.starts_with("prepared "))
 }
 
-/// Lets a run go to its end, with a person beside it who lets it go on where it holds: LinuxCNC may be kept waiting on a busy computer until the
-/// cell holds before the step that it does not answer. Returns what was said.
+/// Follows a run to its end and resumes it wherever it holds, as a person would. On a busy computer LinuxCNC may have
+/// to wait until the cell holds before the step that it does not answer. Returns the output.
 fn to_its_end(mut running: Running, home: &Path) -> String {
     let folder = || run_folders(&home.join("runs")).pop();
     while !running.is_over() {
@@ -120,7 +122,7 @@ fn to_its_end(mut running: Running, home: &Path) -> String {
             && status.status.state == StateName::Held
         {
             let resume = Request::Resume { reason: "seen".into(), seen: Some(status.status.number) };
-            // It may have gone on meanwhile.
+            // The run may have continued meanwhile.
             let _ = ask(&folder, &resume);
         }
         std::thread::park_timeout(Duration::from_millis(50));
@@ -137,7 +139,7 @@ fn to_its_end(mut running: Running, home: &Path) -> String {
 fn a_part_is_ground_along_the_path_that_linuxcnc_executed_until_it_is_accepted() {
     let name = "linuxcnc::a_part_is_ground_along_the_path_that_linuxcnc_executed_until_it_is_accepted";
     beside_linuxcnc(name, |home| {
-        // 360 points leave more of the aperture between them than the shipped recipe's, and its PV is judged there.
+        // 360 points leave larger gaps in the aperture than the shipped recipe does, and the PV is judged there too.
         let (recipe, cell) = (recipe(home, [10.0, 1.2]), cell(home));
         let running = Running::new(regrind(&["run", &recipe, "--cell", &cell, "--runs", "runs"], home));
         let told = to_its_end(running, home);
@@ -154,7 +156,7 @@ fn a_part_is_ground_along_the_path_that_linuxcnc_executed_until_it_is_accepted()
 fn a_run_that_is_killed_while_linuxcnc_grinds_goes_on_with_the_same_pass() {
     let name = "linuxcnc::a_run_that_is_killed_while_linuxcnc_grinds_goes_on_with_the_same_pass";
     beside_linuxcnc(name, |home| {
-        // One pass will do, and the world outlives the run.
+        // One pass is enough, and the world outlives the run.
         let (recipe, cell) = (recipe(home, [60.0, 12.0]), cell(home));
         let mut world = Running::new(regrind(&["simulate", &recipe, "--cell", &cell, "--json"], home));
         let bound: Value = serde_json::from_str(&world.line("its wires", |line| line.starts_with('{'))).unwrap();
@@ -162,10 +164,11 @@ fn a_run_that_is_killed_while_linuxcnc_grinds_goes_on_with_the_same_pass() {
         fs::write(&cell, replaced(&text, "port = 0 ", &format!("port = {} ", bound["cmm"]["port"]))).unwrap();
         let mut first = Running::new(regrind(&["run", &recipe, "--cell", &cell, "--runs", "runs"], home));
         first.line("grinding", |line| line.starts_with("cycle 1: grinding"));
-        // Some seconds before its end, and where this computer was too slow for that, after it: it runs once all the same.
+        // The kill comes some seconds before the end of the pass, or after it if this computer is too slow. In both
+        // cases the pass runs once.
         first.signal("KILL");
         first.end();
-        // It waits for a person who has looked at the machines.
+        // The program waits for a person who has checked the machines.
         let folder = only_run(&home.join("runs"));
         let resumed = Running::new(regrind(&["resume", folder.to_str().unwrap()], home));
         let told = to_its_end(resumed, home);
@@ -175,12 +178,13 @@ fn a_run_that_is_killed_while_linuxcnc_grinds_goes_on_with_the_same_pass() {
     });
 }
 
-/// Begins a run, has something go wrong while LinuxCNC grinds, and returns what the cell shows once it stands: its state and the alarms.
+/// Starts a run and causes a fault while LinuxCNC grinds. Returns the state and the alarms that the cell shows once it
+/// has stopped.
 fn stands_after(home: &Path, go_wrong: impl FnOnce()) -> (StateName, Vec<AlarmId>) {
     let (recipe, cell) = (recipe(home, [60.0, 12.0]), cell(home));
     let mut running = Running::new(regrind(&["run", &recipe, "--cell", &cell, "--runs", "runs"], home));
     running.line("grinding", |line| line.starts_with("cycle 1: grinding"));
-    // It is begun when its program has written so.
+    // The pass has started when its program has written so.
     while !records().iter().any(|record| record.contains("begin")) {
         std::thread::park_timeout(Duration::from_millis(20));
     }
@@ -268,7 +272,7 @@ fn a_program_that_the_controller_cannot_open_is_never_begun() {
         let text = replaced(&text, "settle_timeout_ms = 60000", "settle_timeout_ms = 2000");
         fs::write(&cell, replaced(&text, "executed_path", named)).unwrap();
         let mut running = Running::new(regrind(&["run", &recipe, "--cell", &cell, "--runs", "runs"], home));
-        // It holds, and waits for somebody who sees to it.
+        // The cell holds, and waits for a person to correct the fault.
         running.line("an alarm that names the folder", |line| line.contains("/tmp/nowhere"));
         let folder = only_run(&home.join("runs"));
         run(&["abort", folder.to_str().unwrap(), "--reason", "seen"], home);

@@ -1,4 +1,5 @@
-//! Another user of the computer in the way of the program itself, which runs as root: in namespaces where the folders of locks are empty.
+//! Another user of the computer interferes with the program, which runs as root, in namespaces where the folders of
+//! locks are empty.
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
@@ -8,10 +9,10 @@ use std::process::{Command, Stdio};
 use crate::namespaces::{ACCOUNT, in_namespaces};
 use crate::program::{Running, changed, records_with, regrind, run, small_recipe};
 
-/// The folder of the machine locks.
+/// Folder of the machine locks.
 const LOCKS: &str = "/run/lock/regrind-machines";
 
-/// A cell whose machines are another process, a file that is nobody else's, and a program that everybody may run.
+/// Cell whose machines are another process, a file that only root may change, and a program that everybody may run.
 struct Cell {
     home: PathBuf,
     recipe: String,
@@ -21,7 +22,7 @@ struct Cell {
 }
 
 impl Cell {
-    /// Its machines take a second for as many of a job as `speed` says.
+    /// Starts a cell whose machines take one second for `speed` seconds of a job.
     fn at(home: &Path, speed: f64) -> Self {
         fs::set_permissions(home, fs::Permissions::from_mode(0o755)).unwrap();
         let recipe = small_recipe(home, speed).display().to_string();
@@ -43,14 +44,14 @@ impl Cell {
         ["run", &self.recipe, "--cell", "cell.toml", "--runs", "runs"]
     }
 
-    /// Runs a part to its end and returns the code and everything that was said.
+    /// Runs a part to its end. Returns the exit code and all output.
     fn made(&self) -> (i32, String) {
         let (code, said, errors) = run(&self.arguments(), &self.home);
         self.nothing_happened();
         (code, said + &errors)
     }
 
-    /// The file of root is as it was.
+    /// Checks that the file of root is unchanged.
     fn nothing_happened(&self) {
         let found = fs::metadata(&self.precious).unwrap();
         assert_eq!((found.uid(), found.mode() & 0o777, found.len()), (0, 0o600, 8));
@@ -58,14 +59,14 @@ impl Cell {
     }
 }
 
-/// Whether another user gets done what he tries.
+/// Returns true if another user can run a script successfully.
 fn another_user(script: &str) -> bool {
     let mut command = Command::new(ACCOUNT[0]);
     command.args(&ACCOUNT[1..]).args(["sh", "-euc", script]).stdin(Stdio::null());
     command.output().unwrap().status.success()
 }
 
-/// The locks that every user may make.
+/// Returns the locks that every user can create.
 fn locks() -> Vec<PathBuf> {
     let mut locks: Vec<PathBuf> = fs::read_dir(LOCKS).unwrap().map(|entry| entry.unwrap().path()).collect();
     locks.retain(|lock| lock.extension().is_some_and(|ending| ending == "lock"));
@@ -77,18 +78,18 @@ fn locks() -> Vec<PathBuf> {
 fn what_another_user_laid_in_the_way_is_not_followed() {
     in_namespaces("local_users::what_another_user_laid_in_the_way_is_not_followed", |home| {
         let cell = Cell::at(home, 2e4);
-        // A folder that is his: he could exchange every lock in it.
+        // A folder that belongs to the other user, who could exchange every lock in it.
         assert!(another_user(&format!("mkdir -m 777 {LOCKS}")));
         let (code, said) = cell.made();
         assert!(code != 0 && said.contains(LOCKS) && said.contains("chown"), "{code} {said}");
         assert!(!home.join("runs").exists() || records_in(home).is_empty(), "{said}");
-        // One as the remedy makes it.
+        // A folder as the remedy of the message creates it.
         fs::remove_dir_all(LOCKS).unwrap();
         fs::create_dir(LOCKS).unwrap();
         fs::set_permissions(LOCKS, fs::Permissions::from_mode(0o1777)).unwrap();
         let (code, said) = cell.made();
         assert_eq!(code, 0, "{said}");
-        // Each lock in turn is a link to what is root's, then a pipe.
+        // Each lock in turn is a link to a file of root, then a pipe.
         let names = locks();
         assert!(names.len() >= 2, "{names:?}");
         for lay in ["ln -s", "mkfifo"] {
@@ -102,14 +103,14 @@ fn what_another_user_laid_in_the_way_is_not_followed() {
             let (code, said) = cell.made();
             assert_eq!(code, 0, "{lay}: {said}");
         }
-        // Root's own link is followed no more than his.
+        // Root's own link is not followed either.
         names.iter().for_each(|name| drop(fs::remove_file(name)));
         names.iter().for_each(|name| symlink(&cell.precious, name).unwrap());
         cell.made();
     });
 }
 
-/// Everything that is on record in the runs below a home.
+/// Returns all records of the runs below a home folder.
 fn records_in(home: &Path) -> Vec<serde_json::Value> {
     let runs = crate::program::run_folders(&home.join("runs"));
     runs.iter().flat_map(|run| records_with(run, "event")).collect()
@@ -138,7 +139,7 @@ fn another_user_neither_sees_nor_orders_nor_holds_up_a_run() {
         ] {
             assert!(!another_user(&tried), "{tried}");
         }
-        // He takes no lock away, and what he does to those of all users gives the machines to nobody.
+        // The other user can remove no lock. Changes to the locks that all users share give no one else the machines.
         for lock in locks() {
             another_user(&format!("rm -f {0}; truncate -s 9999 {0}", lock.display()));
         }

@@ -1,5 +1,5 @@
-//! Machines that say what is not so, or lose what they had: each is believed only as far as its words can be true, and a person is offered
-//! a way on that works.
+//! Machines that report false states, or lose data. The program believes a machine only as far as its report can be
+//! true, and offers the person a way to continue that works.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
@@ -14,10 +14,10 @@ use regrind::device::{
 use regrind::drive::{Drive, Notice, Request};
 use tokio::sync::mpsc::UnboundedReceiver;
 
-/// Changes what a machine says of itself.
+/// Function that changes a machine's reported status.
 type Says = Box<dyn FnMut(&mut Status) + Send>;
 
-/// A grinder that says of itself what it is told to say, and whose first answers to PREPARE are lost.
+/// Grinder that reports a prescribed status, and whose first answers to PREPARE are lost.
 struct Told {
     grinder: ModbusGrinder,
     says: Says,
@@ -58,10 +58,11 @@ impl Grinder for Told {
     }
 }
 
-/// What becomes of the result of a measurement.
+/// Function that changes the result of a measurement.
 type Fate = Box<dyn FnMut(&mut Measurement) + Send>;
 
-/// A measuring machine whose results have one fate after the other; the first of them may be discarded at its panel before they are read.
+/// Measuring machine that applies one fate after the other to its results. The first result may be discarded at its
+/// panel before it is read.
 struct Odd {
     cmm: ModbusCmm,
     discarded: u32,
@@ -121,7 +122,7 @@ async fn a_preparation_whose_answer_was_lost_is_taken_back_and_made_anew() {
     while let Ok(notice) = notices.try_recv() {
         alarms.extend(if let Notice::Alarm(alarm) = notice { Some(alarm.id) } else { None });
     }
-    // Its link was lost twice, and nothing was refused.
+    // The link was lost twice, and nothing was refused.
     assert!(alarms.iter().all(|id| *id == AlarmId::LinkLost) && !alarms.is_empty(), "{alarms:?}");
 }
 
@@ -131,7 +132,7 @@ async fn a_job_that_a_machine_shows_no_more_ends_by_a_persons_word_and_is_not_gr
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let seen = Arc::new(Mutex::new(0));
     let count = Arc::clone(&seen);
-    // For some looks after it has begun it shows that it is idle, at no job; its own work goes on.
+    // For some polls after its start the machine reports that it is idle, without a job, although its work continues.
     let says = move |status: &mut Status| {
         let mut seen = count.lock().unwrap();
         *seen += u32::from(status.state == State::Execute);
@@ -144,7 +145,7 @@ async fn a_job_that_a_machine_shows_no_more_ends_by_a_persons_word_and_is_not_gr
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::JobVanished, "{what}");
     assert!(what.contains("grinder, it is IDLE"), "{what}");
-    // It is asked, and is found at its job: nothing is lost, and nothing is begun once more.
+    // The program asks the machine and finds it at its job: nothing is lost, and nothing starts twice.
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Accepted { .. }), "{ending:?}");
     let starts = regrind::journal::Reader::open(&folder).unwrap();
@@ -247,7 +248,7 @@ async fn figures_of_a_measurement_that_cannot_be_make_nothing_of_it() {
     ];
     let told: Vec<_> = fates.iter().map(|(_, id, words)| (*id, *words)).collect();
     let mut fates: VecDeque<Fate> = fates.into_iter().map(|(fate, ..)| fate).collect();
-    // A good one, and then the same again under the next cycle's numbers.
+    // A good result, and then the same result again under the numbers of the next cycle.
     fates.push_back(Box::new(move |of| *kept.lock().unwrap() = Some(of.clone())));
     fates.push_back(Box::new(move |of| {
         let old = given.lock().unwrap().clone().expect("the one before");

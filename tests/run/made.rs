@@ -1,4 +1,5 @@
-//! Whole parts, ground and measured until they are accepted: by the whole pattern, or by touches that are chosen batch by batch.
+//! Whole parts, ground and measured until they are accepted: with the whole pattern, or with touches that are chosen
+//! batch by batch.
 
 use regrind::cell::PvOf;
 use regrind::compensation::told_map;
@@ -15,13 +16,13 @@ use super::{Bench, GainRule, Line, Way};
 /// How a part is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Measured {
-    /// Everywhere that the recipe says.
+    /// All targets of the recipe.
     Whole,
-    /// Where it tells most, until enough is known.
+    /// Targets with the most information, until the stopping rule ends the measurement.
     Chosen,
 }
 
-/// What became of a part.
+/// Result of a part.
 #[derive(Clone, Debug, Default)]
 pub struct Made {
     pub passes: u32,
@@ -29,30 +30,30 @@ pub struct Made {
     pub touching_s: f64,
     pub grinding_s: f64,
     pub accepted: bool,
-    /// RMS and PV of the truth after the last pass, at the targets, in micrometres, after its own best position.
+    /// RMS and PV of the truth after the last pass, at the targets, in µm, relative to its own best-fit pose.
     pub truth_um: [f64; 2],
-    /// Whether the truth is within the limits.
+    /// True if the truth is within the limits.
     pub conforms: bool,
-    /// Touches after each pass, with why they ended.
+    /// Number of touches after each pass, with the reason why they ended.
     pub told: Vec<String>,
 }
 
 impl Bench {
-    /// A recipe as it ships, its grinder with scallops.
+    /// Returns a recipe as shipped, whose grinder leaves scallops.
     pub fn as_shipped(name: &str) -> Self {
         let mut bench = Self::new(name);
         bench.spec.grinder.scallops = true;
         bench
     }
 
-    /// The same with other limits: so many times those of the recipe.
+    /// Returns the same recipe with its limits multiplied by `times`.
     pub fn with_limits(mut self, times: f64) -> Self {
         self.plan.tolerance.pv_mm *= times;
         self.plan.tolerance.rms_mm *= times;
         self
     }
 
-    /// Makes a part in a world of its own.
+    /// Makes a part in its own world.
     pub fn make(&self, seed: u64, measured: Measured) -> Made {
         let world = World::new(WorldSpec { seed, ..self.spec.clone() }).unwrap();
         let mut line = Line::new(self, Way::Regrind(GainRule::Adaptive), &world, &world, None, 1);
@@ -77,7 +78,7 @@ impl Bench {
         made
     }
 
-    /// The limits, with peak to valley of all points, and of most.
+    /// Returns the limits in mm: with the PV of all points and the PV of most points.
     fn limits_mm(&self) -> [f64; 3] {
         let tolerance = &self.plan.tolerance;
         match tolerance.pv_of {
@@ -103,7 +104,7 @@ impl Bench {
     }
 }
 
-/// A measurement of one pass.
+/// Measurement of one pass.
 struct Took {
     touches: usize,
     seconds: f64,
@@ -114,7 +115,7 @@ struct Took {
 }
 
 impl Line<'_> {
-    /// Grinds one pass and returns the seconds that it took.
+    /// Grinds one pass and returns its duration in seconds.
     pub(super) fn ground(&mut self, cycle: u16) -> f64 {
         let (map, pass) = (self.payload(), super::pass_of(&self.bench.task, self.correction.level_mm));
         let payload = |bytes: Vec<u8>, kind: u8| Some(super::Payload { bytes, identity: [kind; 32] });
@@ -143,7 +144,7 @@ impl Line<'_> {
         Took { touches: all.len(), seconds, why: String::new(), figures, found, error }
     }
 
-    /// What the reference sphere tells of the probe.
+    /// Returns the model inputs, with the probe data from the reference sphere.
     fn given(&self) -> ModelInputs {
         ModelInputs { probe_noise_mm: [1e-3 * self.bench.spec.cmm.noise_um, 0.15], ..ModelInputs::default() }
     }
@@ -165,7 +166,7 @@ impl Line<'_> {
             let points: Vec<Point> = all.iter().map(|(_, point)| *point).collect();
             let of: Vec<usize> = all.iter().map(|(k, _)| *k).collect();
             if batch == 0 {
-                // The gates look at these; then so many more that a look says something.
+                // The gates check these first. Then come enough more points for a useful decision.
                 let more: Vec<usize> =
                     model::farthest_points(targets, MIN_TOUCHES).into_iter().filter(|&k| tried[k].is_none()).collect();
                 next = model::short_tour(targets, more);

@@ -1,6 +1,6 @@
-//! Whole runs: the program and its drive against simulated machines on real wires, on sunny days and others.
+//! Whole runs: the program and its drive against simulated machines on real wires, in normal and in faulty conditions.
 //!
-//! Signals, modes and the socket of a run are Unix's; what is tried on Windows is in .ci/windows.
+//! Signals, modes and the socket of a run are specific to Unix. The tests for Windows are in .ci/windows.
 #![cfg(unix)]
 
 mod again;

@@ -1,5 +1,5 @@
-//! A whole part on machines that a person serves. The test is the person: it does what the prompts ask, types what they say, and has the
-//! simulated machines grind by the files of the run and measure by its plan.
+//! A whole part on machines that a person operates. The test plays the person: it follows the prompts, types the
+//! commands in them, makes the simulated machines grind from the files of the run, and measures by its plan.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -19,7 +19,7 @@ use crate::study::{grind, touch};
 
 const RADIUS_MM: f64 = 1.5;
 
-/// The shipped mirror with 300 points; the probe is not checked on a sphere.
+/// Returns the shipped mirror with 300 points. The probe is not checked on a sphere.
 fn recipe(home: &Path) -> (PathBuf, WorldSpec) {
     let text = changed(
         "recipes/freeform-mirror.toml",
@@ -38,14 +38,14 @@ fn recipe(home: &Path) -> (PathBuf, WorldSpec) {
     (path, WorldSpec::deserialize(table["simulation"].clone()).unwrap())
 }
 
-/// Rows of numbers below the comments and the header of a file.
+/// Returns the rows of numbers below the comments and the header of a file.
 fn rows(path: &Path) -> Vec<Vec<f64>> {
     let text = fs::read_to_string(path).unwrap();
     let lines = text.lines().filter(|l| l.starts_with(|c: char| c.is_ascii_digit() || c == '-'));
     lines.map(|line| line.split(',').map(|field| field.parse().unwrap()).collect()).collect()
 }
 
-/// What stands above the numbers behind these words.
+/// Returns the text that follows these words in the lines above the numbers.
 fn stated(path: &Path, words: &str) -> String {
     let text = fs::read_to_string(path).unwrap();
     let line = text.lines().find(|line| line.contains(words)).unwrap_or_else(|| panic!("no {words:?} in {path:?}"));
@@ -59,7 +59,7 @@ struct Person {
 }
 
 impl Person {
-    /// Types a command as a prompt has it.
+    /// Types a command as a prompt shows it.
     fn types(&self, command: &str) -> (i32, String) {
         let words: Vec<&str> = command.split(' ').collect();
         let (code, out, err) = run(&words, self.home.path());
@@ -71,7 +71,7 @@ impl Person {
         assert_eq!(code, 0, "{command}: {told}");
     }
 
-    /// Grinds by the map of a cycle's folder, as the prompt names it.
+    /// Grinds by the map in a cycle's folder, as the prompt names it.
     fn grinds(&self, correction: &Path, cycle: u16) {
         let nodes = rows(correction);
         let columns = nodes.iter().take_while(|node| node[1] == nodes[0][1]).count();
@@ -129,12 +129,13 @@ impl Person {
     }
 }
 
-/// Has the run held in the middle of a pass: it is not held before a person has seen the grinder stand.
+/// Holds the run in the middle of a pass. The state is not Held before a person has confirmed that the grinder is at
+/// rest.
 fn hold_and_go_on(person: &Person, program: &mut Running) {
     person.does("hold");
     let still = program.line("prompt to hold", |line| line.contains("then: regrind confirm still"));
     let state = || person.types("status").1;
-    // What it waits for is said to whoever asks how it is, too.
+    // The status output also shows which confirmation the cell waits for.
     assert!(state().starts_with("Holding") && state().contains("regrind confirm still"), "{}", state());
     person.does(still.split("then: regrind ").nth(1).unwrap());
     let began = Instant::now();
@@ -144,7 +145,8 @@ fn hold_and_go_on(person: &Person, program: &mut Running) {
     person.does("resume");
 }
 
-/// At machines that people serve the plan comes back as the measurement: all of it is marked, and no other cell is rehearsed.
+/// With manual machines, a rehearsal returns the plan as the measurement. All of its files are marked, and no other
+/// kind of cell is rehearsed.
 #[test]
 fn a_rehearsal_is_marked_and_takes_the_plan_for_the_measurement() {
     let home = tempfile::tempdir().unwrap();
@@ -197,7 +199,7 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
         };
         match command {
             "confirm started" => {
-                // Nothing has ended that was not begun, and no word counts that names another map.
+                // A step that has not started cannot end, and a confirmation that names another map is refused.
                 let (code, told) = person.types("confirm done");
                 assert!(code == 3 && told.contains("confirm first that it has begun"), "{told}");
                 let (code, told) = person.types("confirm started --map 0123456789abcdef");
@@ -219,7 +221,7 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
                 if cycle == 1 {
                     let whole = fs::read_to_string(&measured).unwrap();
                     fs::write(person.home.path().join("half.csv"), &whole[..whole.len() / 2]).unwrap();
-                    // The plan itself is no measurement, and neither are its points in another order.
+                    // The plan itself is not a measurement, and neither are its points in another order.
                     let (head, body) = whole.split_once('\n').unwrap();
                     let mut rows: Vec<&str> = body.lines().map(|row| row.split_once(',').unwrap().1).collect();
                     rows.reverse();
@@ -250,7 +252,7 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
     println!("{}", program.said.join("\n"));
     assert!(cycle > 2 && said[0] == "confirm loaded", "{said:?}");
 
-    // Who and when, for each step.
+    // The record contains the person and the time of each step.
     let reader = Reader::open(&folder).unwrap();
     let records: Vec<Record> = reader.records(1).map(Result::unwrap).collect();
     let uid = std::os::unix::fs::MetadataExt::uid(&fs::metadata("/proc/self").unwrap());
@@ -264,12 +266,12 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
         records.iter().filter(is).filter(by_a_person).count()
     };
     let cycles = usize::from(cycle - 1);
-    // The five that were refused are on record too.
+    // The five refused confirmations are on record too.
     assert_eq!((count("grinder", "started"), count("grinder", "still")), (cycles, 1));
     assert_eq!((count("grinder", "done"), count("cmm", "done")), (2 * cycles, cycles + 4));
     let loaded = |r: &&Record| r.value()["event"] == "load_confirmed" && r.value()["actor"].is_object();
     assert_eq!(records.iter().filter(loaded).filter(by_a_person).count(), 1);
-    // The files that came are kept as they came, by their hashes; what nobody told is not there.
+    // The record keeps the incoming files unchanged, by their hashes. Data that nobody entered is not in it.
     for k in 1..cycle {
         let bytes = fs::read(person.home.path().join(format!("measured-{k}.csv"))).unwrap();
         assert!(fs::read(folder.join(format!("cycle-{k}/result.csv"))).unwrap() == bytes);

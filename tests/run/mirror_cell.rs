@@ -1,6 +1,7 @@
-//! Real clouds of a 6 m telescope mirror, raw files of a laser tracker as they are, through the folders of a measuring machine.
+//! Real point clouds of a 6 m telescope mirror: unchanged raw files of a laser tracker, through the folders of a
+//! measuring machine.
 //!
-//! The data stand outside of the project, in the folder that REGRIND_DATA names.
+//! The data are not part of the repository: the variable REGRIND_DATA names their folder.
 
 use std::path::Path;
 use std::time::Duration;
@@ -20,7 +21,8 @@ use regrind::surface::{DefinedSurface, Nominal, Side};
 
 const REFLECTOR_MM: f64 = 19.05;
 
-/// What the cell file says: the reference points are nominal in the telescope's frame, which is the frame of the measuring machine.
+/// Returns the settings of the cell file. The reference points are nominal in the telescope's frame, which is the frame
+/// of the measuring machine.
 fn cell(data: &Path, session: &str, outbox: &Path) -> CmmExchange {
     let files = vec![StationFiles { points: Pattern::new("M1_*.txt"), references: Pattern::new("ref_*.yaml") }];
     let nominal = data.join("nominal/reference.yaml");
@@ -55,7 +57,7 @@ fn measured(settings: CmmExchange, radius_mm: f64) -> (Option<Measurement>, Vec<
     let order = plan(radius_mm);
     let job = Job { job: 1, cycle: 0, digest: digest(&[order.plan_identity]) };
     folders.publish(job, 1, &order, &Permit::new()).unwrap();
-    // A look does not wait for what takes long to read.
+    // A poll does not wait for files that take long to read.
     let began = std::time::Instant::now();
     loop {
         let look = folders.look(Duration::from_secs(1), job).unwrap();
@@ -66,7 +68,7 @@ fn measured(settings: CmmExchange, radius_mm: f64) -> (Option<Measurement>, Vec<
     }
 }
 
-/// Where the fixture holds the mirror in the telescope's frame: turned about x by -atan(1/2), 3600 mm up.
+/// Returns the pose of the mirror in its fixture, in the telescope's frame: rotated about x by -atan(1/2), 3600 mm up.
 fn cmm_from_model() -> Pose {
     let turn = Pose::exp(&Twist::new(0.0, 0.0, 0.0, -(0.5f64).atan(), 0.0, 0.0));
     Pose { translation_mm: Vector::new(0.0, 0.0, 3600.0), ..turn }
@@ -158,7 +160,7 @@ fn another_reflector_than_the_recipes_is_refused() {
     let (found, said) = measured(cell(&data, "20250825_M1", home.path()), 6.35);
     let said = said.join("\n");
     assert!(found.is_none() && said.contains("a probe radius of 19.05 mm, the recipe says 6.35 mm"), "{said}");
-    // A reference point that is off by more than the limit is named.
+    // A reference point whose deviation exceeds the limit is named.
     let mut strict = cell(&data, "20250825_M1", home.path());
     strict.part = "strict".into();
     strict.stations.as_mut().unwrap().limit_mm = 0.01;
@@ -170,7 +172,7 @@ fn another_reflector_than_the_recipes_is_refused() {
     assert!(found.is_none() && said.contains("station 1 (ref_1.yaml): reference point primary_"), "{said}");
 }
 
-/// The points of a session, and what they deviate by.
+/// Returns the points of a session, and their registration with the deviations.
 fn session(data: &Path, nominal: &Nominal, name: &str) -> (Vec<Point>, Registration) {
     let home = tempfile::tempdir().unwrap();
     let (found, said) = measured(cell(data, name, home.path()), REFLECTOR_MM);
@@ -180,8 +182,9 @@ fn session(data: &Path, nominal: &Nominal, name: &str) -> (Vec<Point>, Registrat
     (cloud, registration)
 }
 
-/// How what one measurement tells of another's places agrees with what was found there: rms of the difference in micrometres, and the share
-/// within 95 %, the scatter of the tracker among it.
+/// Compares the prediction from one measurement, at the positions of another one, with the deviations measured there.
+/// Returns the RMS of the difference in µm, and the share within the 95 % interval, which includes the noise of the
+/// tracker.
 fn told(by: &Registration, of: &Registration) -> (f64, f64) {
     let used: Vec<_> = of.deviations.iter().filter(|d| d.status == PointStatus::Used).collect();
     let places: Vec<(Point, Vector)> = used.iter().map(|d| (d.point, d.normal)).collect();
@@ -216,13 +219,14 @@ fn one_session_tells_little_of_another_and_a_fifth_of_it_no_less() {
             fifth.0,
             100.0 * fifth.1
         );
-        // Between the days the tracker stood elsewhere, or the mirror was moved: what no point of one session shows.
+        // Between the days the tracker was set up elsewhere, or the mirror was moved. The points of one session cannot
+        // show this.
         assert!(whole.0 < rms_um && fifth.0 < rms_um, "{whole:?} {fifth:?} {rms_um}");
         assert!(whole.1 > 0.7 && fifth.1 > 0.85, "{whole:?} {fifth:?}");
     }
 }
 
-/// Which station each point of a session was measured from: its files, one after another.
+/// Returns the station from which each point of a session was measured. The files follow one another.
 fn stations(data: &Path, name: &str) -> Vec<u32> {
     let rows = |station: u32| {
         let file = std::fs::read_to_string(data.join(name).join(format!("M1_{station}.txt"))).ok()?;
@@ -268,7 +272,7 @@ fn a_session_that_was_not_seen_is_foretold_with_what_its_stations_will_differ_by
             100.0 * share
         );
         assert!((0.90..=0.99).contains(&share), "{share}");
-        // One day as one session does not tell what another day brings.
+        // One day as a single session cannot show the variance between days.
         let one = vec![1; days[a].1.len()];
         let alone = Sessions::from_registrations(&[(&days[a].0, &one)])
             .unwrap()

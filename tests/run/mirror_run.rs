@@ -1,6 +1,7 @@
-//! A real measurement through a whole run: raw files of a laser tracker, put into an inbox as a person would, and the program itself.
+//! A real measurement through a whole run of the program itself: raw files of a laser tracker, put into an inbox as a
+//! person would do.
 //!
-//! The data stand outside of the project, in the folder that REGRIND_DATA names.
+//! The data are not part of the repository: the variable REGRIND_DATA names their folder.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -14,7 +15,7 @@ use serde_json::Value;
 const SESSION: &str = "20250824_M1_1";
 const POINTS: usize = 1161;
 
-/// A shop: a cell file with its folders, and a recipe.
+/// Shop: a cell file with its folders, and a recipe.
 struct Shop {
     home: tempfile::TempDir,
     recipe: PathBuf,
@@ -22,7 +23,7 @@ struct Shop {
 }
 
 impl Shop {
-    /// Takes what ships, with folders of its own; `hold` is the recipe's line of that name.
+    /// Creates a shop from the shipped files, with its own folders. `hold` is the recipe's line of that name.
     fn new(data: &Path, hold: &str) -> Self {
         let home = tempfile::tempdir().unwrap();
         for machine in ["cmm", "grinder"] {
@@ -41,7 +42,7 @@ impl Shop {
                 (inbox, &format!("{inbox}\nstable_for_s = 0.2")),
             ],
         );
-        // As many points as the files hold, so that a measurement is never taken before the last file is there.
+        // The number of points in the files, so that a measurement is never taken before the last file has arrived.
         let points = format!("points = {POINTS}");
         let recipe = changed(
             "recipes/telescope-panel.toml",
@@ -68,7 +69,7 @@ impl Shop {
         Running::new(self.command())
     }
 
-    /// Puts the raw files of all stations into the inbox, as they are.
+    /// Puts the raw files of all stations into the inbox, unchanged.
     fn deliver(&self, data: &Path) {
         for k in 1..=7 {
             for name in [format!("M1_{k}.txt"), format!("ref_{k}.yaml")] {
@@ -81,7 +82,7 @@ impl Shop {
         only_run(&self.home.path().join("runs"))
     }
 
-    /// Returns the one hand-over in an outbox whose name ends so.
+    /// Returns the only hand-over in an outbox whose name has this ending.
     fn handed_over(&self, outbox: &str, ending: &str) -> Option<PathBuf> {
         let entries = fs::read_dir(self.folder(outbox)).unwrap().map(|e| e.unwrap().path());
         let mut found: Vec<_> = entries
@@ -101,7 +102,7 @@ impl Shop {
     }
 }
 
-/// What a program with `--json` has said.
+/// Returns the notices that a program with `--json` has printed.
 fn notices_of(program: &Running) -> Vec<Value> {
     program.said.iter().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
@@ -125,7 +126,7 @@ fn a_real_mirror_is_measured_and_judged_and_its_correction_refused_in_words() {
     shop.deliver(&data);
     let (code, _) = program.end();
     let said = notices_of(&program);
-    // Finished in order, not in tolerance.
+    // The run ended in order, but not in tolerance.
     assert_eq!(code, 1, "{said:#?}");
     let figures = &notices(&said, "figures")[0]["figures"];
     let (rms_um, pv_um) = (1e3 * figures["rms_mm"].as_f64().unwrap(), 1e3 * figures["pv_mm"].as_f64().unwrap());
@@ -164,7 +165,7 @@ fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confir
     let json: Value = serde_json::from_slice(&fs::read(handed.join("correction.json")).unwrap()).unwrap();
     let map = json["map"].as_str().unwrap().to_owned();
     assert_eq!(map.len(), 64);
-    // What the grinder gets is what the record has.
+    // The grinder gets the correction that is in the record.
     let kept = fs::read_to_string(folder.join("cycle-1/correction.csv")).unwrap();
     assert!(kept.contains(&map), "the record names the same map");
     let values = |text: &str| -> Vec<f64> {
@@ -175,10 +176,10 @@ fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confir
     assert_eq!(correction.len(), (json["columns"].as_u64().unwrap() * json["rows"].as_u64().unwrap()) as usize);
     let largest_um = correction.iter().fold(0.0f64, |most, v| most.max(1e3 * v.abs()));
     println!("{} nodes, up to {largest_um:.1} um", correction.len());
-    // One target lies 630 um low in three touches, and one beside it agrees: half of that is in the map.
+    // One target is 630 µm low in three touches, and one neighbour agrees: half of that is in the map.
     assert!(largest_um > 20.0 && largest_um < 500.0);
     assert!(folder.join("cycle-1/error_map.csv").is_file());
-    // The word of a person who works by another map is not taken.
+    // The confirmation of a person who works by another map is refused.
     program.until("a pass that is under way", |_| match shop.confirm("started", "00000000") {
         (false, text) if text.contains("is another one") => Some(()),
         (false, text) if text.contains("no pass is under way") => None,
@@ -186,10 +187,10 @@ fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confir
     });
     program.until("the start to be confirmed", |_| shop.confirm("started", &map[..8]).0.then_some(()));
     assert!(shop.folder("grinder/in").join("started.json").is_file());
-    // The end is told the other way: the file of the hand-over, copied by hand.
+    // The end is reported in the other way: the file of the hand-over, copied by hand.
     fs::copy(handed.join("done.json"), shop.folder("grinder/in").join("done.json")).unwrap();
     program.until("the pass to be over", |_| shop.handed_over("grinder/out", "_c2.done"));
-    // The next plan; the old files are no answer to it.
+    // The next plan. The old files are not an answer to it.
     program.until("the next plan", |_| shop.handed_over("cmm/out", "_c2"));
     let left_alone = |line: &String| line.contains("lay there before the plan");
     program.until("the old files to be left alone", |said| said.iter().any(left_alone).then_some(()));

@@ -1,23 +1,24 @@
-//! Tests that run in namespaces of their own: nothing that they mount, lock or listen to is seen outside.
+//! Runs tests in their own namespaces: their mounts, locks and ports are not visible outside.
 
 use std::path::Path;
 use std::process::Command;
 
 use crate::program::root;
 
-/// Set for the test that runs within.
+/// Variable that is set for the test that runs inside.
 const WITHIN: &str = "REGRIND_WITHIN_NAMESPACES";
 
-/// The account of the user that is not root there.
+/// Command that runs a program under an account other than root.
 pub const ACCOUNT: [&str; 4] = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"];
 
-/// Runs a test with an empty folder for each kind of temporary files, and a network of its own; `name` is its path in this program. Needs root.
+/// Runs a test with an empty folder for each kind of temporary files, and its own network. `name` is the path of the
+/// test in this program. Needs root.
 pub fn in_namespaces(name: &str, test: impl FnOnce(&Path)) {
     if std::env::var_os(WITHIN).is_some() {
         let home = tempfile::tempdir().unwrap();
         return test(home.path());
     }
-    // Locks of machines are kept outside /tmp too. What is tried may itself lie in one of these folders.
+    // Locks of machines are kept outside /tmp too. The program under test may itself be in one of these folders.
     let prepare = "needed=\"$1 $2\"; shift 2
     for folder in /tmp /run/lock /var/lock /var/tmp; do
         [ -d $folder ] || continue

@@ -1,6 +1,7 @@
-//! Orders from another terminal at every phase: what comes on the wire, and whether the journal says what the machines saw.
+//! Orders from another terminal in every phase: the commands on the wire, and the agreement of the journal with what
+//! the machines received.
 //!
-//! How long an order takes is measured by `cargo bench --bench orders`.
+//! `cargo bench --bench orders` measures the duration of an order.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -17,7 +18,7 @@ use serde_json::Value;
 
 const DEVICES: [&str; 2] = ["cmm", "grinder"];
 
-/// The command of docs/modbus.md that an intent leads to, if it leads to one.
+/// Returns the command of docs/modbus.md that an intent leads to, if there is one.
 fn command_of(intent: &Value) -> Option<u16> {
     let names = [
         "connect",
@@ -55,14 +56,15 @@ fn seen_so_far(rig: &Rig, machine: usize) -> usize {
     rig.servings[machine].machines()[0].1.with(|m| m.log().len())
 }
 
-/// Every frame has its intent, in order, and every intent its frame unless an abort made it void.
+/// Checks that every frame has its intent, in order, and that every intent has its frame unless an abort made it void.
 fn compare(name: &str, frames: &[Frame], intents: &[(u16, Value)]) {
     let mut next = 0;
     let commands: Vec<u16> = frames.iter().map(|f| f.command).collect();
     let intended: Vec<u16> = intents.iter().map(|(command, _)| *command).collect();
     let story = format!("{name}: intents {intended:?}, frames {commands:?}");
     for (k, frame) in frames.iter().enumerate() {
-        // What gives the machine back at the end, and what takes a standing preparation back before another, are part of something else.
+        // Two frames are part of another command: the one that gives the machine back at the end, and the one that
+        // cancels an existing preparation before the next.
         let part_of_prepare = frame.command == 6 && commands.get(k + 1) == Some(&2);
         if frame.command == 10 || part_of_prepare {
             continue;
@@ -70,7 +72,7 @@ fn compare(name: &str, frames: &[Frame], intents: &[(u16, Value)]) {
         let skipped = intents[next..].iter().position(|(command, _)| *command == frame.command);
         let skipped = skipped.unwrap_or_else(|| panic!("{story}: frame {} has no intent", k + 1));
         for (command, _) in &intents[next..next + skipped] {
-            // A result that is not there needs no acknowledging; an abort gives up what was being asked.
+            // A result that does not exist needs no acknowledgement. An abort cancels the open question.
             assert!(*command == 9 || frame.command == 7, "{story}: intent {command} was not carried out");
         }
         next += skipped;
@@ -86,7 +88,7 @@ fn compare(name: &str, frames: &[Frame], intents: &[(u16, Value)]) {
     assert_eq!(next, intents.len(), "{story}: intents without a frame at the end");
 }
 
-/// Watches that nothing is on a wire that is not on the disk.
+/// Checks that no command is on a wire before its intent is on the disk.
 fn watch_the_disk(rig: &Rig, folder: &Arc<Mutex<PathBuf>>, broken: &Arc<Mutex<Vec<String>>>) {
     for machine in [CMM, GRINDER] {
         let (folder, broken) = (Arc::clone(folder), Arc::clone(broken));
@@ -100,11 +102,11 @@ fn watch_the_disk(rig: &Rig, folder: &Arc<Mutex<PathBuf>>, broken: &Arc<Mutex<Ve
                     (of_run, counts, last) = (folder.clone(), [0; 16], 0);
                 }
                 let number = usize::from(command).min(15);
-                // A frame that was not acknowledged in time comes again; no command is ever given twice in a row.
+                // A frame that was not acknowledged in time is sent again. No command is ever given twice in a row.
                 counts[number] += usize::from(command != last);
                 last = command;
                 let on_disk = match command {
-                    // Orders that make safe wait for no disk; what led to them comes on record as soon as it can.
+                    // Safety orders do not wait for the disk. Their cause is recorded as soon as possible.
                     4 | 6 | 7 | 10 => usize::MAX,
                     _ => intents(&folder, machine).iter().filter(|(intended, _)| *intended == command).count(),
                 };
@@ -175,7 +177,8 @@ async fn an_abort_is_given_while_another_process_has_the_journal_and_answered_wh
 
     other.execute_batch("ROLLBACK").unwrap();
     drop(other);
-    // Who had to wait too long was told that it is not on record; nobody that it is before it was.
+    // A person who had to wait too long learns that the order is not on record. No person learns that it is on record
+    // before it is.
     let reply = ordered.await.unwrap();
     assert!(if reply.taken { on_record(&folder) } else { reply.message.contains("not on record") }, "{reply:?}");
     let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
@@ -194,7 +197,8 @@ async fn a_journal_that_is_broken_for_good_holds_the_cell_and_an_abort_ends_the_
     let damage = "PRAGMA writable_schema = ON; UPDATE sqlite_schema SET sql = 'no table at all';
         PRAGMA schema_version = 1000";
     rusqlite::Connection::open(folder.join("journal.sqlite")).unwrap().execute_batch(damage).unwrap();
-    // Progress is recorded, so the loop finds out by itself. Told once: the failure of each further record is no news.
+    // Progress is recorded, so the loop detects the failure by itself. It reports the failure once, and not again for
+    // each further record.
     event(&mut notices, "record_failed", 1).await;
     orders.give(Request::Abort { reason: "the record is gone".into() }, actor).await;
     let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
@@ -206,7 +210,7 @@ async fn a_journal_that_is_broken_for_good_holds_the_cell_and_an_abort_ends_the_
     assert!(told <= 1, "the same failure was told {told} times more");
 }
 
-/// Every file of a folder and of those in it, by its path from the first.
+/// Collects every file of a folder and its subfolders, by its path relative to the first folder.
 fn files_below(folder: &Path, name: &str, files: &mut BTreeSet<String>) {
     for entry in std::fs::read_dir(folder.join(name)).unwrap().map(Result::unwrap) {
         let below = Path::new(name).join(entry.file_name()).to_str().unwrap().to_owned();
@@ -218,7 +222,7 @@ fn files_below(folder: &Path, name: &str, files: &mut BTreeSet<String>) {
     }
 }
 
-/// Every file of a finished run is on record but the journal's own, and at least these are there.
+/// Checks that every file of a finished run is on record except the journal's own, and that at least these files exist.
 fn all_on_record(folder: &Path, least: &[&str]) {
     let mut files = BTreeSet::new();
     files_below(folder, "", &mut files);
@@ -251,7 +255,7 @@ async fn run_to_its_end(ready: Ready) -> (Ending, PathBuf) {
 async fn what_was_computed_and_cannot_be_written_holds_the_cell_and_is_computed_again() {
     let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
-    // A folder stands where the deviations of the first cycle should.
+    // A folder is in the place of the deviations file of the first cycle.
     std::fs::create_dir_all(folder.join("cycle-1/deviations.csv")).unwrap();
     let actor = run.actor.clone();
     let (drive, orders): (_, Orders) = Drive::new(run, cmm, grinder).unwrap();
@@ -264,7 +268,7 @@ async fn what_was_computed_and_cannot_be_written_holds_the_cell_and_is_computed_
     let raised = records(&folder, Kind::Note).into_iter().filter(|note| note["command"] == "raise");
     let alarms: Vec<_> = raised.map(|note| note["id"].clone()).collect();
     assert_eq!(alarms.first(), Some(&Value::from("journal_unwritable")), "{alarms:?}");
-    // The report tells it in words, and that the resumption took it back.
+    // The report describes the failure in words, and that the resumption took it back.
     regrind::report::write_run_report(&folder).unwrap();
     let alarms = crate::reports::Page::of(&folder).rows("alarms");
     assert!(alarms[0][2].starts_with("The record of the run cannot be written"), "{alarms:?}");
@@ -275,7 +279,7 @@ async fn what_was_computed_and_cannot_be_written_holds_the_cell_and_is_computed_
 async fn a_judgement_that_is_amended_leaves_the_file_of_the_first() {
     let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
     let mut ready = rig.next(true);
-    // Another pass is wanted, and then it turns out that the material for it is not there.
+    // Another pass is needed, and then the remaining material is not enough.
     ready.run.task.limits.removal_budget_mm = 1e-6;
     let (ending, folder) = run_to_its_end(ready).await;
     assert!(matches!(ending, Ending::NotAccepted { .. }), "{ending:?}");

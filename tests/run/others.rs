@@ -1,4 +1,5 @@
-//! Two machines that differ: what the first one learned of a recipe, and what that is worth to the second one's first part of it.
+//! Two machines that differ: the state that the first one learned for a recipe, and its benefit for the second
+//! machine's first part of that recipe.
 
 use regrind::compensation::{Alike, Correction, GainRule, LearningState};
 use regrind::formats::{CellRun, Learned};
@@ -11,38 +12,42 @@ use super::{After, Bench, Line, Way};
 /// How the second machine differs from the first.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Differ {
-    /// Every number of the systematic errors of either differs from that of their type by so much (rms share), each by itself, and either has a
-    /// waviness of its own of so many micrometres.
+    /// Every number of the systematic errors of either machine differs independently from that of their type by this
+    /// RMS share, and each machine has its own waviness of this amplitude, in µm.
     By { share: f64, waviness_um: f64 },
-    /// The second has nothing in common with the first: every number is drawn anew, its sign too.
+    /// The second machine has nothing in common with the first: every number is drawn independently, including its
+    /// sign.
     Unrelated,
 }
 
-/// One world: what the first part on the second machine came to, with and without what the first machine taught.
+/// One world: results of the first part on the second machine, with and without the state learned on the first machine.
 #[derive(Clone, Debug)]
 pub struct Taught {
     /// Truth after each pass.
     pub with: Vec<After>,
     pub without: Vec<After>,
-    /// RMS by which what comes back in every pass on the two machines differs.
+    /// RMS of the difference between the repeatable errors of the two machines, in µm.
     pub apart_um: f64,
-    /// In how many bands of wavelengths something was taken over, and the largest rms share that machines were taken to differ by.
+    /// Number of wavelength bands in which a learned error was transferred, and the maximum RMS share by which the
+    /// machines were assumed to differ.
     pub bands: usize,
     pub differ: f64,
 }
 
-/// How many parts the first machine has made of the recipe.
+/// Number of parts of the recipe that the first machine has made.
 pub const TAUGHT_BY: u32 = 2;
 
-/// Two recipes that both machines know: the one that is taught, and the one by which the machines are compared.
+/// Two recipes that both machines know: the one whose learned state is transferred, and the one by which the machines
+/// are compared.
 pub struct Pair<'a> {
     pub taught: &'a Bench,
     pub in_common: &'a Bench,
 }
 
 impl Pair<'_> {
-    /// Both machines grind a part of the recipe in common; the first one `parts` of the other recipe; then the second its first of it, with and
-    /// without what the first taught. Each part has so many passes.
+    /// Grinds, on both machines, a part of the common recipe; on the first machine, `parts` of the other recipe; then
+    /// on the second machine its first part of that recipe, with and without the state learned on the first. Each part
+    /// has `passes` passes.
     pub fn world(&self, seed: u64, differ: Differ, parts: u32, passes: u16) -> Taught {
         let [first, second] = machines(seed, differ, &self.taught.spec.grinder);
         let [a, b] = [2 * seed + 1_000_000, 2 * seed + 1_000_001];
@@ -64,8 +69,9 @@ impl Pair<'_> {
 }
 
 impl Bench {
-    /// The same where the part lies on the CMM where the cell's file says that the fixture holds it, but for what it is off by at each loading: a recipe
-    /// that holds motions believes the fixture, and where that is off by tenths of a millimetre no machine is to blame for the form that it costs.
+    /// Returns the same pair, where the part lies on the CMM at the fixture pose of the cell file, except for the error
+    /// of each loading. A recipe that locks directions of the pose relies on the fixture pose. If that pose is wrong by
+    /// tenths of a millimetre, the resulting form error is not an error of the machines.
     pub fn commissioned(self) -> Self {
         let mut spec = self.spec;
         let fixture = self.task.fixture_cmm_from_model;
@@ -75,7 +81,7 @@ impl Bench {
         Self { spec, ..self }
     }
 
-    /// Makes parts on a grinder; returns the truth after the passes of the last one, and what was learned.
+    /// Makes parts on a grinder. Returns the truth after the passes of the last part, and the learned state.
     fn ground(
         &self,
         grinder: &GrinderSpec,
@@ -96,7 +102,7 @@ impl Bench {
         (after, begun)
     }
 
-    /// RMS of the difference of the first pass on two grinders of which neither adds anything by chance, in micrometres.
+    /// Returns the RMS of the difference of the first pass on two grinders without random errors, in µm.
     fn apart_um(&self, machines: [(&GrinderSpec, u64); 2]) -> f64 {
         let [first, second] = machines.map(|(grinder, seed)| {
             let grinder = GrinderSpec { scallops: false, repeatability_um: 0.0, ..grinder.clone() };
@@ -105,7 +111,7 @@ impl Bench {
         Line::new(self, Way::Regrind(GainRule::default()), &second, &first, None, 1).pass(1).repeatable_um
     }
 
-    /// What a run begins with that another machine's run has taught.
+    /// Returns the initial state of a run that starts from another machine's learned state.
     fn begun_with(&self, (correction, known): (Correction, LearningState), alike: &Alike) -> Learned {
         let learned = Learned::new(true, "the first machine".into(), "run-1".into(), correction, known);
         let from = CellRun { cell: "cell-1".into(), run: "run-1".into() };
@@ -126,7 +132,8 @@ fn machines(seed: u64, differ: Differ, of_type: &GrinderSpec) -> [GrinderSpec; 2
     }
 }
 
-/// The same grinder with other numbers of what comes back in every pass: wheel, setting, slides, screw, wear and warmth.
+/// Returns the same grinder with other numbers for its repeatable errors: wheel, setting, slides, screw, wear and
+/// thermal growth.
 fn with_numbers(of: &GrinderSpec, mut other: impl FnMut(f64) -> f64) -> GrinderSpec {
     GrinderSpec {
         wheel_radius_error_um: other(of.wheel_radius_error_um),

@@ -1,4 +1,5 @@
-//! What comes from outside of a run: a terminal that is closed, a service that is stopped, strangers at the control socket, a second run.
+//! Events from outside a run: a terminal that is closed, a service that is stopped, unknown clients at the control
+//! socket, a second run.
 
 use std::fs;
 use std::io::Write;
@@ -14,7 +15,7 @@ fn sim_cell() -> String {
     root().join("config/sim.toml").display().to_string()
 }
 
-/// A run that grinds, slowly enough that it still does when the test has done with it.
+/// Starts a run that grinds so slowly that it still grinds when the test ends.
 fn grinding(home: &Path, command: impl Fn(&[&str]) -> Command) -> (Running, PathBuf) {
     let recipe = small_recipe(home, 100.0).display().to_string();
     let mut running = Running::new(command(&["run", &recipe, "--cell", &sim_cell(), "--runs", "runs"]));
@@ -29,7 +30,7 @@ fn orders(folder: &Path) -> Vec<(String, String)> {
     orders.map(|event| (text(&event["event"]), text(&event["reason"]))).collect()
 }
 
-/// The program as a terminal starts it, also where who runs the tests ignores SIGHUP.
+/// Returns the program as a terminal starts it, even if the person who runs the tests ignores SIGHUP.
 fn heeding_hangup(arguments: &[&str], home: &Path) -> Command {
     let program = regrind(arguments, home);
     let mut command = Command::new("env");
@@ -139,7 +140,7 @@ fn a_closed_terminal_and_a_stopped_service_end_the_run_in_order() {
 fn a_service_that_is_told_twice_aborts() {
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
-    // The order of the two is kept by the operating system only if the first has been heard.
+    // The operating system keeps the order of the two signals only if the first has been received.
     running.signal("TERM");
     let began = Instant::now();
     while orders(&folder).is_empty() {
@@ -150,7 +151,7 @@ fn a_service_that_is_told_twice_aborts() {
     assert!(code == 3 || code == 1 && orders(&folder).len() == 1, "{code} {errors}");
     assert!(verify(&folder).unwrap().closed);
     let reasons: Vec<_> = orders(&folder).into_iter().map(|(_, reason)| reason).collect();
-    // The machine may have stood before the second one came.
+    // The machine may have stopped before the second signal arrived.
     assert!(reasons == ["SIGTERM"] || reasons == ["SIGTERM", "SIGTERM, again"], "{reasons:?}");
 }
 
@@ -225,7 +226,7 @@ fn a_second_run_does_not_take_the_machines_of_the_first() {
     let (code, _, errors) = run(&begin, home.path());
     let name = folder.file_name().unwrap().to_str().unwrap();
     assert!(code == 3 && errors.contains("another run has this machine") && errors.contains(name), "{code} {errors}");
-    // The first is still the one that says when it ends.
+    // The first run still decides when it ends.
     let (code, _, errors) = run(&["abort"], home.path());
     assert_eq!(code, 0, "{errors}");
     assert_eq!(first.end().0, 3);
@@ -286,7 +287,7 @@ fn without_a_folder_and_without_a_person_to_ask_nothing_is_made() {
 #[test]
 fn at_a_terminal_a_new_folder_is_asked_for_until_the_answers_will_do() {
     let home = tempfile::tempdir().unwrap();
-    // `script` gives it a terminal of its own.
+    // `script` gives the program its own terminal.
     let typed = format!("{} init", env!("CARGO_BIN_EXE_regrind"));
     let mut command = Command::new("script");
     command.args(["-qec", &typed, "/dev/null"]).current_dir(home.path()).stdin(Stdio::piped());

@@ -1,4 +1,4 @@
-//! A driver that panics: told as what it is, and the run comes to its end without that machine.
+//! A driver that panics: the panic is reported as a panic, and the run reaches its end without that machine.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,7 +13,7 @@ use regrind::device::{
 use regrind::drive::{Drive, Notice, Request};
 use regrind_sim::command::State;
 
-/// A grinder whose driver has a fault.
+/// Grinder whose driver has a fault.
 struct Brittle {
     grinder: ModbusGrinder,
     breaks: Arc<AtomicBool>,
@@ -63,7 +63,7 @@ async fn a_driver_that_panics_is_told_as_a_fault_of_the_program_and_its_machine_
     assert!(alarm.what.contains("an index that was out of bounds"), "{}", alarm.what);
     let said = until(&folder, |words| words.starts_with("Held")).await;
     assert!(said.contains("the grinder has not confirmed that it stands"), "{said}");
-    // Nobody beats for it any more.
+    // Nothing sends heartbeats for it any more.
     let held = async {
         while rig.servings[GRINDER].machines()[0].1.with(|machine| machine.state()) != State::Held {
             tokio::time::sleep(Duration::from_millis(5)).await;

@@ -1,5 +1,5 @@
-//! A wheel whose radius is not the stated one: taken back as such the part is good after fewer passes than by the map alone, and the record says what
-//! went where.
+//! A wheel whose radius is not the stated one. With the radius compensated as a parameter, the part is good after fewer
+//! passes than with the map alone, and the record shows which part of the error each of the two compensates.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,8 @@ use crate::sample::seeds;
 use crate::study::told_apart::Compared;
 use crate::study::{After, Bench};
 
-/// A good machine with a wheel that is larger by 0.4 mm, and a part of which no more than 1.6 touches lie on the square centimetre.
+/// A good machine with a wheel whose radius is 0.4 mm too large. The part has at most 1.6 touches per square
+/// centimetre.
 const GRINDER: &str = "[simulation.grinder]\nwheel_radius_error_um = 400.0\nstraightness_x_um = [0.2, -0.2]\nstraightness_y_um = [-0.2, 0.1]\n\
                        waviness_um = 0.15\nperiodic_um = 0.05\nwear_um = 0.6\nbreak_in_um = 0.2\nthermal_um = 0.8\nfollowing_um = 0.05\nscallops = false\n";
 const TAKEN: &str = "[compensation.parameters]\nwheel_radius_um = 600.0\n\n";
@@ -34,7 +35,7 @@ fn recipe(parameters: &str, accepted_um: f64) -> String {
     changed("recipes/freeform-mirror.toml", &changes)
 }
 
-/// Runs a recipe to its end; returns its folder and what was said.
+/// Runs a recipe to its end. Returns its folder and all output.
 fn ran(home: &Path, recipe: &str) -> (PathBuf, String) {
     fs::write(home.join("mirror.toml"), recipe).unwrap();
     let cell = root().join("config/sim.toml");
@@ -93,7 +94,7 @@ fn what_is_beyond_its_tolerance_is_asked_for_and_the_cell_is_shown_as_held() {
     assert_eq!(code, 0, "{errors}\n{}", program.said.join("\n"));
 }
 
-/// A few worlds; `cargo run --release --example parameters` draws two hundred.
+/// Draws a few worlds; `cargo run --release --example parameters` draws two hundred.
 #[test]
 #[ignore = "worlds are drawn, for .ci/long"]
 fn what_is_told_of_a_few_worlds_holds_and_saves() {

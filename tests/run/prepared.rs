@@ -1,4 +1,4 @@
-//! What a recipe and a cell file make together, before a run begins.
+//! The plan that results from a recipe and a cell file, before a run starts.
 
 use std::path::Path;
 use std::time::Duration;

@@ -1,8 +1,9 @@
-//! Production for as long as is asked: part after part by one program, against machines in another program that outlive every
-//! part, at a hundred times the speed of the floor. Only so it shows what grows, what is left open, and what drifts.
+//! Production for a chosen time: one program makes part after part, against machines in another program that outlive
+//! every part, at a hundred times real speed. Only a long production shows growth of memory, open files that are not
+//! closed, and drift.
 //!
-//! The program that makes the parts is this test in a process of its own, where no other test runs. It does what `regrind run`
-//! does for each part: takes the machines, begins a record, drives to the end, writes the report.
+//! The program that makes the parts is this test in its own process, where no other test runs. For each part it does
+//! the same as `regrind run`: it takes the machines, starts a record, drives to the end and writes the report.
 
 use std::fmt;
 use std::fs;
@@ -21,27 +22,33 @@ use regrind::setup;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
-/// Seconds of the machines in a second.
+/// Seconds of machine time per second.
 const SPEED: f64 = 100.0;
-/// Minutes that production goes on for, with some parts more than the warm-up at least, unless REGRIND_PRODUCTION_MINUTES says otherwise.
+/// Duration of the production in minutes, unless REGRIND_PRODUCTION_MINUTES is set. There are always at least some
+/// parts more than the warm-up.
 const MINUTES: f64 = 30.0;
-/// Names the folder of the recipe, the cell and the machines' log to the process that makes the parts, and the machines' process.
+/// Variables for the process that makes the parts: the folder of the recipe, the cell and the machines' log; and the
+/// id of the machines' process.
 const HOME: &str = "REGRIND_PRODUCTION_HOME";
 const MACHINES: &str = "REGRIND_PRODUCTION_MACHINES";
 const NAME: &str = "production::thirty_minutes_of_production_at_a_hundred_times_the_speed";
-/// The line that follows the last part.
+/// Line that follows the last part.
 const OVER: &str = "production is over";
 
-/// Parts after which memory is looked at for the first time: what is made once and kept has been made by then.
+/// Number of parts before memory is first examined. By then, everything that is allocated once and kept has been
+/// allocated.
 const WARM_UP: usize = 5;
-/// What a process holds after a part goes up and down by some per cent with what it has just given back. So the median of so many
-/// parts after the warm-up is compared with that of as many at the end.
+/// Number of parts in each of the two compared groups. The memory of a process after a part varies by some per cent
+/// with the memory that it has just freed. The test therefore compares the median of this many parts after the warm-up
+/// with the median of as many at the end.
 const COMPARED: usize = 10;
-/// Memory may grow by less than this.
+/// Upper bound of the growth of memory, in %.
 const GROWTH_PERCENT: f64 = 5.0;
-/// A machine hears the next beat of its owner within half the time after which it holds itself.
+/// Upper bound of the time between two heartbeats of its owner at a machine, in s: half the time after which the
+/// machine holds itself.
 const LONGEST_SILENCE_S: f64 = 1.5;
-/// The mean time between two beats in the last tenth of the jobs may differ from that in the first by less than this.
+/// Upper bound of the difference, in %, between the mean heartbeat period in the last tenth of the jobs and in the
+/// first tenth.
 const DRIFT_PERCENT: f64 = 5.0;
 
 #[test]
@@ -53,7 +60,7 @@ fn thirty_minutes_of_production_at_a_hundred_times_the_speed() {
     }
 }
 
-/// Starts the machines, then the program that makes the parts, and lets both go to their end.
+/// Starts the machines, then the program that makes the parts, and waits for the end of both.
 fn in_processes_of_their_own() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), SPEED);
@@ -84,15 +91,15 @@ fn in_processes_of_their_own() {
     assert_eq!(serving.end().0, 0, "{}", serving.told);
 }
 
-/// Has the allocator of a program give back at once what is freed: what is looked at is what the program holds, and not what its
-/// allocator keeps for later, which goes up and down by a tenth.
+/// Makes the allocator of a program return freed memory at once. The test measures the memory that the program uses,
+/// not the memory that its allocator keeps for later, which varies by a tenth.
 fn frugal(mut command: Command) -> Command {
     command.env("MALLOC_ARENA_MAX", "1").env("MALLOC_TOP_PAD_", "0");
     command.env("MALLOC_TRIM_THRESHOLD_", "0").env("MALLOC_MMAP_THRESHOLD_", "65536");
     command
 }
 
-/// What a process holds, by the operating system's account.
+/// Resources of a process, as the operating system reports them.
 #[derive(Clone, Copy, Debug)]
 struct Held {
     resident_kb: u64,
@@ -116,7 +123,8 @@ impl Held {
         }
     }
 
-    /// Looks again until a process has no more open than before, and no more threads: what ends with a part ends soon, not at once.
+    /// Polls until a process has no more open files and threads than before. The resources of a part are released soon
+    /// after its end, not at once.
     fn again_by(process: u32, before: &Self, part: usize) -> Self {
         let began = Instant::now();
         loop {
@@ -140,12 +148,12 @@ impl fmt::Display for Held {
     }
 }
 
-/// The program that makes the parts.
+/// Program that makes the parts.
 struct Production {
     home: PathBuf,
     recipe: Recipe,
     cell: CellConfig,
-    /// Itself, and the machines.
+    /// This process, and that of the machines.
     processes: [(&'static str, u32); 2],
     runtime: tokio::runtime::Runtime,
 }
@@ -155,11 +163,12 @@ impl Production {
         let machines = std::env::var(MACHINES).unwrap().parse().unwrap();
         let mut cell = CellConfig::read(&home.join("cell.toml")).unwrap();
         for link in [&mut cell.cmm.link, &mut cell.grinder.link] {
-            // No stall of the computer is taken for a machine that is gone.
+            // A stall of the computer must not look like a machine that is gone.
             link.timing.request_timeout = Duration::from_secs(5);
             link.timing.lost_after = Duration::from_secs(60);
         }
-        // As `regrind run` has it; only that a thread which has computed ends at once, so that none is taken for one that was left.
+        // Same as in `regrind run`, except that a thread ends at once after a computation. Otherwise the test could
+        // count it as a leaked thread.
         let mut runtime = tokio::runtime::Builder::new_multi_thread();
         runtime.worker_threads(2).thread_keep_alive(Duration::from_millis(1)).enable_all();
         Self {
@@ -171,10 +180,10 @@ impl Production {
         }
     }
 
-    /// Makes parts until the time is over, looks after each at what is held, and holds it all against the bounds.
+    /// Makes parts until the time is over, measures the resources after each, and checks them all against the bounds.
     fn go_on(&self) {
         let minutes = std::env::var("REGRIND_PRODUCTION_MINUTES").map_or(MINUTES, |text| text.parse().unwrap());
-        // Threads that are made once and stay are there before the first part.
+        // Starts the threads that are created once and stay before the first part.
         rayon::broadcast(|_| ());
         self.runtime.block_on(async { tokio::spawn(async {}).await }).unwrap();
         let before = self.processes.map(|(_, process)| Held::by(process));
@@ -200,7 +209,7 @@ impl Production {
     }
 
     fn hold_against_bounds(&self, before: &[Held; 2], after: &[[Held; 2]]) {
-        // A run that is too short for it says what it has seen, and is not judged by its memory.
+        // A run that is too short for the comparison prints its measurements, and its memory is not judged.
         let compared = COMPARED.min((after.len() - WARM_UP) / 2);
         let mut grown = Vec::new();
         for (k, (name, _)) in self.processes.iter().enumerate() {
@@ -231,7 +240,7 @@ impl Production {
         }
     }
 
-    /// Makes one part as `regrind run` does, proves its record, and clears it away.
+    /// Makes one part as `regrind run` does, verifies its record, and removes it.
     async fn make(&self, part: usize) -> Ending {
         let (recipe, cell) = (&self.recipe, &self.cell);
         let (task, plan) = setup::prepare(recipe, cell).unwrap();
@@ -273,11 +282,11 @@ impl Production {
     }
 }
 
-/// The drive's beats as a machine heard them, by the machine's log.
+/// Heartbeats of the drive as a machine received them, by the machine's log.
 struct Beats {
     heard: u64,
     longest_silence_s: f64,
-    /// Mean time between two, in the first tenth of its jobs and in the last.
+    /// Mean heartbeat period in the first tenth of its jobs and in the last.
     first_mean_s: f64,
     last_mean_s: f64,
 }

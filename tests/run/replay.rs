@@ -1,4 +1,5 @@
-//! The record of a run, done again: without a difference from wherever it broke off, and with the first one named where there is one.
+//! Replay of a run's record: without a difference from any point where the run broke off, and with the first difference
+//! named if there is one.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,7 +11,7 @@ use regrind::drive::{Drive, Interrupted, Orders, ReplayError, Request, Task};
 use regrind::journal::{Reader, verify};
 use regrind::setup;
 
-/// Runs a part of three passes with a hold on the way, and returns the rig and the folder of the run.
+/// Runs a part of three passes, with a hold during the run. Returns the rig and the folder of the run.
 async fn finished() -> (Rig, PathBuf) {
     let mut rig = Rig::new(small(12, 8, 5000.0)).await;
     let Ready { mut run, cmm, grinder, mut notices, folder } = rig.next(true);
@@ -27,13 +28,14 @@ async fn finished() -> (Rig, PathBuf) {
     (rig, folder)
 }
 
-/// Nothing is good enough and nothing holds, so that it goes on to the last pass that the plan allows.
+/// Changes the plan so that no result is accepted and nothing holds. The run then goes on to the last pass that the
+/// plan allows.
 fn never_content(plan: &mut CellPlan) {
     (plan.tolerance.pv_mm, plan.max_cycles, plan.stall_share) = (1e-6, 3, -1e9);
     (plan.on_stall, plan.on_divergence, plan.on_refusal) = (Disposal::Stop, Disposal::Stop, Disposal::Stop);
 }
 
-/// Reads the record as the program that made it would.
+/// Reads the record as the program that wrote it would.
 fn again(rig: &Rig, folder: &Path, change: impl FnOnce(&mut Task, &mut CellPlan)) -> Result<Interrupted, ReplayError> {
     let (mut task, mut plan) = setup::prepare(&rig.recipe, &rig.cell).unwrap();
     never_content(&mut plan);
@@ -41,12 +43,13 @@ fn again(rig: &Rig, folder: &Path, change: impl FnOnce(&mut Task, &mut CellPlan)
     Interrupted::read(folder, plan, &task)
 }
 
-/// Copies the record of a run up to a record, and its files: what lies there when the program ended behind it.
+/// Copies the record of a run up to a record, with all files: the state of the folder if the program ended after that
+/// record.
 fn broken_off(folder: &Path, at: u64) -> tempfile::TempDir {
     let copy = tempfile::tempdir().unwrap();
     copy_files(folder, copy.path());
     let database = rusqlite::Connection::open(copy.path().join("journal.sqlite")).unwrap();
-    // Records are guarded against change: a copy that is cut has to be let.
+    // The database guards records against change. To cut the copy, the guards must be removed.
     let guards: Vec<String> = database
         .prepare("SELECT name FROM sqlite_schema WHERE type = 'trigger'")
         .and_then(|mut names| names.query_map([], |row| row.get(0))?.collect())
@@ -98,7 +101,7 @@ async fn what_would_be_decided_or_computed_otherwise_is_named_and_nothing_is_gon
     assert!(decided.contains("max_cycles") && decided.contains("the record has"), "{decided}");
     let computed = said(|task, _| task.map.cutoff_mm *= 1.01);
     assert!(computed.contains("computed again"), "{computed}");
-    // Where it lies is nothing that any figure tells: only the plan that the machine was given names it.
+    // No figure depends on this value. Only the plan that the machine received contains it.
     let planned = said(|task, _| task.probing.safe_height_mm += 1.0);
     assert!(planned.contains("the CMM was prepared"), "{planned}");
     for words in [decided, computed, planned] {

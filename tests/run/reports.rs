@@ -1,4 +1,4 @@
-//! The report of a run, held against its result and its record: what it says of the end, of the cycles, of alarms and of orders.
+//! The report of a run, compared with its result and its record: the end, the cycles, the alarms and the orders.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,26 +13,26 @@ use regrind::report::{run_report, write_run_report};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// What a person sees of a report.
+/// Visible content of a report.
 pub struct Page {
     html: String,
 }
 
 impl Page {
-    /// The report that lies in the folder of a run, which is the one that its record gives.
+    /// Returns the report in the folder of a run, after a check that it equals the one generated from the record.
     pub fn of(folder: &Path) -> Self {
         let html = fs::read_to_string(folder.join("report.html")).unwrap();
         assert_eq!(html, run_report(folder).unwrap());
         Self { html }
     }
 
-    /// The text of every element that will do.
+    /// Returns the text of every element that satisfies a condition.
     fn texts(&self, will_do: impl Fn(&roxmltree::Node) -> bool) -> Vec<String> {
         let document = roxmltree::Document::parse(self.html.strip_prefix("<!DOCTYPE html>\n").unwrap()).unwrap();
         document.descendants().filter(will_do).map(text_of).collect()
     }
 
-    /// How the run ended, and whether that is shown as good.
+    /// Returns how the run ended, and true if the report shows that as good.
     pub fn verdict(&self) -> (String, bool) {
         let [good, bad] = ["good", "bad"].map(|class| {
             let found = self.texts(|node| node.has_tag_name("p") && node.attribute("class") == Some(class));
@@ -42,7 +42,7 @@ impl Page {
         (good.or(bad).expect("a verdict"), is_good)
     }
 
-    /// The rows of a table, cell by cell, without its head.
+    /// Returns the rows of a table, cell by cell, without its head.
     pub fn rows(&self, table: &str) -> Vec<Vec<String>> {
         let document = roxmltree::Document::parse(self.html.strip_prefix("<!DOCTYPE html>\n").unwrap()).unwrap();
         let table =
@@ -52,7 +52,7 @@ impl Page {
         rows.map(cells).filter(|cells: &Vec<String>| !cells.is_empty()).collect()
     }
 
-    /// The measurements of the cycles: number, verdict and figures, and why.
+    /// Returns the measurements of the cycles: number, verdict, figures and reason.
     fn cycles(&self) -> Vec<Vec<String>> {
         self.rows("cycles").chunks(2).map(<[Vec<String>]>::concat).collect()
     }
@@ -80,7 +80,7 @@ pub fn arguments(recipe: &Path) -> Vec<String> {
     ["run".to_owned(), recipe.display().to_string()].into_iter().chain(fixed).collect()
 }
 
-/// A run that grinds, slowly enough that it still does when the test has done with it.
+/// Starts a run that grinds so slowly that it still grinds when the test ends.
 fn grinding(home: &Path) -> (Running, PathBuf) {
     let arguments = arguments(&small_recipe(home, 100.0));
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
@@ -90,7 +90,7 @@ fn grinding(home: &Path) -> (Running, PathBuf) {
     (running, folder)
 }
 
-/// The words of each record of a run, as `audit show` prints them, with the kinds.
+/// Returns the words of each record of a run, as `audit show` prints them, with the kinds.
 fn shown(folder: &Path) -> Vec<(String, String)> {
     let (code, out, errors) = run(&["audit", "show", folder.to_str().unwrap()], folder);
     assert_eq!(code, 0, "{errors}");
@@ -142,7 +142,7 @@ fn the_report_of_an_accepted_run_says_what_its_result_and_its_record_say() {
     }
 }
 
-/// With what it was made and measured, how well its place is known, and where people sign.
+/// Checks the equipment, the quality of the registration, and the fields for signatures.
 fn means_registration_and_signatures(page: &Page, folder: &Path, cycles: usize) {
     let cells = |table: &str| page.rows(table).into_iter().map(|row| row.join("|")).collect::<Vec<_>>();
     let means = cells("means");
@@ -163,7 +163,8 @@ fn means_registration_and_signatures(page: &Page, folder: &Path, cycles: usize) 
     assert_eq!(page.rows("signatures").len(), 4);
 }
 
-/// The first and the last map on one scale and the last on its own, each with axes, colour bar and a name.
+/// Checks that the first and the last map are drawn on one scale, and the last one also on its own, each with axes,
+/// colour bar and a name.
 fn maps_are_drawn(page: &Page, cycles: usize) {
     let (others, figures): (Vec<_>, Vec<_>) =
         page.texts(|node| node.has_tag_name("figure")).into_iter().partition(|figure| !figure.contains("scale"));
@@ -183,7 +184,7 @@ fn maps_are_drawn(page: &Page, cycles: usize) {
             assert!(figure.contains(words), "{words}: {figure}");
         }
     }
-    // The labels behind the upright name of y are those of the colour bar.
+    // The labels after the vertical name of y are those of the colour bar.
     let bar = |figure: &str| figure.split("y / mm").nth(1).unwrap().split("deviation").next().unwrap().to_owned();
     assert_eq!(bar(&figures[0]), bar(&figures[1]));
     assert_ne!(bar(&figures[1]), bar(&figures[2]));
@@ -217,7 +218,7 @@ fn the_judged_figure_stands_beside_its_limit_and_every_other_says_what_it_is() {
     let medians = ["pv_robust", "rms"].map(|figure| format!("{:.2}", form(figure)[0]));
     assert_eq!(bold, medians, "one figure of each judges");
     assert!(page.says("ISO 14253-1"));
-    // What the form is known to be, every figure beside the raw one.
+    // Estimated figures of the form, each next to the raw figure.
     let told = json_in(&folder, &format!("cycle-{last}/figures.json"))["form"].clone();
     let rows = page.rows("told");
     assert_eq!(rows.len(), told.as_array().unwrap().len());
@@ -228,7 +229,7 @@ fn the_judged_figure_stands_beside_its_limit_and_every_other_says_what_it_is() {
         let [low, median, high] = ["low", "median", "high"].map(|key| told[key].as_f64().unwrap());
         assert!(low <= median && median <= high && told["raw"].is_number(), "{told}");
     }
-    // What is called alike is the same number everywhere.
+    // Figures with the same name have the same value everywhere.
     let points = json_in(&folder, &format!("cycle-{last}/figures.json"))["figures"].clone();
     let named = |name: &str| points.as_array().unwrap().iter().find(|row| row["name"] == name).unwrap().clone();
     for (name, key) in [("PV 99.8 %", "pv_robust_mm"), ("PV", "pv_mm"), ("RMS", "rms_mm")] {
@@ -263,7 +264,7 @@ fn the_report_of_a_stopped_run_says_who_stopped_it_and_that_nothing_was_measured
     assert!(stop[1].starts_with("Ada at ") && stop[2] == "stop, SIGTERM" && stop[3] == "taken", "{orders:?}");
     let cycles = page.cycles();
     assert!(cycles.len() == 1 && cycles[0].join("|").contains("not measured"), "{cycles:?}");
-    // How much was ground is what the grinder told last.
+    // The amount ground is the last value that the grinder reported.
     let mut told = records_with(&folder, "done").into_iter().filter(|event| event["event"] == "progressed");
     let last = told.rfind(|event| event["device"] == "grinder").expect("a pass that moves tells how far it is");
     let share = 100.0 * last["done"].as_f64().unwrap() / last["total"].as_f64().unwrap();
@@ -280,7 +281,7 @@ fn the_report_of_an_aborted_run_says_so_and_which_order_was_refused() {
     let (code, out, errors) = run(&["abort", path, "--reason", "smoke"], home.path());
     assert_eq!(code, 0, "{out}{errors}");
     assert_eq!(running.end().0, 3);
-    // The terminal of the run shows the refusal, and not that the cell went on.
+    // The terminal of the run shows the refusal, and does not show that the cell went on.
     let said = running.said.join("\n");
     assert!(said.contains("not done: ") && said.contains("ABORT ") && !said.contains("RESUME "), "{said}");
     let page = Page::of(&folder);
@@ -293,7 +294,8 @@ fn the_report_of_an_aborted_run_says_so_and_which_order_was_refused() {
     assert!(abort[2] == "abort, smoke" && abort[3] == "taken", "{orders:?}");
 }
 
-/// A record that is written here as a drive writes it: events, commands with an answer as intents, all others as notes.
+/// Record that this test writes as a drive writes it: events, commands with an answer as intents, and all others as
+/// notes.
 pub struct Written {
     home: TempDir,
     journal: Journal,
@@ -350,7 +352,7 @@ pub fn ada() -> Actor {
     Actor { name: "Ada".into(), station: "console".into() }
 }
 
-/// An alarm as the cell raises it.
+/// Returns an alarm as the cell raises it.
 fn raised(id: &str, what: &str) -> Command {
     let alarm = json!({ "command": "raise", "id": id, "what": what, "consequence": "The cell is held.",
         "remedy": ["Look at it.", "Resume."], "clears": "operator" });
@@ -410,7 +412,7 @@ fn a_cycle_without_figures_says_why_and_an_amended_judgement_shows_both() {
     assert!(rows[0].contains("12 % found, 95 % are needed") && rows[2].contains("it did not converge"), "{rows:?}");
     let last = ["budget spent", "no material is left", "first judged, continue: not yet in tolerance"];
     assert!(last.iter().all(|words| rows[1].contains(words)), "{rows:?}");
-    // The end is on record also where the command to finish is not.
+    // The end is on record even if the command to finish is not.
     assert_eq!(page.verdict(), ("NOT ACCEPTED: no material is left".into(), false));
 }
 
@@ -459,7 +461,7 @@ fn no_record_of_a_run_is_shown_raw_whatever_kind_it_stands_as() {
     said("grinder: done, map 3fa9c210");
     said("grinder: to be brought home by CLEAR, it was seen FAULTED");
     said("answered: IDLE");
-    // What a person says of a machine is an order like any other, and one that was refused says why.
+    // A person's confirmation about a machine is an order like any other. The report shows why an order was refused.
     let orders: Vec<String> = Page::of(&folder).rows("orders").iter().map(|row| row.join("|")).collect();
     for words in ["grinder: done, map 3fa9c210", "grinder: to be brought home by CLEAR"] {
         assert!(orders.iter().any(|row| row.contains(words)), "{words}: {orders:#?}");

@@ -1,4 +1,5 @@
-//! The results of a run for other systems, QIF and Q-DAS ASCII: what they say is what the record says, and others can read it.
+//! Results of a run for other systems, as QIF and Q-DAS ASCII: they agree with the record, and other programs can read
+//! them.
 
 use std::fs;
 use std::path::Path;
@@ -12,7 +13,7 @@ use regrind::report::{ResultsFormat, run_results};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// What a script in tests/common says of a file.
+/// Returns the content of a file as a script in tests/common reads it.
 fn read_by(script: &str, arguments: &[&Path]) -> Value {
     let python = std::env::var_os("REGRIND_LXML_PYTHON").unwrap_or_else(|| "python3".into());
     let said = Command::new(python).arg(root().join("tests/common").join(script)).args(arguments).output().unwrap();
@@ -28,7 +29,7 @@ fn read_dfq(path: &Path) -> Value {
     read_by("read_dfq.py", &[path])
 }
 
-/// A run with five measurements that stand differently, its names such as break files.
+/// Creates a run with five measurements of different status, and names with characters that can break files.
 fn hostile() -> (TempDir, std::path::PathBuf) {
     let plan = json!({ "plan": { "tolerance": tolerance() }, "part_name": "Spiegel \u{201e}\u{c4}\u{201c} <1> & \"2\" ]]>",
         "recipe": "a\u{a4}b.toml", "recipe_sha256": "00", "cell": "c.toml", "cell_sha256": "11" });

@@ -1,4 +1,4 @@
-//! What a run shows of a measurement that still goes on: it is to be seen, and nothing hangs on it.
+//! Progress that a run shows of a measurement that still goes on: it is visible, and nothing depends on it.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ fn cmm(rig: &Rig, what: impl FnOnce(&mut Machine)) {
     rig.servings[CMM].machines()[0].1.with(what);
 }
 
-/// Asks until the snapshot will do.
+/// Polls until the snapshot satisfies a condition.
 async fn seen<T>(folder: &Path, what: impl Fn(&Snapshot) -> Option<T>) -> T {
     let began = Instant::now();
     loop {
@@ -28,7 +28,7 @@ async fn seen<T>(folder: &Path, what: impl Fn(&Snapshot) -> Option<T>) -> T {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn touches_are_shown_while_they_are_measured_and_are_gone_with_the_end() {
     let mut rig = Rig::new(small(12, 8, 5000.0)).await;
-    // The CMM measures when the test says so.
+    // The test decides when the CMM measures.
     cmm(&rig, |machine| machine.set_speed(0.0));
     let Ready { run, cmm: driver, grinder, folder, .. } = rig.next(true);
     let (drive, orders) = Drive::new(run, driver, grinder).unwrap();
@@ -45,11 +45,11 @@ async fn touches_are_shown_while_they_are_measured_and_are_gone_with_the_end() {
         assert!(progress(machine) < 90, "{}", progress(machine));
     };
     cmm(&rig, half);
-    // Eight full pages of seven points, those on the reference sphere among them; the first of them will do.
+    // Eight full pages of seven points, including those on the reference sphere. The first pages are enough.
     let told = seen(&folder, |status| status.so_far.filter(|told| told.touched >= 14)).await;
     let SoFar { touched, rms_um, least_um, most_um } = told;
     assert!(touched <= 90 && rms_um > 0.0 && rms_um <= least_um.abs().max(most_um.abs()), "{told:?}");
-    // Held they stay to be seen; an order is obeyed as ever.
+    // After a hold, the points stay visible. Orders are obeyed as usual.
     let (reply, ..) = order(&folder, Request::Hold { reason: "to look".into() }).await;
     assert!(reply.taken, "{reply:?}");
     until(&folder, |words| words.starts_with("Held (Measure, Run)")).await;
@@ -60,7 +60,7 @@ async fn touches_are_shown_while_they_are_measured_and_are_gone_with_the_end() {
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Accepted { .. }), "{ending:?}");
     assert_eq!(orders.status().borrow().so_far, None);
-    // Nothing of it is on record.
+    // The record contains none of it.
     let journal = std::fs::read(folder.join("journal.sqlite")).unwrap();
     for word in ["so_far", "preliminary"] {
         assert!(!journal.windows(word.len()).any(|bytes| bytes == word.as_bytes()), "{word}");

@@ -1,4 +1,5 @@
-//! Cycles of one simulated part without wires: ground, touched, registered, compensated as in a run, and held against the truth.
+//! Cycles of one simulated part without wires: ground, touched, registered and compensated as in a run, and compared
+//! with the truth.
 #![allow(dead_code, reason = "not every program that includes this uses all of it")]
 
 #[path = "made.rs"]
@@ -28,32 +29,34 @@ use regrind_sim::spec::GrinderSpec;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
 
-/// Every recipe that ships with a truth to simulate.
+/// All shipped recipes with a truth to simulate.
 pub const RECIPES: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "biconic", "shallow-wave"];
 
-/// How the next correction is made.
+/// Method that computes the next correction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Way {
-    /// As Regrind does it, by a rule for the gain.
+    /// Method of Regrind, with a rule for the gain.
     Regrind(GainRule),
-    /// What a spreadsheet does: subtract from the map what was measured, nearest point by nearest point, nothing filtered.
+    /// Method of a spreadsheet: subtracts the measured deviations from the map, by the nearest point and without a
+    /// filter.
     Plain,
 }
 
-/// The truth after one pass, in micrometres, of the surface with the best position taken out.
+/// Truth after one pass, in µm, of the surface relative to its best-fit pose.
 #[derive(Clone, Copy, Debug)]
 pub struct After {
     /// RMS of the whole error.
     pub rms_um: f64,
-    /// RMS of what comes back in every pass.
+    /// RMS of the repeatable error, which comes back in every pass.
     pub repeatable_um: f64,
-    /// RMS of what this pass added by itself, which no correction could have known.
+    /// RMS of the error that this pass added by itself. No correction could have predicted it.
     pub floor_um: f64,
-    /// RMS that was forecast for this pass after the one before, with its standard deviation, and what the CMM then saw.
+    /// Forecast after the previous pass of the RMS of this pass, its standard deviation, and the RMS that the CMM then
+    /// measured.
     pub forecast_um: Option<[f64; 3]>,
 }
 
-/// A recipe with everything that a run makes of it.
+/// A recipe with everything that a run derives from it.
 pub struct Bench {
     pub name: String,
     task: Task,
@@ -70,15 +73,15 @@ impl Bench {
         let cell = CellConfig::read(&root.join("config/sim.toml")).unwrap();
         let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
         let mut spec: WorldSpec = recipe.simulation.clone().unwrap().try_into().unwrap();
-        // No correction takes the ridges between tracks back, nor could it: what is studied is what corrections do.
+        // No correction can remove the ridges between tracks. The study is about the effect of corrections.
         spec.grinder.scallops = false;
         let plan_of = task.targets.iter().map(|t| (t.point, t.normal)).collect();
         Self { name: name.to_owned(), task, plan, spec, machine: told_apart::Machine::default(), plan_of }
     }
 
-    /// Makes one part after another in a world of its own: for each the truth after every pass.
+    /// Makes one part after another in its own world. Returns the truth after every pass, for each part.
     ///
-    /// A second part begins with what was learned from the first.
+    /// A second part starts from the state that was learned on the first.
     pub fn parts(&self, seed: u64, way: Way, parts: usize, passes: u16) -> Vec<Vec<After>> {
         let spec = WorldSpec { seed, ..self.spec.clone() };
         let twin = random_alone(&spec);
@@ -95,7 +98,7 @@ impl Bench {
     }
 }
 
-/// The same random part of every pass, and nothing else: what the best correction would leave.
+/// Returns the world with the same random part of every pass and no other error: the residual of the best correction.
 fn random_alone(spec: &WorldSpec) -> WorldSpec {
     let grinder = GrinderSpec {
         repeatability_um: spec.grinder.repeatability_um,
@@ -106,13 +109,14 @@ fn random_alone(spec: &WorldSpec) -> WorldSpec {
     WorldSpec { grinder, ..spec.clone() }
 }
 
-/// One part on its way.
+/// Part in progress.
 struct Line<'a> {
     bench: &'a Bench,
     way: Way,
     worlds: [&'a World; 2],
     grinders: [Grinder; 2],
-    /// The twin's own twin without the random part: what the other leaves beyond it is random and nothing else, where a datum shows the height as well.
+    /// Copy of the twin without the random part. The difference between the two is random only, also where a datum
+    /// makes the height observable.
     still: Option<(&'a World, Grinder)>,
     job: u32,
     places: Vec<[f64; 2]>,
@@ -120,7 +124,7 @@ struct Line<'a> {
     known: LearningState,
     before: Option<(Correction, ErrorMap)>,
     forecast: Option<[f64; 2]>,
-    /// What was told of the parameters after the first pass.
+    /// Parameters that were estimated after the first pass.
     told: Option<Parameters>,
 }
 
@@ -155,7 +159,7 @@ impl<'a> Line<'a> {
         Self { bench, way, worlds, grinders, still, job, places, correction, known, before, forecast, told }
     }
 
-    /// Grinds and measures once, and makes the correction of the next pass.
+    /// Grinds and measures once, and computes the correction of the next pass.
     fn pass(&mut self, cycle: u16) -> After {
         let level_mm = self.correction.level_mm;
         let map = self.payload();
@@ -202,7 +206,7 @@ impl<'a> Line<'a> {
         }
     }
 
-    /// Touches the part where the recipe says, and registers what the probe gave.
+    /// Touches the part where the recipe says, and registers the measured points.
     fn register(&self, level_mm: f64) -> Registration {
         let all: Vec<usize> = (0..self.bench.plan_of.len()).collect();
         let (touched, _) = self.touch(level_mm, &all);
@@ -210,7 +214,7 @@ impl<'a> Line<'a> {
         self.registered(&points, level_mm)
     }
 
-    /// Touches some of the targets, and returns those that were found, with the seconds that it took.
+    /// Touches some of the targets. Returns the points that were found, and the duration in seconds.
     fn touch(&self, level_mm: f64, chosen: &[usize]) -> (Vec<(usize, Point)>, f64) {
         let task = &self.bench.task;
         let target = |(index, k): (usize, &usize)| {
@@ -235,12 +239,12 @@ impl<'a> Line<'a> {
 
     fn registered(&self, points: &[Point], level_mm: f64) -> Registration {
         let task = &self.bench.task;
-        // The true radius, as the reference sphere tells it in a run.
+        // The true radius, as the reference sphere gives it in a run.
         let true_radius_mm = task.probing.probe_radius_mm + 1e-3 * self.bench.spec.cmm.probe_radius_error_um;
         task.register(points, true_radius_mm + level_mm).unwrap().0
     }
 
-    /// Makes the next correction of what was found.
+    /// Computes the next correction from the registration.
     fn correct(&mut self, found: &Registration) {
         let error = self.error(found);
         self.correct_by(found, error);
@@ -280,7 +284,7 @@ impl<'a> Line<'a> {
         self.forecast = Some([1e3 * forecast.rms_mm, 1e3 * forecast.sigma_mm]);
         let next = match self.correction.next(&error, &self.known, set.as_ref(), &task.limits) {
             Ok(step) => step.correction,
-            // The study goes on where a recipe would have no material left: what counts here is the form.
+            // The study goes on where the material budget of a recipe would be spent. Here only the form counts.
             Err(NextPassError::BudgetSpent { .. }) => {
                 let changed = self.correction.changed(&self.known, set.as_ref());
                 Correction {
@@ -294,7 +298,8 @@ impl<'a> Line<'a> {
         self.before = Some((std::mem::replace(&mut self.correction, next), error));
     }
 
-    /// Tells the parameters after the first pass, as a run does: where that is, and what of it the next pass is told.
+    /// Estimates the parameters after the first pass, as a run does. Returns the contacts, and the parameter
+    /// corrections that the next pass uses.
     fn tell(&mut self, found: &Registration) -> (Vec<Contact>, Option<Set>) {
         let task = &self.bench.task;
         let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
@@ -311,12 +316,12 @@ impl<'a> Line<'a> {
         (contacts, set)
     }
 
-    /// What a next part would begin with.
+    /// Returns the state from which a next part would start.
     fn learned(&self) -> Option<(Correction, LearningState)> {
         Some((self.correction.clone(), self.known.clone()))
     }
 
-    /// Deviations at the places without what a motion of the part could be.
+    /// Returns the deviations at the positions without the component that a rigid motion of the part can explain.
     fn without_motion(&self, deviations_mm: &[f64]) -> Vec<f64> {
         let size = 50.0;
         let row = |(p, n): &(Point, Vector)| {
@@ -358,7 +363,7 @@ pub fn touch(world: &World, job: u32, plan: &Plan) -> Vec<PointRecord> {
     touched_in(world, job, plan).0
 }
 
-/// Measures a part by a plan, and says how many seconds that takes.
+/// Measures a part by a plan. Also returns the duration in seconds.
 fn touched_in(world: &World, job: u32, plan: &Plan) -> (Vec<PointRecord>, f64) {
     let mut cmm = world.cmm();
     let payload = Payload { bytes: plan.encode(), identity: [1; 32] };
@@ -386,7 +391,7 @@ pub fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass
     grinder.outcome(1);
 }
 
-/// What was measured, nearest point by nearest point.
+/// Returns the measured deviations as a map, by the nearest point.
 fn unfiltered(readings: &[Sample], options: &MapOptions) -> ErrorMap {
     let grid = Grid::over(readings.iter().map(|r| r.at_mm), options.spacing_mm).unwrap();
     let nearest = |[x, y]: [f64; 2]| {

@@ -1,4 +1,4 @@
-//! Parameters of the machine in many worlds: told, taken back, and what comes of it beside the map alone, by the truth.
+//! Machine parameters in many worlds: estimated, compensated, and compared with the map alone, by the truth.
 
 use regrind::compensation::path::height_of;
 use regrind::compensation::{Contact, GainRule, ParameterKind, WheelTerm};
@@ -9,37 +9,40 @@ use regrind_sim::world::World;
 
 use super::{After, Bench, GrinderSpec, Line, Way};
 
-/// Expanded uncertainties of the radius of a wheel as it is trued, of where it is set and of a part as it is clamped, and of the datum of the CMM.
+/// Expanded uncertainties of the radius of a wheel as dressed, of the setting of the wheel and the clamping of a part,
+/// and of the datum of the CMM.
 pub const RADIUS_UM: f64 = 100.0;
 pub const SETTING_UM: f64 = 15.0;
 pub const TILT_URAD: f64 = 60.0;
 pub const DATUM_UM: f64 = 0.5;
-/// By how much slides are bent, to either side.
+/// Bow of the slides, to either side, in µm.
 const STRAIGHT_UM: f64 = 0.6;
-/// What a pass may leave over what it adds by itself, to be at the floor.
+/// Maximum ratio of the error after a pass to the error that the pass adds by itself, for the pass to be at the floor.
 pub const AT_FLOOR: f64 = 1.2;
 
-/// What is off beside what is set by hand.
+/// Errors of the machine in addition to the manual settings.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Machine {
-    /// Little: slides on air or oil, within 0.1 um over 25 mm, a spindle that is cooled.
+    /// Small errors: slides on air or oil, within 0.1 µm over 25 mm, and a cooled spindle.
     #[default]
     Good,
-    /// As much as the recipe says.
+    /// The errors of the recipe.
     AsShipped,
 }
 
-/// What became of one world.
+/// Results of one world.
 #[derive(Clone, Debug)]
 pub struct Compared {
-    /// Of each parameter that was told: its kind, by how much it was off in expanded uncertainties, these, whether it was offered, taken and beyond.
+    /// Estimates of the parameters. Each has its kind, the error of the estimate (estimate minus truth) divided by the
+    /// expanded uncertainty, the expanded uncertainty, the true value, the value that was compensated, and a flag for a
+    /// compensated value that exceeds its tolerance.
     pub told: Vec<Told>,
-    /// The truth after every pass with parameters, and by the map alone.
+    /// Truth after every pass, with parameters and by the map alone.
     pub with: Vec<After>,
     pub alone: Vec<After>,
 }
 
-/// What was told of a parameter.
+/// Estimate of one parameter.
 #[derive(Clone, Copy, Debug)]
 pub struct Told {
     pub kind: ParameterKind,
@@ -51,7 +54,8 @@ pub struct Told {
 }
 
 impl Bench {
-    /// The same in worlds whose grinder is held by a datum in all that a part may be off by in it, or not at all.
+    /// Returns the same bench with the given pose directions locked. If any is locked, a datum locates the part in the
+    /// grinder in every direction in which the part can be off.
     pub fn held(mut self, held: [bool; 6]) -> Self {
         self.task.registration.locked = held;
         if held.contains(&true) {
@@ -67,12 +71,13 @@ impl Bench {
         [shift_mm, shift_mm / (0.5 * x.max(y))]
     }
 
-    /// The same on another machine.
+    /// Returns the same bench on another machine.
     pub fn on(self, machine: Machine) -> Self {
         Self { machine, ..self }
     }
 
-    /// A world whose wheel and part are off by what their tolerances allow; the rest as the recipe ships it.
+    /// Returns a world whose wheel and part have errors within their tolerances. All other values are those of the
+    /// shipped recipe.
     fn off(&self, seed: u64) -> WorldSpec {
         let mut drawn = regrind_sim::rng(seed ^ 0x5eed_0ff5);
         let mut draw = |expanded: f64| 0.5 * expanded * normal(&mut drawn);
@@ -98,7 +103,7 @@ impl Bench {
         spec
     }
 
-    /// Makes one part in a world whose machine is off, with parameters and by the map alone.
+    /// Makes one part in a world whose machine has errors, with parameters and by the map alone.
     pub fn told_apart(&self, seed: u64, passes: u16) -> Compared {
         let spec = self.off(seed);
         let (told, with) = self.with_parameters().line_of(&spec, passes);
@@ -138,7 +143,8 @@ impl Bench {
         (told.collect(), after)
     }
 
-    /// What wear and the growth of the spindle add to the height on average, in every pass alike: nothing tells it from how high the wheel is set.
+    /// Returns the mean height that wear and spindle growth add, equally in every pass, in µm. It cannot be
+    /// distinguished from an error of the wheel's height setting.
     fn drift_um(&self, spec: &WorldSpec) -> f64 {
         let of = &spec.grinder;
         let alone = GrinderSpec {
@@ -185,7 +191,7 @@ impl Bench {
     }
 }
 
-/// How far a grinder is off, in the unit that a parameter is told in.
+/// Returns the true error of a grinder, in the unit of the estimated parameter.
 fn truth(of: &GrinderSpec, kind: ParameterKind) -> f64 {
     match kind {
         ParameterKind::WheelRadius => of.wheel_radius_error_um,
@@ -198,10 +204,11 @@ fn truth(of: &GrinderSpec, kind: ParameterKind) -> f64 {
     }
 }
 
-/// The correction after which the truth is at the floor, 0 being none; beyond the passes where it never is.
+/// Returns the number of the correction after which the truth is at the floor; 0 means that none is needed. Returns the
+/// number of passes if the truth never reaches the floor.
 ///
-/// By what comes back in every pass, beside what passes add on average: how the random part of one pass happens to lie to what is left is no merit of its
-/// correction.
+/// The criterion combines the repeatable error of a pass with the mean random error of all passes. How the random part
+/// of one pass happens to combine with the residual is not an effect of its correction.
 pub fn corrections(after: &[After]) -> usize {
     let floor_um = (after.iter().map(|a| a.floor_um * a.floor_um).sum::<f64>() / after.len() as f64).sqrt();
     after.iter().position(|a| a.repeatable_um.hypot(floor_um) <= AT_FLOOR * floor_um).unwrap_or(after.len())

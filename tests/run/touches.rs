@@ -1,4 +1,5 @@
-//! Runs whose touches are chosen batch by batch: how few they are, what they make, and what stops them at the first ten.
+//! Runs whose touches are chosen batch by batch: their number, their results, and the faults that stop them within the
+//! first ten.
 
 use std::fs;
 use std::path::Path;
@@ -23,7 +24,7 @@ fn document(path: &Path) -> Value {
     serde_json::from_slice(&fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))).unwrap()
 }
 
-/// How many targets every measurement of the record was asked for.
+/// Returns the number of requested targets of every measurement in the record.
 fn batches(folder: &Path) -> Vec<u64> {
     let records = Reader::open(folder).unwrap();
     let values = records.records(0).map(Result::unwrap).filter(|record| record.kind == Kind::Event).map(|r| r.value());
@@ -39,7 +40,7 @@ fn a_part_is_made_with_a_sixth_of_the_touches_and_is_what_it_is_said_to_be() {
         let [taken, whole] = ["taken", "whole_patterns"].map(|key| told["touches"][key].as_u64().unwrap());
         println!("{recipe}: {taken} touches of {whole}, batch by batch up to {:?}", batches(&ran.folder));
         assert!(6 * taken <= whole, "{recipe}: {taken} of {whole}");
-        // The last measurement stands in the folder of its cycle, whole; each batch before it in one of its own.
+        // The last measurement is complete in the folder of its cycle. Each batch before it has its own folder.
         let last = ran.rows().last().unwrap().cycle;
         let cycle = ran.folder.join(format!("cycle-{last}"));
         for name in ["measured.csv", "touches.json", "registration.json", "model.json", "form.csv", "error_map.svg"] {
@@ -49,7 +50,7 @@ fn a_part_is_made_with_a_sixth_of_the_touches_and_is_what_it_is_said_to_be() {
         assert_eq!(touches["tried"][0].as_array().unwrap().len(), 10);
         assert_eq!(touches["of"].as_array().unwrap().len(), table(&cycle.join("measured.csv")).len());
         assert!(cycle.join("batch-1/measured.csv").is_file() && cycle.join("batch-1/registration.json").is_file());
-        // The form is told over the whole pattern.
+        // The form is estimated over the whole pattern.
         let form = table(&cycle.join("form.csv")).len() as u64;
         assert_eq!(form * ran.rows().len() as u64, whole, "{recipe}");
         is_true(&ran, recipe);
@@ -58,7 +59,7 @@ fn a_part_is_made_with_a_sixth_of_the_touches_and_is_what_it_is_said_to_be() {
     }
 }
 
-/// The part is within its tolerance, by the truth, where nobody touched it too.
+/// Checks that the true part is within its tolerance, also at positions that were not touched.
 fn is_true(ran: &Ran, recipe: &str) {
     let half = [46.0, 26.0];
     let places: Vec<[f64; 2]> = (0..61 * 41)
@@ -132,7 +133,7 @@ fn people_are_told_after_every_batch_what_is_known_and_why_more_is_touched() {
         _ => None,
     });
     let figures: Vec<_> = figures.collect();
-    // Of ten touches with six motions taken off nothing is said of a form.
+    // Ten touches with six fitted motions are too few for a statement about the form.
     let forms: Vec<_> = figures.iter().map(|figures| (figures.points, figures.form.map(|form| form.rms))).collect();
     assert!(forms.iter().all(|(points, form)| form.is_some() == (*points > 10)), "{forms:?}");
     let on: Vec<_> =
@@ -140,7 +141,7 @@ fn people_are_told_after_every_batch_what_is_known_and_why_more_is_touched() {
     println!("{on:?}");
     assert_eq!(on[0].1, Some(30), "{on:?}");
     assert!(on.last().unwrap().1.is_none(), "{on:?}");
-    // Whatever was asked for was touched, but what was not found.
+    // All requested targets were touched, except those that were not found.
     for pair in on.windows(2).filter(|pair| pair[0].1.is_some()) {
         assert!(
             pair[1].0 <= pair[0].0 + pair[0].1.unwrap() && pair[1].0 + 2 >= pair[0].0 + pair[0].1.unwrap(),

@@ -1,9 +1,10 @@
-//! What a registration ought to find, from the world's truth and by means of its own.
+//! Reference solution of a registration, computed independently from the world's truth.
 //!
-//! The measurand is the pose, and the map of deviations, that best fit the *true* surface at the *measured* places: the form
-//! error itself moves a best fit, and no measurement can undo that. So the true centre of a ball on the real surface is
-//! computed over the foot of every measured centre, without noise, and the pose is the exact least-squares one, found by
-//! Newton's method on the closed form with feet of its own. Nothing here is shared with the library but the type of a pose.
+//! The measurand is the pose, and the map of deviations, that best fit the *true* surface at the *measured* places: the
+//! form error itself moves a best fit, and no measurement can undo that. The true centre of a ball on the real surface
+//! is therefore computed over the projection of every measured centre, without noise. The pose is the exact
+//! least-squares pose, found by Newton's method on the closed form with independent projections. This code shares
+//! nothing with the library except the type of a pose.
 
 use nalgebra::{Matrix6, Vector6};
 use regrind::geometry::{Pose, Twist};
@@ -13,28 +14,28 @@ use regrind_sim::world::World;
 
 use crate::worlds::{Snapshot, foot};
 
-/// The best fit to the true surface.
+/// Best fit to the true surface.
 pub struct Truth {
-    /// Takes the model frame to the CMM's.
+    /// Pose that transforms the model frame to the CMM's frame.
     pub pose: Pose,
-    /// Deviation at each measured place, less the level.
+    /// Deviation at each measured position, minus the level, in mm.
     pub deviations_mm: Vec<f64>,
 }
 
 impl Truth {
-    /// Largest less least.
+    /// Returns the maximum minus the minimum deviation, in mm.
     pub fn pv_mm(&self) -> f64 {
         let (low, high) = self.deviations_mm.iter().fold((f64::MAX, f64::MIN), |(l, h), d| (l.min(*d), h.max(*d)));
         high - low
     }
 
-    /// Root mean square.
+    /// Returns the root mean square of the deviations, in mm.
     pub fn rms_mm(&self) -> f64 {
         (self.deviations_mm.iter().map(|d| d * d).sum::<f64>() / self.deviations_mm.len() as f64).sqrt()
     }
 }
 
-/// Fits the true surface of a cycle at the places that took part in the registration; the map is that of all places.
+/// Fits the true surface of a cycle at the positions that took part in the registration. The map covers all positions.
 pub fn truth(world: &World, seen: &Snapshot, used: &[bool], radius_mm: f64, level_mm: f64) -> Truth {
     let above = |(place, height_mm): (&[f64; 2], &f64)| -> Vec3 {
         let (s, n) = world.nominal(place[0], place[1]);

@@ -1,4 +1,5 @@
-//! The machine that is not at its job is watched too: keys that are turned, jobs that nobody ordered, an older contract.
+//! Supervision of the machine that has no job at the moment: keys that are turned, jobs that nobody ordered, an older
+//! contract.
 
 use std::time::{Duration, Instant};
 
@@ -12,7 +13,7 @@ use tokio::task::JoinHandle;
 const HOLD: u16 = 4;
 const RESUME: u16 = 5;
 
-/// A run whose grinder has been started, slowly enough to be there for the whole test.
+/// Starts a run whose grinder grinds slowly enough to last for the whole test.
 async fn grinding(rig: &mut Rig) -> (Watched, JoinHandle<Ending>) {
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let (drive, orders) = Drive::new(run, cmm, grinder).unwrap();
@@ -21,7 +22,7 @@ async fn grinding(rig: &mut Rig) -> (Watched, JoinHandle<Ending>) {
     (Watched { notices, folder, _orders: orders }, running)
 }
 
-/// What a test keeps of a run that goes on.
+/// State that a test keeps of an active run.
 struct Watched {
     notices: UnboundedReceiver<Notice>,
     folder: std::path::PathBuf,
@@ -42,7 +43,7 @@ impl Watched {
         tokio::time::timeout(PATIENCE, told).await.expect("an alarm")
     }
 
-    /// Resumes as often as it takes until that is accepted; returns the first answer.
+    /// Resumes repeatedly until the order is accepted. Returns the first answer.
     async fn resume(&self) -> String {
         let began = Instant::now();
         let mut first = None;

@@ -1,7 +1,8 @@
-//! A whole cell in one process: a simulated world behind real sockets, and the drive that runs it; for tests of whole cycles.
+//! A whole cell in one process, for tests of whole cycles: a simulated world with real sockets, and the drive that runs
+//! it.
 //!
-//! [`run`] goes through a recipe as `regrind run` does. What the world was like when a measurement was made is kept just before
-//! the next pass changes it, so that a test can hold every cycle against the truth.
+//! [`run`] executes a recipe as `regrind run` does. The state of the world at each measurement is saved just before the
+//! next pass changes it, so that a test can compare every cycle with the truth.
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
@@ -29,43 +30,43 @@ use serde::Deserialize;
 use serde_json::json;
 use tokio::sync::mpsc;
 
-/// The number of the part's run.
+/// Job number of the part's run.
 pub const JOB: u32 = 7;
-/// No run takes so long, however loaded the computer is.
+/// Upper bound of the duration of a run, even on a loaded computer.
 const PATIENCE: Duration = Duration::from_secs(300);
-/// Machine seconds in a second.
+/// Seconds of machine time per second.
 const SPEED: f64 = 50_000.0;
 
-/// The free-form mirror with a quarter of its points.
+/// Replacements for the free-form mirror with a quarter of its points.
 const COARSE: [(&str, &str); 3] =
     [("columns = 60", "columns = 30"), ("rows = 30", "rows = 15"), ("cutoff_mm = 5.0", "cutoff_mm = 10.0")];
 
-/// What a test changes about a cell before it runs.
+/// Changes that a test makes to a cell before it runs.
 pub struct Setup {
-    /// The recipe's name, without its ending.
+    /// Name of the recipe, without its extension.
     pub recipe: &'static str,
-    /// Draws everything that is random in the world.
+    /// Seed of everything that is random in the world.
     pub seed: u64,
-    /// Changes the truth.
+    /// Function that changes the truth.
     pub world: Box<dyn Fn(&mut WorldSpec) + Send>,
-    /// Each machine answers where the other should.
+    /// True if the two machines are exchanged: each answers at the other's address.
     pub exchanged: bool,
-    /// The words of the machines' values stand the other way round than the cell file says.
+    /// True if the word order of the machines' values is opposite to that in the cell file.
     pub other_word_order: bool,
-    /// The version of the register map that both machines say they keep.
+    /// Version of the register map that both machines report.
     pub version: u16,
-    /// What the recipe says of the temperature of a measurement.
+    /// Temperature limits of a measurement in the recipe.
     pub temperature_c: Option<[f64; 2]>,
-    /// What the recipe says of the growth of the part.
+    /// Thermal expansion of the part in the recipe.
     pub expansion_um_m_k: Option<f64>,
-    /// Whether touches are chosen.
+    /// True if touches are chosen.
     pub adaptive: bool,
-    /// A quarter of the points, for what does not hang on their number.
+    /// True for a quarter of the points, in tests that do not depend on their number.
     pub coarse: bool,
 }
 
 impl Setup {
-    /// A recipe as it is, with a seed.
+    /// Returns a setup with a recipe as shipped, and a seed.
     pub fn new(recipe: &'static str, seed: u64) -> Self {
         let world = Box::new(|_: &mut WorldSpec| {});
         Self {
@@ -82,64 +83,65 @@ impl Setup {
         }
     }
 
-    /// The same in another world.
+    /// Returns the same setup with a changed world.
     pub fn with(mut self, world: impl Fn(&mut WorldSpec) + Send + 'static) -> Self {
         self.world = Box::new(world);
         self
     }
 }
 
-/// What the world was like when a cycle was measured.
+/// State of the world when a cycle was measured.
 pub struct Snapshot {
-    /// The cycle.
+    /// Number of the cycle.
     pub cycle: u32,
-    /// Where the part lay on the CMM.
+    /// Placement of the part on the CMM.
     pub placement: Placement,
-    /// Feet of the measured centres on the nominal surface, over the plane of the true model frame.
+    /// Projections of the measured centres onto the nominal surface, as positions in the xy plane of the true model
+    /// frame, in mm.
     pub places_mm: Vec<[f64; 2]>,
-    /// How far the centre of the ball stood above the offset of the nominal there.
+    /// Heights of the ball centre above the offset surface of the nominal at these positions, in mm.
     pub heights_mm: Vec<f64>,
 }
 
-/// What came of a run.
+/// Result of a run.
 pub struct Ran {
-    /// How it ended.
+    /// How the run ended.
     pub ending: Ending,
-    /// What was shown, in order.
+    /// Notices, in order.
     pub notices: Vec<Notice>,
-    /// The run folder, with the journal.
+    /// Run folder, with the journal.
     pub folder: PathBuf,
-    /// The truth.
+    /// Simulated world, with the truth.
     pub world: World,
-    /// The truth at each measured cycle.
+    /// State of the world at each measured cycle.
     pub snapshots: Vec<Snapshot>,
-    /// Largest PV and RMS that are accepted.
+    /// Maximum PV and RMS that are accepted, in mm.
     pub tolerance_mm: [f64; 2],
-    /// Radius that the recipe states of the probe.
+    /// Probe radius that the recipe states, in mm.
     pub probe_radius_mm: f64,
-    /// Passes begun when the first alarm that a person must clear was seen, if one was.
+    /// Number of passes that had started when the first alarm appeared that a person must clear, if there was one.
     pub passes_at_alarm: Option<usize>,
     _home: tempfile::TempDir,
 }
 
 impl Ran {
-    /// The table of cycles.
+    /// Returns the table of cycles.
     pub fn rows(&self) -> Vec<CycleRow> {
         let rows = |n: &Notice| if let Notice::Finished { cycles, .. } = n { Some(cycles.clone()) } else { None };
         self.notices.iter().rev().find_map(rows).unwrap_or_default()
     }
 
-    /// All alarms, in order.
+    /// Returns all alarms, in order.
     pub fn alarms(&self) -> Vec<&Alarm> {
         self.notices.iter().filter_map(|n| if let Notice::Alarm(alarm) = n { Some(alarm) } else { None }).collect()
     }
 
-    /// Whether the part was accepted.
+    /// Returns true if the part was accepted.
     pub fn accepted(&self) -> bool {
         matches!(self.ending, Ending::Accepted { .. })
     }
 
-    /// Everything that a failed test should show.
+    /// Returns all the text that a failed test should show.
     pub fn told(&self) -> String {
         let alarms: Vec<_> = self.alarms().iter().map(|a| format!("{:?}: {}", a.id, a.what)).collect();
         let rows: Vec<_> = self
@@ -151,7 +153,7 @@ impl Ran {
     }
 }
 
-/// A grinder that lets a test look at the world just before every pass.
+/// Grinder that lets a test inspect the world just before every pass.
 struct Watched<B> {
     body: B,
     before: Box<dyn FnMut() + Send>,
@@ -191,7 +193,7 @@ impl<B: Body> Body for Watched<B> {
     }
 }
 
-/// Looks at the world where each cycle was measured.
+/// Recorder of the state of the world at each measured cycle.
 struct Eye {
     world: World,
     folder: PathBuf,
@@ -200,7 +202,7 @@ struct Eye {
 }
 
 impl Eye {
-    /// Looks where the newest cycle was measured, once.
+    /// Records the state of the world at the newest measured cycle, once.
     fn look(&self) {
         let Self { world, folder, radius_mm, .. } = self;
         let mut taken = self.taken.lock().unwrap();
@@ -216,22 +218,24 @@ impl Eye {
         let (placement, measured) = (world.placement(), table(&folder.join(format!("cycle-{cycle}/measured.csv"))));
         let centres = measured.iter().map(|row| back(&placement, [row[0], row[1], row[2]]));
         let places_mm: Vec<[f64; 2]> = centres.map(|centre| foot(world, centre).0).collect();
-        // A touch at the very edge of the part may have its foot beyond it.
+        // A touch at the very edge of the part may have its projection beyond the edge.
         let touched = world.touched_mm(&places_mm, *radius_mm).into_iter().zip(&places_mm);
         let heights_mm = touched.map(|(height, &[x, y])| height.unwrap_or_else(|| world.deviation_mm(x, y))).collect();
         taken.push(Snapshot { cycle, placement, places_mm, heights_mm });
     }
 }
 
-/// Moves a point of the CMM's frame into the part's.
+/// Transforms a point from the CMM's frame to the part's frame.
 pub fn back(placement: &Placement, p: Vec3) -> Vec3 {
     let d: Vec3 = std::array::from_fn(|i| p[i] - placement.translation_mm[i]);
     std::array::from_fn(|k| (0..3).map(|i| placement.rotation[i][k] * d[i]).sum())
 }
 
-/// Returns the foot of a point on the true nominal surface: its place, the normal there, the distance.
+/// Projects a point onto the true nominal surface. Returns the position of the projection, the normal there, and the
+/// distance.
 ///
-/// Each turn moves the foot by what is left along the surface; what is left shrinks by distance over radius of curvature.
+/// Each iteration moves the projection by the residual along the surface. The residual shrinks by the ratio of distance
+/// to radius of curvature.
 pub fn foot(world: &World, p: Vec3) -> ([f64; 2], Vec3, f64) {
     let [mut x, mut y] = [p[0], p[1]];
     for _ in 0..40 {
@@ -252,11 +256,11 @@ pub fn foot(world: &World, p: Vec3) -> ([f64; 2], Vec3, f64) {
 pub fn table(path: &std::path::Path) -> Vec<Vec<f64>> {
     let text = std::fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
     let row = |line: &str| line.split(',').map(|cell| cell.trim().parse().unwrap()).collect();
-    // Comments, such as the mark of a simulation, then the header.
+    // First come comments, for example the mark of a simulation, then the header.
     text.lines().filter(|line| !line.starts_with('#')).skip(1).map(row).collect()
 }
 
-/// Runs a cell in a runtime of its own.
+/// Runs a cell in its own runtime.
 pub fn run(setup: Setup) -> Ran {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
     runtime.block_on(async {
@@ -314,7 +318,7 @@ async fn go(setup: Setup) -> Ran {
         if person && passes_at_alarm.is_none() {
             passes_at_alarm = Some(world.history().len());
             let (folder, orders, actor) = (folder.clone(), orders.clone(), actor.clone());
-            // A held cell waits for a person; this one ends it.
+            // A held cell waits for a person. This task ends the run instead.
             tokio::spawn(async move {
                 if rests(folder).await {
                     orders.give(Request::Stop { reason: "the test has seen enough".into() }, actor).await;
@@ -329,7 +333,7 @@ async fn go(setup: Setup) -> Ran {
     Ran { ending, notices: seen, folder, world, snapshots, tolerance_mm, probe_radius_mm, passes_at_alarm, _home: home }
 }
 
-/// Waits until the cell is held; false if it ended by itself.
+/// Waits until the cell is held. Returns false if the run ended by itself.
 async fn rests(folder: PathBuf) -> bool {
     loop {
         let folder = folder.clone();
@@ -342,7 +346,7 @@ async fn rests(folder: PathBuf) -> bool {
     }
 }
 
-/// How a run of a part begins on record.
+/// Returns the first record of a run of a part.
 pub fn header(part: &str) -> Header {
     Header {
         run: "run".into(),
@@ -364,12 +368,12 @@ fn world(setup: &Setup, recipe: &Recipe) -> World {
     World::new(spec).unwrap()
 }
 
-/// Serves both machines on ports of their own, and tells the drivers of the cell where.
+/// Serves both machines on their own ports, and gives the drivers of the cell the addresses.
 async fn serve(setup: &Setup, cell: &CellConfig, eye: &Arc<Eye>) -> ([Serving; 2], [ModbusSettings; 2]) {
     let options = |seed| MachineOptions {
         speed: SPEED,
         seed,
-        // A loaded computer is no silent client.
+        // A client on a loaded computer must not look like a client that is gone.
         lost_after_ms: 30_000,
         acting: Duration::from_millis(10),
         word_order: if setup.other_word_order { words::WordOrder::Little } else { words::WordOrder::Big },

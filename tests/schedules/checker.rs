@@ -1,5 +1,5 @@
-//! Holds what the machines did against what is on record and what people were shown and told. Knows nothing of the program but its
-//! record, and nothing of the machines but what they did.
+//! Compares the actions of the machines with the record and with what people were shown. It knows nothing of the
+//! program except its record, and nothing of the machines except their actions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -21,64 +21,65 @@ use crate::schedule::Tally;
 use crate::wire::{Sent, Traffic};
 use crate::{programs, touches};
 
-/// A cell that shows that it stands may be wrong for so long: a machine that hears nothing holds by itself after three seconds.
+/// Longest time for which a cell can wrongly show that nothing moves: a machine without communication holds by itself
+/// after three seconds.
 const STANDS_WITHIN: Duration = Duration::from_millis(3_600);
-/// An abort is at a machine that moves within this, whatever the disk does.
+/// Time limit for an abort to reach a moving machine, whatever the disk does.
 const ABORTS_WITHIN: Duration = Duration::from_millis(100);
-/// What was in the way of questions to the machines is out of it after this.
+/// Time after which an obstacle to queries to the machines has been removed.
 const RECOVERS_WITHIN: Duration = Duration::from_secs(12);
-/// A machine that moves without an order is seen and holds within this.
+/// Time limit for the detection of a machine that moves without an order, until it is held.
 const FOUND_WITHIN: Duration = Duration::from_millis(800);
-/// A machine that is found moving is told to hold within this, if it can be reached.
+/// Time limit for the HOLD command to a machine that is found moving, if it is reachable.
 const HOLDS_WITHIN: Duration = Duration::from_secs(4);
-/// What leads from one state to the next takes no longer than this, where nothing but the disk fails.
+/// Time limit of a transitional state, if nothing but the disk fails.
 const LEADS_ON_WITHIN: Duration = Duration::from_secs(9);
-/// What a cell shows that stands.
+/// States in which the cell shows that nothing moves.
 const STANDS: [StateName; 4] = [StateName::Held, StateName::Stopped, StateName::Aborted, StateName::Complete];
 const NAMES: [&str; 2] = ["cmm", "grinder"];
 
-/// What the cell showed from a moment on; nothing where nobody could see it.
+/// State that the cell showed from a moment on; none if nobody could see it.
 #[derive(Clone, Copy, Debug)]
 pub struct Shown {
     pub at: Instant,
     pub state: Option<StateName>,
     pub phase: Option<Phase>,
-    /// Which machines were named as not having confirmed that they stand.
+    /// Machines that are named as not having confirmed standstill.
     pub unconfirmed: [bool; 2],
 }
 
-/// What is left of a schedule.
+/// Evidence that a schedule leaves.
 pub struct Evidence {
     pub began: Instant,
     pub job: u32,
     pub folder: PathBuf,
     pub log: Vec<Moment>,
-    /// What the CMM did, where it is one by I++ DME.
+    /// Actions of the CMM, if it is one by I++ DME.
     pub deeds: Vec<(Instant, Deed)>,
-    /// What the grinder did, where it is one by LinuxCNC.
+    /// Actions of the grinder, if it is one by LinuxCNC.
     pub rsh_deeds: Vec<(Instant, OfRsh)>,
     pub given: Vec<Given>,
     pub written: Vec<Recorded>,
     pub shown: Vec<Shown>,
     pub tally: Tally,
     pub wires: Traffic,
-    /// From when to when something was in the way of questions to the machines; none where that may have been so at any time.
+    /// Intervals in which something obstructed queries to the machines; none if that is possible at any time.
     pub hindered: Option<Vec<(Instant, Instant)>>,
-    /// How far over the highest target the probe's centre travels.
+    /// Height of the travel of the probe's centre above the highest target, in mm.
     pub clearance_mm: f64,
-    /// Whether a machine's application may have stood still.
+    /// True if the application of a machine can have frozen.
     pub freezes: bool,
-    /// Whether nothing goes wrong but that the disk fails for a while.
+    /// True if nothing fails except the disk, for a while.
     pub disk_alone: bool,
-    /// Whether machines say what is not so: of where they stand and whether they move only they themselves can tell.
+    /// True if machines report false values: only the machines themselves then know their position and motion.
     pub lies: bool,
-    /// Whether it came to the end it should come to where nothing was in its way but deaths of the program.
+    /// True if the run had the expected end, provided that only deaths of the program disturbed it.
     pub ended_well: bool,
     pub effects: u64,
 }
 
 impl Evidence {
-    /// Everything that happened, line by line.
+    /// Returns all events, line by line.
     pub fn trace(&self) -> Vec<String> {
         let log = self.log.iter().map(|m| (m.at, format!("{} {:?}", NAMES[m.machine], m.what)));
         let written = self.written.iter().map(|w| (w.at, format!("record {}", w.payload)));
@@ -102,7 +103,7 @@ impl Evidence {
             .chain(spoken)
             .collect();
         lines.sort_by_key(|(at, _)| *at);
-        // Journals and programs lie beside each other.
+        // Journals and programs are in neighbouring folders.
         let home = self.folder.parent().unwrap_or(&self.folder).display().to_string();
         let line = |(at, what): (Instant, String)| format!("{:10.4} {}", self.seconds(at), what.replace(&home, "HOME"));
         lines.into_iter().map(line).collect()
@@ -112,34 +113,35 @@ impl Evidence {
         (at - self.began).as_secs_f64()
     }
 
-    /// What the cell showed last before a moment.
+    /// Returns the last state that the cell showed before a moment.
     pub fn shown_before(&self, at: Instant) -> Option<&Shown> {
         let next = self.shown.partition_point(|shown| shown.at < at);
         self.shown[..next].last()
     }
 
-    /// What the cell shows from a moment on.
+    /// Returns the state that the cell shows at a moment.
     fn shown_at(&self, at: Instant) -> Option<&Shown> {
         let next = self.shown.partition_point(|shown| shown.at <= at);
         self.shown[..next].last()
     }
 
-    /// Records of an event of a machine from one moment to another.
+    /// Returns the records of an event of a machine between two moments.
     fn told(&self, event: &str, machine: usize, from: Instant, to: Instant) -> impl Iterator<Item = &Recorded> {
         let of_it = move |w: &&Recorded| w.payload["event"] == event && w.payload["device"] == NAMES[machine];
         self.written.iter().filter(move |w| from <= w.at && w.at <= to).filter(of_it)
     }
 
-    /// The START that is on record last before a record, for the same machine.
+    /// Returns the last START on record before a record, for the same machine.
     fn intent_before(&self, number: usize, machine: usize) -> Option<usize> {
         self.written[..number].iter().rposition(|w| is_intent(w, machine))
     }
 }
 
-/// Holds a schedule against every promise.
+/// Checks a schedule against every promise.
 ///
 /// # Errors
-/// The first that was broken.
+///
+/// Returns the first broken promise.
 pub fn check(evidence: &Evidence) -> Result<(), String> {
     let (records, is_closed) = sound_record(evidence)?;
     intended_before(evidence)?;
@@ -167,12 +169,12 @@ pub fn check(evidence: &Evidence) -> Result<(), String> {
     if !evidence.ended_well {
         return Err("nothing went wrong but that the program died, and the run does not end as it should".to_owned());
     }
-    // Once nothing goes wrong any more, the run comes to its end.
+    // After the last fault, the run finishes.
     let last = evidence.shown.iter().rev().find_map(|shown| shown.state);
     if is_closed { Ok(()) } else { Err(format!("the run comes to no end; last it shows {last:?}")) }
 }
 
-/// The record is whole, and has everything that was acknowledged.
+/// Checks that the record is intact, and contains everything that was acknowledged.
 fn sound_record(evidence: &Evidence) -> Result<(Vec<Value>, bool), String> {
     let verified = verify(&evidence.folder).map_err(|error| format!("the record is broken: {error}"))?;
     let reader = Reader::open(&evidence.folder).map_err(|error| error.to_string())?;
@@ -180,7 +182,7 @@ fn sound_record(evidence: &Evidence) -> Result<(Vec<Value>, bool), String> {
         reader.records(0).map(|record| record.map(|r| r.value())).collect::<Result<_, _>>().unwrap();
     let mut left: BTreeMap<String, u64> = BTreeMap::new();
     records.iter().for_each(|payload| *left.entry(payload.to_string()).or_default() += 1);
-    // A run that was begun anew has a record of its own.
+    // A run that was started again has its own record.
     let first_of_run = evidence.written.iter().rposition(|w| w.payload["event"] == "start").unwrap_or(0);
     for recorded in evidence.written[first_of_run..].iter().filter(|w| w.payload.is_object()) {
         match left.get_mut(&recorded.payload.to_string()) {
@@ -191,7 +193,8 @@ fn sound_record(evidence: &Evidence) -> Result<(Vec<Value>, bool), String> {
     Ok((records, verified.closed))
 }
 
-/// Whether a machine has forgotten a job that it began before anything on record had seen it at that: then nobody can know that it began.
+/// Returns true if a machine has forgotten a job that it began before any record had seen it: then nobody can know that
+/// it began.
 fn was_forgotten_unseen(evidence: &Evidence, began: &Moment) -> bool {
     let of_it = || evidence.log.iter().filter(|moment| moment.machine == began.machine && moment.at >= began.at);
     let forgot = of_it().find(|moment| matches!(moment.what, What::Forgot));
@@ -204,24 +207,24 @@ fn was_forgotten_unseen(evidence: &Evidence, began: &Moment) -> bool {
                 || event["event"] == "progressed"
                 || event["event"] == "reconciled" && at_work)
     };
-    // A status that was on its way when the machine forgot is told a moment later.
+    // A status that was in transit when the machine forgot arrives a moment later.
     let next_start = of_it().find(|moment| moment.at > began.at && matches!(moment.what, What::Began { .. }));
     let until = next_start.map_or(forgot.at + Duration::from_secs(1), |next| next.at);
     !evidence.written.iter().any(|w| w.at >= began.at && w.at <= until && seen(w))
 }
 
-/// Every START moves a machine once, and every pass is begun once.
+/// Checks that every START moves a machine once, and that every pass begins once.
 fn began_once(evidence: &Evidence) -> Result<(), String> {
     let mut starts: BTreeSet<(usize, u32, u32, u16)> = BTreeSet::new();
     let mut passes = BTreeSet::new();
     for moment in &evidence.log {
-        // A machine that was started anew counts anew.
+        // A machine that was restarted counts from the beginning.
         if let What::Rebooted { .. } | What::Forgot = moment.what {
             starts.retain(|(machine, ..)| *machine != moment.machine);
         }
         let What::Began { start, job, cycle } = moment.what else { continue };
         let (machine, at) = (NAMES[moment.machine], evidence.seconds(moment.at));
-        // Numbers come again where somebody has counted to their end; a START is told by its job too.
+        // Numbers repeat after the counter has wrapped; the job identifies a START as well.
         if !starts.insert((moment.machine, start, job, cycle)) {
             return Err(format!("the {machine} carried out START {start} twice, again at {at:.3} s"));
         }
@@ -235,7 +238,7 @@ fn began_once(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// What a machine begins was on record before.
+/// Checks that every job that a machine begins was on record before.
 fn intended_before(evidence: &Evidence) -> Result<(), String> {
     for moment in &evidence.log {
         let What::Began { start, job, cycle } = moment.what else { continue };
@@ -255,7 +258,7 @@ fn intended_before(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// What is in force at a machine as it begins is what the record names.
+/// Checks that the payload in force when a machine begins is the one in the record.
 fn map_of_record(evidence: &Evidence, records: &[Value]) -> Result<(), String> {
     let mut in_force: [BTreeMap<u16, [u8; 32]>; 2] = Default::default();
     for moment in &evidence.log {
@@ -282,7 +285,7 @@ fn map_of_record(evidence: &Evidence, records: &[Value]) -> Result<(), String> {
     Ok(())
 }
 
-/// The state of each machine from moment to moment.
+/// Returns the state of each machine from moment to moment.
 fn states(evidence: &Evidence) -> Vec<(Instant, [State; 2])> {
     let mut now = [State::Idle; 2];
     let mut states = vec![(evidence.began, now)];
@@ -295,7 +298,7 @@ fn states(evidence: &Evidence) -> Vec<(Instant, [State; 2])> {
     states
 }
 
-/// The two machines never move at the same time by an order of the program.
+/// Checks that the two machines never move at the same time by an order of the program.
 fn never_both(evidence: &Evidence) -> Result<(), String> {
     let (mut now, mut strays) = ([State::Idle; 2], [false; 2]);
     for moment in &evidence.log {
@@ -314,7 +317,7 @@ fn never_both(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// A machine that moves, from when to when, and whether nobody had ordered it.
+/// Motion of a machine: start, end, and whether nobody had ordered it.
 struct Motion {
     machine: usize,
     from: Instant,
@@ -343,8 +346,8 @@ fn motions(evidence: &Evidence) -> Vec<Motion> {
     motions
 }
 
-/// Where the cell shows that it stands, nothing moves, but what it names as not having confirmed the end of the safe sequence. What
-/// goes astray once the run is over, or in the moment before, nobody watches any more.
+/// Checks that nothing moves while the cell shows standstill, except a machine that it names as not having confirmed
+/// the end of the safe sequence. Nobody watches for stray motions after the run is over, or in the moment before.
 fn still_where_shown(evidence: &Evidence) -> Result<(), String> {
     let motions = motions(evidence);
     for (k, shown) in evidence.shown.iter().enumerate() {
@@ -366,7 +369,8 @@ fn still_where_shown(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// Where only the disk fails no state that is to lead on lasts: a command that did not come on record is not waited for.
+/// Checks that no transitional state lasts if only the disk fails: the cell does not wait for a command that did not
+/// reach the record.
 fn waits_for_nothing_for_long(evidence: &Evidence) -> Result<(), String> {
     const LEADS_ON: [StateName; 6] = [
         StateName::Holding,
@@ -387,7 +391,7 @@ fn waits_for_nothing_for_long(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// A cell that holds shows Held only once the machine does that it holds.
+/// Checks that a cell that holds shows Held only after the machine reports that it holds.
 fn held_when_it_holds(evidence: &Evidence) -> Result<(), String> {
     let states = states(evidence);
     for pair in evidence.shown.windows(2) {
@@ -404,12 +408,12 @@ fn held_when_it_holds(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// Nothing that moves a machine leaves the program while the cell shows that it stands.
+/// Checks that no command that moves a machine leaves the program while the cell shows standstill.
 fn moved_by_nothing_that_stands(evidence: &Evidence) -> Result<(), String> {
     let mut numbers = BTreeSet::new();
     let moves = evidence.wires.sent.iter().filter(|sent| matches!(sent.command, Command::Start | Command::Resume));
     for sent in moves {
-        // Written again it is the same command, and as it was decided.
+        // A rewrite is the same command, with the same decision.
         let is_first = numbers.insert((sent.machine, sent.frame.owner, sent.frame.epoch, sent.frame.sequence));
         let Some(last) = evidence.shown_before(sent.at).filter(|_| is_first) else { continue };
         if last.state.is_some_and(|state| state == StateName::Suspended || STANDS.contains(&state)) {
@@ -423,7 +427,7 @@ fn moved_by_nothing_that_stands(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// A job that was out of sight and is found to run is told to hold, where the cell holds.
+/// Checks that the cell, if it holds, sends HOLD to a job that was out of sight and is found running.
 fn told_to_hold(evidence: &Evidence) -> Result<(), String> {
     for (k, name) in NAMES.iter().enumerate() {
         let found = evidence.told("reconciled", k, evidence.began, evidence.began + Duration::from_secs(86_400));
@@ -446,7 +450,8 @@ fn told_to_hold(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// A machine that begins to move without an order while the cell stands is told to hold, where it can be reached and seen.
+/// Checks that the cell sends HOLD to a machine that begins to move without an order while the cell is at a standstill,
+/// if the machine is reachable and visible.
 fn strays_are_told_to_hold(evidence: &Evidence) -> Result<(), String> {
     let Some(hindered) = evidence.hindered.as_ref().filter(|_| !evidence.freezes) else { return Ok(()) };
     for (number, moment) in evidence.log.iter().enumerate().filter(|(_, moment)| matches!(moment.what, What::Strayed)) {
@@ -466,14 +471,14 @@ fn strays_are_told_to_hold(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// An abort is on its way at once to a machine that moves, whatever the disk does; where nothing is in the way of it.
+/// Checks that an abort is sent at once to a moving machine, whatever the disk does, if nothing obstructs it.
 fn aborted_at_once(evidence: &Evidence) -> Result<(), String> {
     let Some(hindered) = &evidence.hindered else { return Ok(()) };
     let by_lines = [!evidence.deeds.is_empty(), !evidence.rsh_deeds.is_empty()];
     for abort in evidence.given.iter().filter(|given| given.what == "abort" && given.done) {
         let by = abort.at + ABORTS_WITHIN;
         let is_hindered = hindered.iter().any(|(from, to)| *from <= by && abort.at <= *to + RECOVERS_WITHIN);
-        // A program that was started again has to meet the machines first.
+        // A restarted program first has to connect to the machines.
         let lives = evidence.shown.iter().rposition(|shown| shown.at <= abort.at && shown.state.is_none());
         let has_met = lives.is_none_or(|end| evidence.shown[end].at + RECOVERS_WITHIN < abort.at);
         let met = |k: usize| has_met || by_lines[k];
@@ -483,7 +488,7 @@ fn aborted_at_once(evidence: &Evidence) -> Result<(), String> {
                     && moment.at <= abort.at
                     && match &moment.what {
                         What::Began { .. } | What::Strayed => true,
-                        // Who knows no jobs is seen to move.
+                        // For a machine without jobs, the change of state shows the motion.
                         What::Changed { to, .. } => by_lines[k] && *to == State::Execute,
                         _ => false,
                     }
@@ -501,7 +506,8 @@ fn aborted_at_once(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// A pass that a machine has begun is never intended again: that it would refuse it is not relied on.
+/// Checks that a pass that a machine has begun is never intended again. The check does not rely on the machine to
+/// refuse it.
 fn begun_is_not_intended_again(evidence: &Evidence) -> Result<(), String> {
     for began in evidence.log.iter().filter(|moment| moment.machine == 1) {
         let What::Began { start, job, cycle } = began.what else { continue };
@@ -523,7 +529,7 @@ fn begun_is_not_intended_again(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// A START that the record says was not taken has moved nothing, and never will.
+/// Checks that a START that is on record as not taken has moved nothing, and never does.
 fn said_of_starts_is_so(evidence: &Evidence) -> Result<(), String> {
     for (number, said) in evidence.written.iter().enumerate() {
         let event = &said.payload;
@@ -536,7 +542,7 @@ fn said_of_starts_is_so(evidence: &Evidence) -> Result<(), String> {
         let Some(intent) = evidence.intent_before(number, machine) else { continue };
         let (intended, rest) = (&evidence.written[intent], &evidence.written[intent + 1..]);
         if not_started && event["cycle"] != intended.payload["cycle"] {
-            // Of this cycle no START was ever on record.
+            // No START of this cycle was ever on record.
             continue;
         }
         let meant = &intended.payload["intent"];
@@ -544,13 +550,14 @@ fn said_of_starts_is_so(evidence: &Evidence) -> Result<(), String> {
         for moment in moved {
             let What::Began { start, job, cycle } = moment.what else { continue };
             let is_it = meant["start_sequence"] == start && meant["job"] == job && intended.payload["cycle"] == cycle;
-            // A machine that was started anew counts anew: a later START may bear the same number.
+            // A machine that was restarted counts from the beginning: a later START can have the same number.
             let is_later = || {
                 rest.iter().any(|w| {
                     is_intent(w, machine) && w.at <= moment.at && w.payload["intent"]["start_sequence"] == start
                 })
             };
-            // A machine that has forgotten its job says that it never began; the record has what it said, and nothing follows from that.
+            // A machine that has forgotten its job reports that it never began. The record contains that report, and no
+            // conclusion follows from it.
             let forgot = |then: &&Moment| matches!(then.what, What::Forgot) && then.machine == machine;
             let is_a_lie = evidence.log.iter().filter(forgot).any(|then| moment.at <= then.at && then.at <= said.at);
             if is_it && !is_later() && !is_a_lie {
@@ -565,12 +572,13 @@ fn said_of_starts_is_so(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// Whether a record is the intent of a START of a machine.
+/// Returns true if a record is the intent of a START of a machine.
 pub fn is_intent(recorded: &Recorded, machine: usize) -> bool {
     recorded.payload["command"] == "start_machine" && recorded.payload["device"] == NAMES[machine]
 }
 
-/// One question at a time, on a connection on which nothing waits and the machine has been met; and the program never fails.
+/// Checks that there is one query at a time, on a connection without waiting commands and with an established machine,
+/// and that the program never fails.
 fn asked_as_it_should_be(evidence: &Evidence) -> Result<(), String> {
     if let Some((at, what)) = evidence.wires.wrong.first() {
         return Err(format!("at {:.3} s {what}", evidence.seconds(*at)));
@@ -581,7 +589,7 @@ fn asked_as_it_should_be(evidence: &Evidence) -> Result<(), String> {
     }
 }
 
-/// An order that was accepted is on record, and was so before it was answered.
+/// Checks that an accepted order is on record, and was so before its answer.
 fn answered_is_on_record(evidence: &Evidence, records: &[Value]) -> Result<(), String> {
     for given in evidence.given.iter().filter(|given| given.accepted) {
         let names = |payload: &Value| match given.what {

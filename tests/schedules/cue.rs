@@ -1,4 +1,5 @@
-//! Moments that others wait for: what is drawn to happen just as a machine is started, say, happens then.
+//! Cues: moments that faults wait for. A fault that is drawn for the start of a machine, for example, then occurs
+//! exactly at that start.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,7 +11,7 @@ use regrind_sim::seen::What;
 use serde_json::Value;
 use tokio::sync::watch;
 
-/// A kind of moment at which something can go wrong in a way of its own.
+/// Kind of moment at which a specific fault is possible.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Cue {
     /// A payload is in force.
@@ -46,7 +47,7 @@ impl Cue {
         Self::LinkBack,
     ];
 
-    /// What of a record is one.
+    /// Returns the cue of a record, if it is one.
     fn recorded(payload: &Value) -> Option<Self> {
         Some(match (payload["event"].as_str(), payload["command"].as_str()) {
             (Some("pass_loaded" | "plan_loaded"), _) => Self::Loaded,
@@ -59,7 +60,7 @@ impl Cue {
         })
     }
 
-    /// What of what a machine does is one.
+    /// Returns the cue of a machine's action, if it is one.
     fn done(what: &What) -> Option<Self> {
         Some(match what {
             What::Began { .. } => Self::Begins,
@@ -71,16 +72,16 @@ impl Cue {
     }
 }
 
-/// When something happens.
+/// Time of an event.
 #[derive(Clone, Copy, Debug)]
 pub enum When {
     At(Duration),
-    /// So long after a moment comes for that many-th time.
+    /// This long after the n-th moment of a kind.
     After(Cue, u32, Duration),
 }
 
 impl When {
-    /// Draws a time of a run that takes so many seconds, or one of the first moments of a kind.
+    /// Draws a time in a run of this many seconds, or one of the first moments of a kind.
     pub fn drawn(chance: &mut StdRng, span_s: f64) -> Self {
         if chance.random::<f64>() < 0.5 {
             return Self::At(Duration::from_secs_f64(span_s * chance.random::<f64>()));
@@ -99,12 +100,12 @@ impl When {
     }
 }
 
-/// Draws a time up to so many seconds; some milliseconds are as likely as some seconds.
+/// Draws a duration up to this many seconds; some milliseconds are as likely as some seconds.
 pub fn any_length(chance: &mut StdRng, most_s: f64) -> Duration {
     Duration::from_secs_f64(1e-3 * (1e3 * most_s).powf(chance.random::<f64>()))
 }
 
-/// Counts the moments of each kind, for who waits for one.
+/// Counters of the moments of each kind, for tasks that wait for one.
 #[derive(Clone, Debug)]
 pub struct Cues(Arc<watch::Sender<[u32; Cue::ALL.len()]>>);
 
@@ -121,12 +122,12 @@ impl Cues {
         self.give(Cue::done(what));
     }
 
-    /// A START leaves the program.
+    /// Counts a START that leaves the program.
     pub fn see_start(&self) {
         self.give(Some(Cue::StartSent));
     }
 
-    /// A machine that knows no jobs begins one.
+    /// Counts the beginning of a job on a machine that knows no jobs.
     pub fn begin(&self) {
         self.give(Some(Cue::Begins));
     }
@@ -137,15 +138,15 @@ impl Cues {
         }
     }
 
-    /// Waits until it is time.
+    /// Waits until the given time.
     pub async fn wait(&self, when: When) {
         match when {
             When::At(at) => tokio::time::sleep(at).await,
             When::After(cue, nth, pause) => {
                 let mut counts = self.0.subscribe();
-                // The counter lives as long as this.
+                // The counter lives as long as `self`.
                 let _ = counts.wait_for(|counts| counts[cue as usize] >= nth).await;
-                // At once is before anything else happens.
+                // Without a pause, the fault occurs before anything else happens.
                 if !pause.is_zero() {
                     tokio::time::sleep(pause).await;
                 }

@@ -1,4 +1,5 @@
-//! A schedule while it happens: the machines live on, and one life of the program follows the other until its run has come to its end.
+//! Execution of a schedule: the machines live on, and the program is restarted after each death until its run has
+//! finished.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -35,17 +36,17 @@ use crate::person::{Given, Person, actor};
 use crate::schedule::{Act, Schedule, Tally};
 use crate::wire::Wires;
 
-/// Nothing is drawn to go wrong after this.
+/// Time after which no fault is drawn.
 const CALM_AFTER: Duration = Duration::from_secs(90);
-/// What goes wrong is over so long after it began.
+/// Longest duration of a fault.
 const AT_MOST: Duration = Duration::from_secs(21);
-/// A run has come to its end this long after everything has become calm.
+/// Time limit for the end of a run after the last fault.
 const ENDS_WITHIN: Duration = Duration::from_secs(1800);
 
-/// What the probe's centre must not leave.
+/// Volume that the probe's centre must not leave, in mm.
 const VOLUME_MM: [[f64; 3]; 2] = [[-500.0, -500.0, -300.0], [500.0, 500.0, 400.0]];
 
-/// A schedule while it happens.
+/// Schedule in execution.
 pub struct Happening<'s> {
     schedule: &'s Schedule,
     home: &'s Path,
@@ -59,9 +60,9 @@ pub struct Happening<'s> {
     written: Written,
     wires: Wires,
     cues: Cues,
-    /// When what is asked of the machines may not have arrived at once.
+    /// Intervals in which requests to the machines were possibly delayed.
     hindered: Hindered,
-    /// The orders of the life that is under way, for who gives them from outside.
+    /// Orders of the current life, for tasks that give them from outside.
     orders: Office,
     job: u32,
     lives: u64,
@@ -69,11 +70,11 @@ pub struct Happening<'s> {
     background: JoinSet<()>,
 }
 
-/// How a life of the program ended.
+/// End of a life of the program.
 enum Ended {
     Died,
     Over(Ending),
-    /// It came to no end.
+    /// It did not end.
     Never,
 }
 
@@ -87,7 +88,7 @@ impl<'s> Happening<'s> {
             Faults::from(plan)
         });
         let nets = match schedule.baud {
-            // Both are on one line.
+            // Both machines are on one line.
             Some(_) => {
                 let line = Net::new(machines.both(), faults[0].clone(), schedule.baud, seed ^ 0x10);
                 [line.clone(), line]
@@ -130,7 +131,7 @@ impl<'s> Happening<'s> {
             self.effects += life.effects();
             match ended {
                 Ended::Over(ending) if self.is_closed() => break Some(ending),
-                // The disk did not take its end: it is gone on with to bring it there.
+                // The disk did not accept its end: the program resumes to record it.
                 Ended::Over(_) if self.began.elapsed() < CALM_AFTER => sleep(CALM_AFTER).await,
                 Ended::Over(_) | Ended::Never => break None,
                 Ended::Died => sleep(up_to(&mut chance, 8.0)).await,
@@ -144,7 +145,7 @@ impl<'s> Happening<'s> {
                 folder = self.folder();
             }
         };
-        // Whoever has given a machine back has done so by now.
+        // Everybody who has a machine to give back has done so by now.
         sleep(Duration::from_secs(5)).await;
         self.evidence(folder, ending)
     }
@@ -157,7 +158,7 @@ impl<'s> Happening<'s> {
         self.home.join(format!("run-{}", self.job))
     }
 
-    /// Begins or goes on with the run, until it ends or the program dies.
+    /// Begins or resumes the run, until it ends or the program dies.
     async fn live(&mut self, folder: &Path, life: &Arc<Life>) -> (Ended, bool) {
         self.lives += 1;
         let (task, plan) = part::task(self.schedule.wanted);
@@ -165,7 +166,7 @@ impl<'s> Happening<'s> {
         let (journal, interrupted) = if begins {
             let mut journal = Journal::create_with(folder, self.header(), Some(AuditKey::new())).unwrap();
             if self.schedule.rsh.is_some() {
-                // As `regrind run` does for a grinder that works by what lies in the folder of the run.
+                // As `regrind run` does for a grinder that reads files from the folder of the run.
                 for name in task.save_first(&folder.join("cycle-0")).unwrap() {
                     journal.adopt(&format!("cycle-0/{name}"), 0, 0).unwrap();
                 }
@@ -212,7 +213,7 @@ impl<'s> Happening<'s> {
             () = self.person.attend(&orders, life) => unreachable!("a person does not go"),
         };
         watching.abort();
-        // Nobody sees the cell of a program that is not there.
+        // A dead program shows no cell.
         self.shown.lock().unwrap().push(Shown {
             at: Instant::now(),
             state: None,
@@ -222,7 +223,7 @@ impl<'s> Happening<'s> {
         *self.orders.lock().unwrap() = None;
         life.end();
         self.nets.iter().for_each(Net::hang_up);
-        // The dead keep no lock.
+        // A dead program holds no lock.
         drop(journal.lock().unwrap().take());
         (ended, !begins)
     }
@@ -245,12 +246,12 @@ impl<'s> Happening<'s> {
         setup::modbus(link, true, 7, self.lives as u32).unwrap()
     }
 
-    /// The folder of programs, which the controller sees too.
+    /// Returns the folder of programs, which the controller sees too.
     fn programs(&self) -> PathBuf {
         self.home.join("nc")
     }
 
-    /// How linuxcncrsh is reached, as a cell file has it where it says nothing else.
+    /// Returns the settings of linuxcncrsh: the defaults of a cell file.
     fn rsh_settings(&self, folder: &Path) -> LinuxcncSettings {
         let programs = self.programs();
         fs::create_dir_all(&programs).unwrap();
@@ -273,7 +274,7 @@ impl<'s> Happening<'s> {
         }
     }
 
-    /// The drivers of a life of the program.
+    /// Returns the drivers of a life of the program.
     fn drivers(&self, life: &Arc<Life>, folder: &Path) -> (AnyCmm, AnyGrinder) {
         let [of_cmm, of_grinder] = self.links(life);
         let wires = (self.wires.clone(), self.cues.clone());
@@ -318,7 +319,7 @@ impl<'s> Happening<'s> {
         [link(0), link(1)]
     }
 
-    /// Lets happen what the schedule has.
+    /// Spawns the acts of the schedule.
     fn spawn_acts(&mut self) {
         let latest = self.began + CALM_AFTER - AT_MOST;
         for (number, (when, act)) in self.schedule.acts.iter().cloned().enumerate() {
@@ -381,15 +382,16 @@ impl<'s> Happening<'s> {
             self.schedule.baud.is_none() && self.schedule.fault_share == 0.0 && self.schedule.servers_go_well();
         let hindered = is_plain.then(|| self.hindered.lock().unwrap().clone());
         let wires = self.wires.lock().unwrap().clone();
-        // The program may have died with its end on record, before anybody heard of it.
+        // The program can have died with its end on record, before anybody received it.
         let finish = written.iter().rev().find(|recorded| recorded.payload["command"] == "finish");
         let told = ending.as_ref().and_then(|ending| serde_json::to_value(ending).ok());
         let told = told.as_ref().or(finish.map(|finish| &finish.payload)).and_then(|told| told["ending"].as_str());
         let ended_well = match (told, self.schedule.wanted) {
             (Some("accepted"), Wanted::Good) | (Some("not_accepted"), Wanted::Perfect) => true,
-            // A wheel that is led leaves more between tracks that are 6 mm apart than such a part may have: RMS 2.5 um of 2.
+            // A wheel under program control leaves more between tracks that are 6 mm apart than the limits of this part
+            // allow: RMS 2.5 um, limit 2.
             (Some("not_accepted"), Wanted::Good) if self.schedule.rsh.is_some() => true,
-            // What went wrong may have ended it.
+            // A fault can have ended it.
             _ => !self.schedule.dies_alone(),
         };
         let shown = self.shown.lock().unwrap().clone();
@@ -416,7 +418,7 @@ impl<'s> Happening<'s> {
     }
 }
 
-/// How a server of I++ DME is reached, as a cell file has it where it says nothing else.
+/// Returns the settings of a server of I++ DME: the defaults of a cell file.
 fn dme_settings() -> IppdmeSettings {
     let cell = &part::setting(Wanted::Good).cell;
     let wire = IppdmeWire { host: "cmm".into(), tool: "Probe1".into(), ..IppdmeWire::default() };
@@ -444,12 +446,12 @@ fn dme_settings() -> IppdmeSettings {
     }
 }
 
-/// Whether a run has begun, as `regrind resume` asks.
+/// Returns true if a run has begun, by the same check as `regrind resume`.
 fn has_events(folder: &Path) -> bool {
     Reader::open(folder).is_ok_and(|reader| reader.records(0).flatten().any(|record| record.kind == Kind::Event))
 }
 
-/// Keeps what the cell shows of itself.
+/// Records the states that the cell shows.
 async fn watch(orders: Orders, life: Arc<Life>, shown: Arc<Mutex<Vec<Shown>>>) {
     let mut status = orders.status();
     loop {
@@ -467,7 +469,7 @@ async fn watch(orders: Orders, life: Arc<Life>, shown: Arc<Mutex<Vec<Shown>>>) {
     }
 }
 
-/// Draws a time up to so many seconds.
+/// Draws a duration up to this many seconds.
 fn up_to(chance: &mut StdRng, seconds: f64) -> Duration {
     Duration::from_secs_f64(seconds * chance.random::<f64>())
 }

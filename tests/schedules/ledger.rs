@@ -1,4 +1,5 @@
-//! The record of a run on a disk that fails as it is told: full for a while, slow, or written without saying so.
+//! Record of a run on a disk with simulated faults: temporarily full, slow, or with writes that succeed but report
+//! failure.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -15,16 +16,16 @@ use tokio::time::Instant;
 use crate::cue::Cues;
 use crate::life::Life;
 
-/// What the disk is like.
+/// Behaviour of the disk.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Disk {
     /// Share of the writes that find no room, or fail.
     pub failing_share: f64,
-    /// Share of the writes that come about and are told as failed.
+    /// Share of the writes that succeed but are reported as failed.
     pub unknown_share: f64,
-    /// Share of the writes that take long.
+    /// Share of the slow writes.
     pub slow_share: f64,
-    /// How long at most.
+    /// Longest duration of a slow write.
     pub slow: Duration,
 }
 
@@ -32,7 +33,7 @@ impl Disk {
     pub const SOUND: Self = Self { failing_share: 0.0, unknown_share: 0.0, slow_share: 0.0, slow: Duration::ZERO };
 }
 
-/// A disk that all lives of the program share.
+/// Disk that all lives of the program share.
 #[derive(Clone)]
 pub struct SharedDisk(Arc<Mutex<(Disk, StdRng)>>);
 
@@ -45,14 +46,14 @@ impl SharedDisk {
         self.0.lock().unwrap().0 = disk;
     }
 
-    /// How long the next write takes.
+    /// Returns the duration of the next write.
     pub fn write_takes(&self) -> Duration {
         let (disk, chance) = &mut *self.0.lock().unwrap();
         let usual = Duration::from_micros(chance.random_range(100..4000));
         if chance.random::<f64>() < disk.slow_share { disk.slow.mul_f64(chance.random()) } else { usual }
     }
 
-    /// What becomes of the next one.
+    /// Draws the outcome of the next write.
     fn fate(&self) -> Fate {
         let (disk, chance) = &mut *self.0.lock().unwrap();
         let drawn = chance.random::<f64>();
@@ -72,17 +73,17 @@ enum Fate {
     Unknown,
 }
 
-/// What came on record, when.
+/// Record in the journal, with its time.
 #[derive(Clone, Debug)]
 pub struct Recorded {
     pub at: Instant,
     pub payload: Value,
 }
 
-/// What came on record in all lives, in order.
+/// Records of all lives, in order.
 pub type Written = Arc<Mutex<Vec<Recorded>>>;
 
-/// A journal in a life of the program.
+/// Journal in a life of the program.
 pub struct Kept {
     journal: SharedJournal,
     folder: PathBuf,
@@ -90,11 +91,11 @@ pub struct Kept {
     life: Arc<Life>,
     written: Written,
     cues: Cues,
-    /// What was written without saying so, by the text of what was given, until it is given again.
+    /// Write that succeeded without acknowledgement, by the text given, until the same text is given again.
     untold: Option<(String, u64)>,
 }
 
-/// A journal that goes with its life: what belongs to a dead one still cannot write it, nor keep its lock.
+/// Journal that is dropped with its life: tasks of a dead life can neither write it nor keep its lock.
 pub type SharedJournal = Arc<Mutex<Option<Journal>>>;
 
 impl Kept {
@@ -105,7 +106,7 @@ impl Kept {
         Self { journal, folder, disk, life, written, cues, untold: None }
     }
 
-    /// Returns the journal, to be taken away from a life that is over.
+    /// Returns the journal, so that it can be taken from a life that is over.
     pub fn shared(&self) -> SharedJournal {
         self.journal.clone()
     }
@@ -114,7 +115,7 @@ impl Kept {
         Err(JournalError::File { path: self.folder.clone(), action: "writing it", source: kind.into() })
     }
 
-    /// Writes something by the disk's leave. `text` tells it from anything else.
+    /// Writes something if the disk allows it. `text` identifies it.
     fn write(
         &mut self,
         text: String,
@@ -181,7 +182,7 @@ impl Ledger for Kept {
         });
         match (ended, anchor) {
             (Ok(_), Some(anchor)) => Ok(anchor),
-            // Written before, without saying so.
+            // Already written, without acknowledgement.
             (Ok(_), None) => {
                 self.journal.lock().unwrap().as_mut().map_or_else(
                     || self.failed(io::ErrorKind::BrokenPipe),

@@ -1,10 +1,10 @@
-//! One life of the program. What it does to the world is counted, and it can be killed between any two of its effects.
+//! One life of the program. It counts the program's effects on the world, and can end between any two of them.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use tokio::sync::Notify;
 
-/// A life of the program, from its start to its end or to its death.
+/// Life of the program, from its start to its end or to its death.
 #[derive(Debug)]
 pub struct Life {
     effects: AtomicU64,
@@ -14,12 +14,12 @@ pub struct Life {
 }
 
 impl Life {
-    /// A life that ends before the effect of this number, from 1; `u64::MAX` is never.
+    /// Returns a life that ends before the effect of this number, counted from 1; `u64::MAX` is never.
     pub fn new(dies_at: u64) -> Self {
         Self { effects: AtomicU64::new(0), dies_at, dead: AtomicBool::new(false), died: Notify::new() }
     }
 
-    /// Counts an effect. Whether it comes about: the dead have none.
+    /// Counts an effect. Returns true if it takes place: a dead program has none.
     pub fn passes(&self) -> bool {
         if !self.is_dead() && self.effects.fetch_add(1, Ordering::Relaxed) + 1 >= self.dies_at {
             self.dead.store(true, Ordering::Relaxed);
@@ -43,7 +43,7 @@ impl Life {
         }
     }
 
-    /// Ends it for whatever belongs to it still.
+    /// Ends the life for everything that still belongs to it.
     pub fn end(&self) {
         self.dead.store(true, Ordering::Relaxed);
     }

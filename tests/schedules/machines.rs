@@ -1,4 +1,4 @@
-//! The two machines of a cell, their time, and what they did.
+//! The two machines of a cell, their time, and their actions.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -26,31 +26,31 @@ use crate::net::Far;
 use crate::part::{Wanted, setting};
 use crate::schedule::Schedule;
 
-/// How often their time passes.
+/// Time step of the machines.
 const TICK: Duration = Duration::from_millis(10);
 
-/// Something that a machine saw or did.
+/// Observation or action of a machine.
 #[derive(Clone, Debug)]
 pub struct Moment {
     pub at: Instant,
-    /// 0 is the CMM, 1 the grinder.
+    /// Index of the machine: 0 is the CMM, 1 the grinder.
     pub machine: usize,
     pub what: What,
 }
 
-/// What both did, in order.
+/// Actions of both machines, in order.
 pub type Log = Arc<Mutex<Vec<Moment>>>;
 
-/// What a measuring machine by I++ DME did, in order.
+/// Actions of a measuring machine by I++ DME, in order.
 pub type Deeds = Arc<Mutex<Vec<(Instant, Deed)>>>;
 
-/// What a grinder by LinuxCNC did, in order.
+/// Actions of a grinder by LinuxCNC, in order.
 pub type RshDeeds = Arc<Mutex<Vec<(Instant, OfRsh)>>>;
 
-/// How much slower a program is run than a pass of a machine of registers, which does its strokes in it.
+/// Speed of a program, relative to a pass of a register machine, which does its strokes within the pass.
 const OF_PROGRAMS: f64 = 0.25;
 
-/// A machine, behind whichever wire.
+/// Machine, with any protocol.
 #[derive(Clone)]
 pub enum Plant {
     Registers(SharedMachine),
@@ -59,7 +59,7 @@ pub enum Plant {
 }
 
 impl Plant {
-    /// Whether it may be moving.
+    /// Returns true if the machine is possibly moving.
     pub fn moves(&self) -> bool {
         match self {
             Self::Registers(machine) => moves(machine.with(|machine| machine.state())),
@@ -68,7 +68,7 @@ impl Plant {
         }
     }
 
-    /// Whether a person who looks at it says that it is at no job.
+    /// Returns true if a person who looks at the machine says that it has no job.
     pub fn is_over(&self) -> bool {
         match self {
             Self::Registers(machine) => {
@@ -80,7 +80,7 @@ impl Plant {
         }
     }
 
-    /// Somebody has led it away from the part by hand.
+    /// Tells the machine that a person has moved it away from the part by hand.
     pub fn moved_away(&self) {
         match self {
             Self::Registers(_) => {}
@@ -89,7 +89,7 @@ impl Plant {
         }
     }
 
-    /// The machine of registers that it is.
+    /// Returns the register machine, if it is one.
     pub fn registers(&self) -> Option<&SharedMachine> {
         if let Self::Registers(machine) = self { Some(machine) } else { None }
     }
@@ -110,14 +110,15 @@ pub struct Machines {
     pub plants: [Plant; 2],
     pub log: Log,
     pub deeds: Deeds,
-    /// What is still to go wrong at the server of I++ DME.
+    /// Remaining faults of the server of I++ DME.
     pub dme_faults: DmeFaults,
     pub rsh_deeds: RshDeeds,
     pub rsh_faults: RshFaults,
 }
 
 impl Machines {
-    /// Switches both on, so many times as fast as real ones; trusting ones do not see to it themselves that nothing comes twice.
+    /// Switches both machines on, at a multiple of the real speed. A trusting machine does not itself prevent
+    /// duplicates.
     pub fn new(schedule: &Schedule, cues: &Cues) -> Self {
         let Schedule { seed, speed, trusting, .. } = *schedule;
         let truth = setting(Wanted::Good).recipe.simulation.clone().unwrap();
@@ -160,7 +161,7 @@ impl Machines {
         Self { plants: [cmm, grinder], log, deeds, dme_faults, rsh_deeds, rsh_faults }
     }
 
-    /// Returns what is at the far end of the wire of a machine.
+    /// Returns the far end of the connection of a machine.
     pub fn far(&self, which: usize) -> Far {
         match &self.plants[which] {
             Plant::Registers(machine) => Far::Registers(vec![(which as u8 + 1, machine.clone())]),
@@ -169,13 +170,13 @@ impl Machines {
         }
     }
 
-    /// Returns both, as they are on one line.
+    /// Returns both machines, as on one line.
     pub fn both(&self) -> Far {
         let units = self.plants.iter().enumerate();
         Far::Registers(units.filter_map(|(k, plant)| Some((k as u8 + 1, plant.registers()?.clone()))).collect())
     }
 
-    /// Lets their time pass.
+    /// Advances the time of the machines.
     pub async fn live(plants: [Plant; 2]) {
         let mut ticks = tokio::time::interval(TICK);
         loop {
@@ -185,7 +186,7 @@ impl Machines {
     }
 }
 
-/// A measuring machine behind a server of I++ DME.
+/// Returns a measuring machine with a server of I++ DME.
 fn by_lines(world: &World, speed: f64, faults: DmeFaults, (log, deeds, cues): (&Log, &Deeds, &Cues)) -> SharedServer {
     let mut server = Server::new(probe::Machine::new(world.led(), probe::Options::default()), speed, faults);
     let (log, deeds, cues) = (log.clone(), deeds.clone(), cues.clone());
@@ -207,7 +208,7 @@ fn by_lines(world: &World, speed: f64, faults: DmeFaults, (log, deeds, cues): (&
     SharedServer::from(server)
 }
 
-/// A grinder behind linuxcncrsh.
+/// Returns a grinder with linuxcncrsh.
 fn by_programs(
     world: &World,
     speed: f64,
@@ -231,7 +232,7 @@ fn by_programs(
     SharedController::from(controller)
 }
 
-/// Whether a machine may be moving in a state.
+/// Returns true if a machine in this state is possibly moving.
 pub fn moves(state: State) -> bool {
     matches!(state, State::Execute | State::Holding | State::Stopping | State::Aborting)
 }

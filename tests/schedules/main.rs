@@ -1,5 +1,5 @@
-//! Whole parts under every fault that a seed can draw, in a time of their own: the production cell, drive, stations, link and record run
-//! unchanged on one thread whose clock jumps from one thing that happens to the next.
+//! Whole parts under every fault that a seed can draw, in simulated time. The production cell, drive, stations, link
+//! and record run unchanged on one thread, whose clock jumps from one event to the next.
 //!
 //! ```text
 //!  person --> drive --> stations --> link --> net --> sim's servers --> machines   what they did --+
@@ -7,7 +7,7 @@
 //!               +--> ledger --> journal        late, lost, twice, cut, dead        what is on record +
 //! ```
 //!
-//! A seed that fails prints the command that repeats it. What failed once stands in [`KEPT`] and is run every time.
+//! A failing seed prints the command that repeats it. Seeds that once failed are listed in [`KEPT`] and always run.
 
 mod checker;
 mod cue;
@@ -31,29 +31,29 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use schedule::{FORGETFUL, FULL_DISK, LIARS, OTHER_WIRES, Schedule, Tally};
 
-/// Seeds in which it shows that a guard is missing which hardly another one needs: a station asks again whether the loop lives (134); what
-/// waited behind a look that found the link lost is not sent, START (163) and RESUME (181); nothing may wait when a question is asked (264);
-/// an abort does not wait for a machine that stands still (585).
+/// Seeds that detect a missing guard that few other seeds detect. A station checks again that the loop is alive (134).
+/// A command that waited for a poll that found the link lost is not sent: START (163) and RESUME (181). No command
+/// waits in the queue when a query is sent (264). An abort does not wait for a machine that does not move (585).
 const KEPT: &[u64] = &[134, 163, 181, 264, 585];
 
-/// The same where the machines are reached by other wires than Modbus: a linuxcncrsh that is lost while it is asked what became of a START was
-/// told as one that had never been met (1,000,075).
+/// Seeds of the same kind for machines with a protocol other than Modbus. The connection to linuxcncrsh was lost during
+/// the query for the result of a START, and the link reported it as never established (1,000,075).
 const KEPT_BY_OTHER_WIRES: &[u64] = &[1_000_075];
 
-/// How many a merge has time for.
+/// Number of seeds that a merge has time for.
 const SAMPLE: u64 = 40;
 const SAMPLE_BY_OTHER_WIRES: u64 = 10;
 
 const SAMPLE_OF_FORGETFUL: u64 = 24;
 const SAMPLE_OF_FULL_DISKS: u64 = 24;
 const KEPT_OF_FULL_DISKS: &[u64] = &[3_000_338];
-/// One for each register of the two blocks.
+/// One seed for each register of the two blocks.
 const SAMPLE_OF_LIARS: u64 = 104;
 
-/// Every so many effects the program dies once.
+/// Distance, in effects, between the points at which the program dies once.
 const STRIDE: usize = 151;
 
-/// Runs schedules on all processors; says which seed broke which promise.
+/// Runs schedules on all processors; reports which seed broke which promise.
 fn run_all(schedules: &[Schedule]) -> Tally {
     let next = AtomicU64::new(0);
     let workers = std::thread::available_parallelism().map_or(1, usize::from);
@@ -94,7 +94,7 @@ fn number(name: &str) -> Option<u64> {
     std::env::var(name).ok().map(|text| text.parse().unwrap_or_else(|_| panic!("{name} is no number")))
 }
 
-/// Plays the schedules of some seeds, and fails by the first that breaks a promise.
+/// Runs the schedules of some seeds, and fails at the first broken promise.
 fn hold_their_promises(seeds: impl Iterator<Item = u64>) {
     let schedules: Vec<Schedule> = seeds.map(Schedule::drawn).collect();
     let began = std::time::Instant::now();
@@ -115,31 +115,32 @@ fn nor_one_by_other_wires() {
     hold_their_promises(seeds);
 }
 
-/// Machines that start anew with their old boot id and say that their job never began.
+/// Checks machines that restart with their old boot id and report that their job never began.
 #[test]
 fn nor_one_in_which_a_machine_forgets_its_job() {
     let seeds = (0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_FORGETFUL)).map(|k| FORGETFUL + k);
     hold_their_promises(seeds);
 }
 
-/// A disk that is full for a while: the cell is held meanwhile, waits for no answer to what it has not asked, and goes on after.
+/// Checks a disk that is temporarily full: the cell is held in the meantime, does not wait for an answer to a request
+/// that it has not sent, and continues afterwards.
 #[test]
 fn nor_one_in_which_the_disk_is_full_for_a_while() {
-    // A stop that overtook the preparation of a cycle was not seen to be done.
+    // A stop that overtook the preparation of a cycle was not recognized as done.
     let seeds = KEPT_OF_FULL_DISKS.iter().copied();
     let seeds = seeds.chain((0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_FULL_DISKS)).map(|k| FULL_DISK + k));
     hold_their_promises(seeds);
 }
 
-/// Machines of which each register of the status and of the header of a result says in its turn what is not so: nothing that was seen to begin is
-/// intended once more, nothing begins that is not on record, and the run comes to an end.
+/// Checks machines that report false values, in turn in each register of the status and of the header of a result. No
+/// START is intended again for a job that was seen to begin, no job begins without a record, and the run finishes.
 #[test]
 fn nor_one_in_which_a_machine_says_what_is_not_so() {
     let seeds = (0..number("REGRIND_SCHEDULES").unwrap_or(SAMPLE_OF_LIARS)).map(|k| LIARS + k);
     hold_their_promises(seeds);
 }
 
-/// The program dies before every single one of its effects on the world, once each, and before some pairs of them.
+/// Kills the program once before each of its effects on the world, and before some pairs of them.
 #[test]
 fn a_death_before_any_effect_breaks_no_promise() {
     let stride = if number("REGRIND_SCHEDULES").is_some() { 1 } else { STRIDE };

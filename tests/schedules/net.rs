@@ -1,5 +1,5 @@
-//! What lies between the program and the machines: bytes that are on their way for a while, stay on their way when the program has hung
-//! up or died, or never arrive.
+//! Network between the program and the machines: bytes are delayed, stay in transit after the program has closed the
+//! connection or died, or never arrive.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -26,16 +26,16 @@ use crate::cue::Cues;
 use crate::life::Life;
 use crate::wire::{Listening, Watched, Wires};
 
-/// How a network carries, as of now.
+/// Current behaviour of a network.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weather {
-    /// Share of what is sent that takes long.
+    /// Share of slow transmissions.
     pub slow_share: f64,
-    /// How long at most.
+    /// Longest delay of a slow transmission.
     pub slow: Duration,
-    /// Nobody answers a call, and who talks is cut off.
+    /// Connections are refused, and open ones are cut.
     pub down: bool,
-    /// What is sent is lost without a word.
+    /// Transmissions are lost without an error.
     pub silent: bool,
 }
 
@@ -43,10 +43,10 @@ impl Weather {
     pub const FAIR: Self = Self { slow_share: 0.0, slow: Duration::ZERO, down: false, silent: false };
 }
 
-/// Between two looks whether a network carries again.
+/// Interval between two checks whether a network works again.
 const AGAIN: Duration = Duration::from_millis(20);
 
-/// Who is at the far end of a wire.
+/// Far end of a connection.
 #[derive(Clone)]
 pub enum Far {
     Registers(Units),
@@ -54,7 +54,7 @@ pub enum Far {
     Rsh(SharedController),
 }
 
-/// The network to one machine, or to both on one line.
+/// Network to one machine, or to both on one line.
 #[derive(Clone)]
 pub struct Net(Arc<Shared>);
 
@@ -64,7 +64,7 @@ struct Shared {
     /// A server of lines has one client at a time.
     turn: Arc<tokio::sync::Mutex<()>>,
     state: Mutex<State>,
-    /// The machines' end of a serial line; none where each call has a connection of its own.
+    /// The machines' end of a serial line; none if each call has its own connection.
     bus: Option<UnboundedSender<Vec<u8>>>,
 }
 
@@ -72,9 +72,9 @@ struct State {
     weather: Weather,
     changes: u64,
     chance: StdRng,
-    /// Who carries answers to a client.
+    /// Tasks that carry answers to a client.
     carrying: Vec<AbortHandle>,
-    /// Who listens to the serial line.
+    /// Listener on the serial line.
     listening: Option<UnboundedSender<Vec<u8>>>,
 }
 
@@ -85,7 +85,7 @@ impl fmt::Debug for Net {
 }
 
 impl Net {
-    /// A network of connections, or a serial line of so many bits a second.
+    /// Returns a network of connections, or a serial line with this number of bits per second.
     pub fn new(far: Far, faults: Faults, baud: Option<u32>, seed: u64) -> Self {
         let turn = Arc::default();
         let chance = StdRng::seed_from_u64(seed);
@@ -106,7 +106,7 @@ impl Net {
         net
     }
 
-    /// Changes how it carries, for as long as nothing else does or that long.
+    /// Changes the behaviour for the given duration, unless another change comes first.
     pub async fn weather(&self, weather: Weather, lasts: Duration) {
         let number = self.set(weather);
         tokio::time::sleep(lasts).await;
@@ -115,7 +115,7 @@ impl Net {
         }
     }
 
-    /// Changes how it carries; returns the number of the change.
+    /// Changes the behaviour; returns the number of the change.
     pub fn set(&self, weather: Weather) -> u64 {
         let mut state = self.state();
         state.weather = weather;
@@ -131,7 +131,7 @@ impl Net {
         self.0.state.lock().unwrap()
     }
 
-    /// How long the next bytes are on their way; none if they are lost.
+    /// Returns the delay of the next bytes; none if they are lost.
     fn way(&self) -> Option<Duration> {
         let mut state = self.state();
         let Weather { slow_share, slow, silent, .. } = state.weather;
@@ -141,7 +141,7 @@ impl Net {
         (!silent).then_some(way)
     }
 
-    /// Carries what a client sends. What is on its way arrives, also when who sent it has gone.
+    /// Carries what a client sends. Bytes in transit arrive even after the sender has gone.
     async fn carry_to(self, mut sent: UnboundedReceiver<Vec<u8>>, mut to: impl AsyncWrite + Unpin) {
         while let Some(bytes) = sent.recv().await {
             let Some(way) = self.way() else { continue };
@@ -163,7 +163,7 @@ impl Net {
         }
     }
 
-    /// Carries lines to a machine. What a network loses TCP sends again, as long as who has sent it is there; and it tells that he has gone.
+    /// Carries lines to a machine. TCP retransmits lost data as long as the sender exists, and reports its end.
     async fn carry_lines_to(self, mut sent: UnboundedReceiver<Vec<u8>>, mut to: impl AsyncWrite + Unpin) {
         while let Some(bytes) = sent.recv().await {
             while self.is_silent() && !sent.is_closed() {
@@ -250,14 +250,14 @@ impl Net {
         }
     }
 
-    /// Cuts off whoever listens: the program has died.
+    /// Cuts off every listener: the program has died.
     pub fn hang_up(&self) {
         let mut state = self.state();
         state.carrying.drain(..).for_each(|carrying| carrying.abort());
         state.listening = None;
     }
 
-    /// Returns how a life of the program reaches the machines, and is watched as it does; anybody else is not.
+    /// Returns the dialler by which a life of the program reaches the machines. Only these connections are watched.
     pub fn dial(&self, life: &Arc<Life>, wires: Option<&(Wires, Cues)>) -> Box<dyn Dial> {
         Box::new(Caller { net: self.clone(), life: life.clone(), wires: wires.cloned() })
     }
@@ -283,7 +283,7 @@ impl Dial for Caller {
     }
 }
 
-/// Who watches a connection.
+/// Observer of a connection.
 enum Watch {
     Frames(Watched),
     Lines(Listening),

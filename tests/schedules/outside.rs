@@ -1,4 +1,4 @@
-//! What acts upon the cell from outside, as a schedule has drawn it.
+//! External acts on the cell, as drawn by a schedule.
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
@@ -23,16 +23,16 @@ use crate::net::{Net, Weather};
 use crate::person::{Given, give, take_supplies};
 use crate::schedule::Act;
 
-/// Where orders are taken, in the life of the program that is under way.
+/// Receiver of orders in the current life of the program.
 pub type Office = Arc<Mutex<Option<(Orders, Arc<Life>)>>>;
 
-/// From when to when something was in the way of what is asked of the machines.
+/// Intervals in which something obstructed requests to the machines.
 pub type Hindered = Arc<Mutex<Vec<(Instant, Instant)>>>;
 
-/// A person sets a machine right that has stopped within this.
+/// Time limit within which a person restores a machine that has stopped.
 const SET_RIGHT: Duration = Duration::from_secs(3);
 
-/// What acts upon the cell from outside.
+/// External influence on the cell.
 pub struct Outside {
     pub plants: [Plant; 2],
     pub nets: [Net; 2],
@@ -43,13 +43,13 @@ pub struct Outside {
     pub settings: [ModbusSettings; 2],
     pub is_serial: bool,
     pub hindered: Hindered,
-    /// The folder of programs.
+    /// Folder of programs.
     pub programs: PathBuf,
     pub number: usize,
 }
 
 impl Outside {
-    /// Lets it happen, and comes back when it is over.
+    /// Performs an act, and returns when it is over.
     pub async fn act(self, act: Act) {
         let by_lines = self.plants.iter().any(|plant| plant.registers().is_none());
         if let Some(lasts) = act.hinders(by_lines) {
@@ -63,7 +63,7 @@ impl Outside {
                 sleep(lasts).await;
                 self.disk.set(Disk::SOUND);
             }
-            // Their servers are frozen by a network that is silent.
+            // A silent network has the effect of a frozen server.
             Act::Freeze { machine, lasts } if self.plants[machine].registers().is_none() => {
                 self.nets[machine].weather(Weather { silent: true, ..Weather::FAIR }, lasts).await;
             }
@@ -93,7 +93,7 @@ impl Outside {
         }
     }
 
-    /// What happens to a machine that is reached by registers.
+    /// Performs an act on a register machine.
     async fn at_registers(&self, act: Act, of: &SharedMachine, machine: usize) {
         match act {
             Act::Freeze { lasts, .. } => {
@@ -113,12 +113,13 @@ impl Outside {
                 sleep(lasts).await;
                 take_supplies(of, false);
             }
-            // A second master on a serial line would talk into the answers of the first: there is one master on such a line.
+            // A second master on a serial line would corrupt the answers to the first: there is only one master on this
+            // type of line.
             Act::Stranger { aborts, .. } if !self.is_serial => self.stranger(machine, aborts).await,
             Act::HighNumber { .. } => {
                 let frame = Frame { sequence: u32::MAX - 3, command: 1, owner: 99, epoch: 1, ..Frame::default() };
                 let at = Layout::default().command;
-                // It is acknowledged, and refused.
+                // The write is acknowledged, and the command is refused.
                 let _ = of.with(|machine| machine.write(at, &frame.registers(WordOrder::Big)));
             }
             Act::Stray { lasts, .. } => {
@@ -132,7 +133,7 @@ impl Outside {
         }
     }
 
-    /// What happens to a server of I++ DME: it is started anew. Of the rest it has nothing.
+    /// Performs an act on a server of I++ DME: a restart. It ignores all others.
     async fn at_dme(&self, act: &Act, server: &SharedServer) {
         if let Act::Reboot { .. } = act {
             let now = server.now();
@@ -142,7 +143,7 @@ impl Outside {
         }
     }
 
-    /// What happens to a controller of programs, and what people do at it.
+    /// Performs an act on a controller of programs, or an act of people at it.
     async fn at_rsh(&self, act: &Act, controller: &SharedController) {
         match act {
             Act::Reboot { .. } => {
@@ -164,7 +165,7 @@ impl Outside {
             }
             Act::Stranger { aborts, .. } => controller.with(|controller| controller.steal(None, *aborts)),
             Act::PressStart { .. } => controller.with(Controller::press_resume),
-            // Somebody opens a program of his own.
+            // Somebody opens their own program.
             Act::Spoil { .. } => {
                 let other = self.programs.join("other.ngc");
                 std::fs::write(&other, "G21 G90\nG1 X5 F60\nM2\n").unwrap();
@@ -189,14 +190,14 @@ impl Outside {
         }
     }
 
-    /// Another program tries to take the machine, and may abort it.
+    /// Tries to take the machine from another program, and possibly aborts it.
     async fn stranger(&self, which: usize, aborts: bool) {
         let life = Arc::new(Life::new(u64::MAX));
         let settings = ModbusSettings { owner: 99, epoch: 1, ..self.settings[which].clone() };
         let seed = self.number as u64;
         let dial = self.nets[which].dial(&life, None);
         let link = Link::over(settings.line.clone(), settings.request_timeout, settings.quarantine, dial, seed);
-        // It is refused wherever the machine has an owner that is alive; what it is told does not matter here.
+        // The command is refused if the machine has an owner that is alive; its content does not matter here.
         if which == 0 {
             let mut machine = ModbusCmm::on(link, settings);
             let _ = machine.connect().await;

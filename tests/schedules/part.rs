@@ -1,4 +1,5 @@
-//! A part small enough to be ground, measured and registered in some milliseconds: the shipped free-form mirror, coarsely.
+//! Part small enough to be ground, measured and registered in some milliseconds: the shipped free-form mirror, on a
+//! coarse grid.
 
 use std::path::Path;
 use std::sync::OnceLock;
@@ -24,16 +25,16 @@ fn changed(file: &str, changes: &[(&str, &str)]) -> String {
     text
 }
 
-/// How good a part has to be.
+/// Required quality of a part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Wanted {
-    /// As it is after two or three cycles.
+    /// Quality that a part reaches after two or three cycles.
     Good,
-    /// As it never becomes: all five cycles are gone through.
+    /// Quality that a part never reaches: the run uses all five cycles.
     Perfect,
 }
 
-/// Returns recipe and cell, which are the same for all but for what is wanted.
+/// Returns recipe and cell, which differ only in the required quality.
 pub fn setting(wanted: Wanted) -> &'static Setting {
     static SETTINGS: [OnceLock<Setting>; 2] = [OnceLock::new(), OnceLock::new()];
     SETTINGS[wanted as usize].get_or_init(|| {
@@ -58,7 +59,8 @@ pub fn setting(wanted: Wanted) -> &'static Setting {
                 ("pv_um = 7.0", pv_um),
                 ("rms_um = 1.0", rms_um),
                 ("on_stall = \"stop\"", "on_stall = \"hold\""),
-                // Each of these is a field of random waves that is drawn anew; what the grinder does wrong in every pass is left.
+                // Each of these fields of random waves is drawn again in every pass. Only the repeatable error of the
+                // grinder remains.
                 ("form_error_um = 20.0", "form_error_um = 0.0"),
                 (
                     "[simulation.part]",
@@ -73,19 +75,19 @@ pub fn setting(wanted: Wanted) -> &'static Setting {
     })
 }
 
-/// Makes what a run computes from, and what its cell decides by.
+/// Returns the inputs of a run's computations and of its cell's decisions.
 pub fn task(wanted: Wanted) -> (Task, CellPlan) {
     let Setting { recipe, cell } = setting(wanted);
     setup::prepare(recipe, cell).unwrap()
 }
 
-/// Time between two looks at each machine.
+/// Returns the interval between two polls of each machine.
 pub fn poll() -> [Duration; 2] {
     let cell = &setting(Wanted::Good).cell;
     [cell.cmm.link.timing.poll, cell.grinder.link.timing.poll]
 }
 
-/// How far over the highest target of a plan the centre of a probe travels that is led by lines.
+/// Returns the height at which the centre of an I++ DME probe travels above the highest target of a plan.
 pub fn clearance_mm() -> f64 {
     let measure = &setting(Wanted::Good).recipe.measure;
     measure.safe_height_mm + measure.probe_radius_mm

@@ -1,4 +1,5 @@
-//! The person at the cell: gives the orders that the schedule draws, and lets the cell go on wherever it waits for one.
+//! The person at the cell: gives the orders that the schedule draws, and resumes the cell wherever it waits for a
+//! person.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -15,24 +16,25 @@ use tokio::time::Instant;
 use crate::life::Life;
 use crate::machines::Plant;
 
-/// After so many resumes the person gives up in order, and after twice as many at once.
+/// Number of resumes after which the person ends the run in order; after twice as many, the person aborts.
 const PATIENCE: u32 = 40;
 
-/// A run that has not come to its end by then is given up too: a machine that somebody else controls is not had back by waiting.
+/// Time after which the person gives up an unfinished run too: waiting does not return a machine that another program
+/// controls.
 const NO_LONGER_THAN: Duration = Duration::from_secs(1200);
 
-/// An order, and what the cell said.
+/// Order, and the cell's answer.
 #[derive(Clone, Debug)]
 pub struct Given {
     pub at: Instant,
     pub answered: Instant,
     pub what: &'static str,
-    /// By which it is found on record.
+    /// Reason that identifies the order in the record.
     pub reason: String,
     pub accepted: bool,
-    /// Whether it was carried out, on record or not.
+    /// True if the order was carried out, on record or not.
     pub done: bool,
-    /// Whether the grinder and the CMM moved as it was given.
+    /// True for the grinder, and for the CMM, if it moved when the order was given.
     pub moved: [bool; 2],
 }
 
@@ -53,7 +55,7 @@ impl Person {
         Self { plants, given: Arc::default(), chance: StdRng::seed_from_u64(seed), resumes: 0, began: Instant::now() }
     }
 
-    /// Looks after the cell in one life of the program; never comes to an end.
+    /// Attends to the cell in one life of the program; never returns.
     pub async fn attend(&mut self, orders: &Orders, life: &Life) {
         let status = orders.status();
         loop {
@@ -84,7 +86,8 @@ impl Person {
         }
     }
 
-    /// Where a machine cannot tell whether it is clear of the part, a person looks, moves it away, and says so.
+    /// Confirms that a machine is clear of the part, if it cannot report it: the person looks, moves it away, and
+    /// confirms.
     async fn see_clear(&mut self, orders: &Orders, life: &Life, device: Device) {
         let plant = &self.plants[device as usize];
         if !plant.moves() {
@@ -93,14 +96,15 @@ impl Person {
         }
     }
 
-    /// Where a machine cannot tell what became of its job, a person looks whether it stands, and says so.
+    /// Confirms the end of a job that a machine cannot report: the person looks whether the machine is at a standstill,
+    /// and confirms.
     async fn look_at(&mut self, orders: &Orders, life: &Life, device: Device) {
         if self.resumes.is_multiple_of(4) && self.plants[device as usize].is_over() {
             self.give(orders, life, "over", |evidence| Request::Over { device, evidence }).await;
         }
     }
 
-    /// Gives an order and keeps what was answered.
+    /// Gives an order and records the answer.
     pub async fn give(
         &mut self,
         orders: &Orders,
@@ -113,7 +117,7 @@ impl Person {
     }
 }
 
-/// Gives an order and keeps what was answered, unless the program has died over it.
+/// Gives an order and records the answer, unless the program dies during it.
 pub async fn give(
     orders: &Orders,
     life: &Life,

@@ -1,5 +1,5 @@
-//! Holds what a grinder by LinuxCNC did against what is on record: its controller knows programs and no passes, so nothing but the program
-//! that drives it sees to it that each is begun once, and that it is the one that was meant.
+//! Compares the actions of a grinder by LinuxCNC with the record. Its controller knows programs and no passes. Only the
+//! program that drives it ensures that each pass begins once and with the right file.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -10,17 +10,18 @@ use tokio::time::Instant;
 
 use crate::checker::{Evidence, is_intent};
 
-/// A hold is on its way to a program that runs within this.
+/// Time limit for a hold to be sent to a running program.
 const HOLDS_WITHIN: Duration = Duration::from_millis(100);
-/// A program that was told to run is looked at so soon after; before that nobody knows whether there is anything to hold.
+/// Time limit for the first poll after a program was started; before it nobody knows whether there is anything to hold.
 const SEEN_WITHIN: Duration = Duration::from_millis(130);
-/// What was in the way of lines is out of it after this.
+/// Time after which an obstacle to lines has been removed.
 const RECOVERS_WITHIN: Duration = Duration::from_secs(12);
 
-/// Holds a grinder by LinuxCNC against every promise.
+/// Checks a grinder by LinuxCNC against every promise.
 ///
 /// # Errors
-/// The first that was broken.
+///
+/// Returns the first broken promise.
 pub fn check(evidence: &Evidence) -> Result<(), String> {
     if evidence.rsh_deeds.is_empty() {
         return Ok(());
@@ -31,14 +32,15 @@ pub fn check(evidence: &Evidence) -> Result<(), String> {
     paused_at_once(evidence)
 }
 
-/// The run and the cycle of a program, by its name.
+/// Returns the run and the cycle of a program, from its name.
 fn named(path: &str) -> Option<(&str, u64)> {
     let (named, _) = path.rsplit('/').next()?.rsplit_once('-')?;
     let (run, cycle) = named.rsplit_once("-c")?;
     Some((run, cycle.parse().ok()?))
 }
 
-/// A program is begun once, for a START that is on record, which is that of its pass; and it grinds what the correction of that pass has.
+/// Checks that a program begins once, for a START on record that belongs to its pass, and that it grinds the correction
+/// of that pass.
 fn begins_what_is_meant(evidence: &Evidence) -> Result<(), String> {
     let mut begun = BTreeSet::new();
     for (at, deed) in &evidence.rsh_deeds {
@@ -58,7 +60,7 @@ fn begins_what_is_meant(evidence: &Evidence) -> Result<(), String> {
         }
         let pass = evidence.folder.with_file_name(run).join(format!("cycle-{cycle}/toolpath.ngc"));
         let pass = std::fs::read_to_string(pass).unwrap_or_default();
-        // A run that never began is taken away with its folder.
+        // A run that never began is removed with its folder.
         if !pass.is_empty() && !text.contains(pass.trim_end().trim_end_matches("M2")) {
             return Err(format!("{path} was begun at {when:.3} s, and holds another pass than that of the correction"));
         }
@@ -66,7 +68,8 @@ fn begins_what_is_meant(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// What stands goes on by an order that is on record or by a person at the machine; behind an abort by a START alone.
+/// Checks that a paused program continues only by an order on record or by a person at the machine, and after an abort
+/// only by a START.
 fn goes_on_by_an_order(evidence: &Evidence) -> Result<(), String> {
     let mut aborted: Option<Instant> = None;
     for (at, deed) in &evidence.rsh_deeds {
@@ -85,7 +88,7 @@ fn goes_on_by_an_order(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// Nothing that moves the grinder leaves the program while the cell shows that it stands.
+/// Checks that no command that moves the grinder leaves the program while the cell shows standstill.
 fn told_nothing_while_it_stands(evidence: &Evidence) -> Result<(), String> {
     let moves = |line: &str| matches!(line, "set run" | "set resume");
     for spoken in evidence.wires.lines.iter().filter(|spoken| spoken.machine == 1 && moves(&spoken.line)) {
@@ -99,7 +102,7 @@ fn told_nothing_while_it_stands(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// A hold or a stop is on its way at once to a program that runs, whatever the disk does; where nothing is in the way of it.
+/// Checks that a hold or a stop is sent at once to a running program, whatever the disk does, if nothing obstructs it.
 fn paused_at_once(evidence: &Evidence) -> Result<(), String> {
     let Some(hindered) = &evidence.hindered else { return Ok(()) };
     for given in
@@ -109,7 +112,7 @@ fn paused_at_once(evidence: &Evidence) -> Result<(), String> {
         let since = moved.map_or(evidence.began, |(at, _)| *at);
         let by = given.at.max(since + SEEN_WITHIN) + HOLDS_WITHIN;
         let is_hindered = hindered.iter().any(|(from, to)| *from <= by && given.at <= *to + RECOVERS_WITHIN);
-        // A program that was started again has to meet the machines first.
+        // A restarted program first has to connect to the machines.
         let ended = evidence.shown.iter().rfind(|shown| shown.at <= by && shown.state.is_none());
         let has_met = ended.is_none_or(|ended| ended.at + RECOVERS_WITHIN < given.at);
         let stands = evidence.rsh_deeds.iter().any(|(at, deed)| given.at <= *at && *at <= by && *deed == Deed::Stands);

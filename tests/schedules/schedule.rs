@@ -1,4 +1,4 @@
-//! One schedule: everything that happens in it follows from its seed.
+//! One schedule: its seed determines everything that happens in it.
 
 use std::fmt;
 use std::path::Path;
@@ -18,55 +18,56 @@ use crate::ledger::Disk;
 use crate::net::Weather;
 use crate::part::Wanted;
 
-/// The most lives of the program that are cut short.
+/// Maximum number of lives of the program that are cut short.
 const MOST_DEATHS: usize = 3;
 
-/// From this seed on the machines are reached by other wires than Modbus.
+/// First seed of the schedules whose machines have other protocols than Modbus.
 pub const OTHER_WIRES: u64 = 1_000_000;
 
-/// From this seed on a machine forgets its job.
+/// First seed of the schedules in which a machine forgets its job.
 pub const FORGETFUL: u64 = 2_000_000;
 
-/// From this seed on nothing fails but the disk.
+/// First seed of the schedules in which nothing fails but the disk.
 pub const FULL_DISK: u64 = 3_000_000;
 
-/// From this seed on machines say of themselves and of their results what is not so.
+/// First seed of the schedules in which machines report false values in their status and results.
 pub const LIARS: u64 = 4_000_000;
 
-/// The status block and the header of a result: the first register, and how many.
+/// Status block and header of a result: the first register, and the number of registers.
 const STATUS: (u16, usize) = (64, 48);
 const HEADER: (u16, usize) = (400, 56);
 
-/// What goes wrong at a server of I++ DME: at which command, after how many of them, what.
+/// Fault of a server of I++ DME: the command, the number of them before the fault, and the fault.
 pub type DmeFault = (&'static str, u32, OfDme);
 
-/// What goes wrong at linuxcncrsh: at which line, after how many of them, what.
+/// Fault of linuxcncrsh: the line, the number of them before the fault, and the fault.
 pub type RshFault = (&'static str, u32, OfRsh);
 
-/// The schedule of a seed.
+/// Schedule of a seed.
 #[derive(Clone, Debug)]
 pub struct Schedule {
     pub seed: u64,
-    /// Seconds of the machines' own time in one of the cell's: a pass takes from some hundredths of a second to ten.
+    /// Speed of the machines' time relative to the cell's: a pass takes from some hundredths of a second to ten
+    /// seconds.
     pub speed: f64,
-    /// Whether the machines leave it to the program that nothing is begun twice.
+    /// True if the machines rely on the program that nothing begins twice.
     pub trusting: bool,
-    /// Bits a second of the one serial line that both machines are on; none where they are on a network.
+    /// Bits per second of the one serial line that both machines share; none if they are on a network.
     pub baud: Option<u32>,
-    /// Share of the requests to the machines with which something goes wrong.
+    /// Share of the requests to the machines that have a fault.
     pub fault_share: f64,
     pub faults: Vec<Fault>,
-    /// What goes wrong at the CMM's server of I++ DME; none where the CMM is reached by Modbus.
+    /// Faults of the CMM's I++ DME server; none if the CMM uses Modbus.
     pub dme: Option<Vec<DmeFault>>,
-    /// What goes wrong at the grinder's LinuxCNC; none where the grinder is reached by Modbus.
+    /// Faults of the grinder's LinuxCNC; none if the grinder uses Modbus.
     pub rsh: Option<Vec<RshFault>>,
     pub acts: Vec<(When, Act)>,
-    /// Before which of its effects each life of the program ends.
+    /// Effects before which the lives of the program end, one for each life.
     pub deaths: Vec<u64>,
     pub wanted: Wanted,
 }
 
-/// What happens to the cell from outside.
+/// External act on the cell.
 #[derive(Clone, Debug)]
 pub enum Act {
     Weather {
@@ -85,7 +86,7 @@ pub enum Act {
     Reboot {
         machine: usize,
     },
-    /// Its application starts anew with its old boot id, and knows of no job that it began.
+    /// Its application restarts with its old boot id, and knows no job that it began.
     Forget {
         machine: usize,
     },
@@ -101,20 +102,20 @@ pub enum Act {
         machine: usize,
         aborts: bool,
     },
-    /// Somebody writes a command under a number near the last that there is.
+    /// Another client writes a command with a number near the highest possible one.
     HighNumber {
         machine: usize,
     },
-    /// A machine that stands at its place begins to move without an order.
+    /// A machine at rest begins to move without an order.
     Stray {
         machine: usize,
         lasts: Duration,
     },
-    /// Somebody presses the button that has a held machine go on.
+    /// A person presses the button that resumes a held machine.
     PressStart {
         machine: usize,
     },
-    /// What comes into force next is changed once it has been looked at.
+    /// The payload that comes into force next is changed after it was checked.
     Spoil {
         machine: usize,
     },
@@ -126,7 +127,7 @@ pub enum Act {
     EmergencyStop {
         machine: usize,
     },
-    /// A register of a block that is read says something else.
+    /// A register of a block that is read has a false value.
     Lie {
         machine: usize,
         block: u16,
@@ -138,7 +139,7 @@ pub enum Act {
 }
 
 impl Act {
-    /// Whether what is asked of the machines may not arrive at once.
+    /// Returns the time for which this act can delay requests to the machines; none if it does not.
     pub fn hinders(&self, by_lines: bool) -> Option<Duration> {
         match self {
             Self::Weather { lasts, .. } | Self::Suspend { lasts } => Some(*lasts),
@@ -150,7 +151,8 @@ impl Act {
 }
 
 impl Schedule {
-    /// Draws the schedule of a seed. Every kind of fault is in some schedules and not in others, so that none hides another.
+    /// Draws the schedule of a seed. Every kind of fault occurs in some schedules and not in others, so that no fault
+    /// hides another.
     pub fn drawn(seed: u64) -> Self {
         match seed {
             LIARS.. => Self::lied_to(seed),
@@ -161,7 +163,8 @@ impl Schedule {
         }
     }
 
-    /// Draws a run in which nothing fails but the disk, for a while, now and then; and a person who has the run held, or ended, meanwhile.
+    /// Draws a run in which nothing fails but the disk, now and then for a while, and in which a person holds or ends
+    /// the run in the meantime.
     fn on_a_full_disk(seed: u64) -> Self {
         const CUES: [Cue; 7] =
             [Cue::Loaded, Cue::Prepared, Cue::StartOnRecord, Cue::Begins, Cue::Complete, Cue::Complete, Cue::Ordered];
@@ -182,8 +185,8 @@ impl Schedule {
         Self { speed, acts, wanted: Wanted::Good, ..Self::with_deaths(seed, Vec::new()) }
     }
 
-    /// Draws a run in which registers of the status and of the header of a result say for a while what is not so: one field after the other by the
-    /// number of the seed, and others beside it.
+    /// Draws a run in which registers of the status and of the header of a result have false values for a while: one
+    /// field selected by the seed, and others in addition.
     fn lied_to(seed: u64) -> Self {
         let mut chance = StdRng::seed_from_u64(seed);
         let mut acts = Vec::new();
@@ -204,17 +207,17 @@ impl Schedule {
         Self { speed, acts, wanted: Wanted::Good, ..Self::with_deaths(seed, Vec::new()) }
     }
 
-    /// Whether machines say what is not so.
+    /// Returns true if machines report false values.
     pub fn lies(&self) -> bool {
         self.seed >= LIARS
     }
 
-    /// Whether nothing goes wrong but that the disk fails.
+    /// Returns true if nothing fails but the disk.
     pub fn disk_fails_alone(&self) -> bool {
         (FULL_DISK..LIARS).contains(&self.seed)
     }
 
-    /// Draws what happens as for Modbus; once or twice a machine forgets the job that it is at, or has just done.
+    /// Draws the acts as for Modbus. Once or twice a machine forgets the current or the last job.
     fn forgetful(seed: u64) -> Self {
         let mut chance = StdRng::seed_from_u64(seed ^ 0x0F02_6E70);
         let mut drawn = Self { speed: [400.0, 60.0, 10.0][chance.random_range(0..3)], ..Self::by_modbus(seed) };
@@ -226,7 +229,8 @@ impl Schedule {
         drawn
     }
 
-    /// What happens is drawn as for Modbus; the wires, and what goes wrong at their servers, by dice of their own.
+    /// Draws the acts as for Modbus. The protocols, and the faults at their servers, come from separate random
+    /// generators.
     fn by_other_wires(seed: u64) -> Self {
         let mut chance = StdRng::seed_from_u64(seed ^ 0xD3E0_0000);
         let mut drawn = Self { baud: None, ..Self::by_modbus(seed) };
@@ -256,7 +260,7 @@ impl Schedule {
             }
             0 => return drawn,
             1 | 2 => return Self { baud: None, acts: hasty(&mut chance), ..drawn },
-            // A pass takes long enough for a line to be lost and found.
+            // A pass takes long enough to lose and restore a line within it.
             3 | 4 => {
                 return Self {
                     speed: [20.0, 10.0, 5.0][chance.random_range(0..3)],
@@ -271,7 +275,7 @@ impl Schedule {
         Self { fault_share, faults, acts: acts(&mut chance, speed), ..drawn }
     }
 
-    /// A schedule in which nothing goes wrong but that the program dies before certain effects.
+    /// Returns a schedule without faults except that the program dies before these effects.
     pub fn with_deaths(seed: u64, deaths: Vec<u64>) -> Self {
         Self {
             seed,
@@ -288,20 +292,21 @@ impl Schedule {
         }
     }
 
-    /// Whether nothing goes wrong but that the program dies.
+    /// Returns true if the only faults are deaths of the program.
     pub fn dies_alone(&self) -> bool {
         self.acts.is_empty() && self.fault_share == 0.0 && self.servers_go_well()
     }
 
-    /// Whether nothing goes wrong at the servers of lines.
+    /// Returns true if there are no faults at the servers of lines.
     pub fn servers_go_well(&self) -> bool {
         self.dme.as_ref().is_none_or(Vec::is_empty) && self.rsh.as_ref().is_none_or(Vec::is_empty)
     }
 
-    /// Runs it and holds what happened against the promises.
+    /// Runs the schedule and checks the promises.
     ///
     /// # Errors
-    /// Which was broken.
+    ///
+    /// Returns the broken promise.
     pub fn run(&self) -> Result<Tally, String> {
         let (evidence, home) = self.happen();
         let checked = check(&evidence);
@@ -309,18 +314,18 @@ impl Schedule {
         checked.map(|()| evidence.tally.clone())
     }
 
-    /// Runs it and returns everything that happened, line by line.
+    /// Runs the schedule and returns all events, line by line.
     pub fn traced(&self) -> Vec<String> {
         self.happen().0.trace()
     }
 
-    /// Returns how many effects the program had, where nothing kills it.
+    /// Returns the number of effects of the program if nothing kills it.
     pub fn effects(&self) -> u64 {
         self.happen().0.effects
     }
 
     fn happen(&self) -> (Evidence, tempfile::TempDir) {
-        // In memory, where there is room for what a run asks for: nothing here is to outlast the process.
+        // Use memory if there is room for the data of a run: nothing here has to outlast the process.
         let memory = Path::new("/dev/shm");
         let has_room = free_bytes(memory).is_ok_and(|bytes| bytes > 48 << 20);
         let home = has_room.then(|| tempfile::tempdir_in(memory).ok()).flatten();
@@ -341,7 +346,7 @@ impl fmt::Display for Schedule {
     }
 }
 
-/// Draws which faults of the wire a schedule has.
+/// Draws the communication faults of a schedule.
 fn faults(chance: &mut StdRng, is_serial: bool) -> Vec<Fault> {
     let all = [
         Fault::DropRequest,
@@ -373,7 +378,7 @@ fn faults(chance: &mut StdRng, is_serial: bool) -> Vec<Fault> {
     drawn
 }
 
-/// Draws what goes wrong at a server of I++ DME.
+/// Draws the faults of a server of I++ DME.
 fn dme_faults(chance: &mut StdRng) -> Vec<DmeFault> {
     let late = |s: f64| OfDme::LateAcknowledgement(Duration::from_secs_f64(s));
     let anywhere = [late(0.3), late(2.0), late(6.0), OfDme::NoCompletion, OfDme::Disconnect, OfDme::EmergencyStop];
@@ -397,7 +402,7 @@ fn dme_faults(chance: &mut StdRng) -> Vec<DmeFault> {
     faults
 }
 
-/// Draws what goes wrong at linuxcncrsh.
+/// Draws the faults of linuxcncrsh.
 fn rsh_faults(chance: &mut StdRng) -> Vec<RshFault> {
     const SETS: [&str; 9] =
         ["set run", "set run", "set open", "set open", "set mode", "set mdi", "set enable", "set pause", "set abort"];
@@ -430,9 +435,9 @@ fn rsh_faults(chance: &mut StdRng) -> Vec<RshFault> {
     faults
 }
 
-/// Draws what happens, and when. A misfortune seldom comes alone.
+/// Draws the acts and their times. Faults seldom come alone.
 fn acts(chance: &mut StdRng, speed: f64) -> Vec<(When, Act)> {
-    // A run without faults takes about so long.
+    // Approximate duration of a run without faults.
     let span_s = 8.0 + 320.0 / speed;
     let mut acts = Vec::new();
     for _ in 0..chance.random_range(0..6) {
@@ -447,27 +452,27 @@ fn acts(chance: &mut StdRng, speed: f64) -> Vec<(When, Act)> {
     acts
 }
 
-/// Draws moments at which the computer sleeps, for longer than the loop that decides may hang.
+/// Draws times at which the computer sleeps, longer than the decision loop is allowed to hang.
 fn asleep(chance: &mut StdRng) -> Vec<(When, Act)> {
     let nap = |chance: &mut StdRng| Act::Suspend { lasts: Duration::from_secs(2) + any_length(chance, 4.0) };
     (0..chance.random_range(2..8)).map(|_| (When::drawn(chance, 12.0), nap(chance))).collect()
 }
 
-/// Draws moments at which a machine begins to move by itself soon after the cell was held.
+/// Draws times at which a machine begins to move by itself soon after the cell was held.
 fn astray(chance: &mut StdRng) -> Vec<(When, Act)> {
     let mut acts = Vec::new();
     for nth in 1..=chance.random_range(2..5) {
         acts.push((When::After(Cue::Begins, nth, any_length(chance, 0.3)), Act::Order("hold")));
         let (machine, lasts) = (chance.random_range(0..2), Duration::from_secs(1) + any_length(chance, 4.0));
-        // Once the cell shows it.
+        // After the cell shows it.
         let pause = Duration::from_millis(50) + any_length(chance, 0.3);
         acts.push((When::After(Cue::Held, nth, pause), Act::Stray { machine, lasts }));
     }
     acts
 }
 
-/// Draws moments at which a line breaks off just as a machine is told to move or to hold, and comes back soon; what was said last may be
-/// under way for long.
+/// Draws times at which a connection breaks exactly when a machine receives a command to move or to hold, and soon
+/// returns. The last command can stay in transit for a long time.
 fn broken_off(chance: &mut StdRng) -> Vec<(When, Act)> {
     const CUES: [Cue; 7] =
         [Cue::Prepared, Cue::Prepared, Cue::StartSent, Cue::StartSent, Cue::Begins, Cue::Begins, Cue::Ordered];
@@ -503,7 +508,7 @@ fn broken_off(chance: &mut StdRng) -> Vec<(When, Act)> {
     acts
 }
 
-/// Draws moments at which a machine or the disk does not do its part and a person gives one order after the other.
+/// Draws times at which a machine or the disk fails while a person gives one order after the other.
 fn hasty(chance: &mut StdRng) -> Vec<(When, Act)> {
     let mut acts = Vec::new();
     for _ in 0..chance.random_range(1..4) {
@@ -549,7 +554,7 @@ fn act(chance: &mut StdRng) -> Act {
         13 => Act::Supplies { machine, lasts },
         14 => Act::Stranger { machine, aborts: chance.random::<f64>() < 0.2 },
         15 => Act::HighNumber { machine },
-        // The loop that decides counts as hung after two seconds.
+        // The decision loop counts as hung after two seconds.
         16 => Act::Suspend { lasts: lasts + 2 * second },
         17 => Act::Stray { machine, lasts },
         18 => Act::PressStart { machine },
@@ -561,7 +566,7 @@ fn order(chance: &mut StdRng) -> Act {
     Act::Order(["hold", "hold", "abort", "abort", "stop", "resume"][chance.random_range(0..6)])
 }
 
-/// What schedules did.
+/// Counters of the results of schedules.
 #[derive(Clone, Debug, Default)]
 pub struct Tally {
     pub runs: u64,

@@ -1,5 +1,5 @@
-//! Holds what a measuring machine by I++ DME did against what is on record: its server knows no jobs, so nothing but the program sees to it
-//! that what moves is meant, and that what is measured was touched.
+//! Compares the actions of a measuring machine by I++ DME with the record. Its server knows no jobs. Only the program
+//! ensures that every motion is intended, and that every measured point was touched.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -12,19 +12,21 @@ use tokio::time::Instant;
 use crate::checker::{Evidence, is_intent};
 use crate::ledger::Recorded;
 
-/// A hold is seen by what carries out the job within this.
+/// Time within which the task that carries out the job sees a hold.
 const HOLDS_WITHIN: Duration = Duration::from_millis(100);
-/// A place that is the same.
+/// Tolerance for equal places, in mm.
 const SAME_MM: f64 = 1e-6;
-/// A touch comes back from where it truly touched, which is as far from its target as the part is from what it should be.
+/// Maximum distance, in mm, from the target at which a touch retracts: it starts at the true contact, which is off by
+/// the error of the part.
 const STRAIGHT_MM: f64 = 0.1;
-/// What moves the machine.
+/// Commands that move the machine.
 const MOTIONS: [&str; 4] = ["GoTo(", "PtMeas(", "Home(", "ChangeTool("];
 
-/// Holds a measuring machine by I++ DME against every promise.
+/// Checks a measuring machine by I++ DME against every promise.
 ///
 /// # Errors
-/// The first that was broken.
+///
+/// Returns the first broken promise.
 pub fn check(evidence: &Evidence) -> Result<(), String> {
     if evidence.deeds.is_empty() {
         return Ok(());
@@ -37,7 +39,7 @@ pub fn check(evidence: &Evidence) -> Result<(), String> {
     holds_at_the_next_target(evidence)
 }
 
-/// Every motion that began, by which command, from where to where.
+/// Returns every motion that began: its command, its start and its end.
 fn motions(evidence: &Evidence) -> impl Iterator<Item = (Instant, &str, [[f64; 3]; 2])> {
     evidence.deeds.iter().filter_map(|(at, deed)| match deed {
         Deed::Moves { command, from_mm, to_mm } => Some((*at, command.as_str(), [*from_mm, *to_mm])),
@@ -45,7 +47,7 @@ fn motions(evidence: &Evidence) -> impl Iterator<Item = (Instant, &str, [[f64; 3
     })
 }
 
-/// Whether a record says that the job of the CMM is over.
+/// Returns true if a record says that the job of the CMM is over.
 fn is_over(payload: &serde_json::Value) -> bool {
     let of_cmm = payload["device"] == "cmm";
     let ended = matches!(payload["event"].as_str(), Some("ended" | "abort_confirmed" | "fault"));
@@ -54,7 +56,7 @@ fn is_over(payload: &serde_json::Value) -> bool {
     of_cmm && (ended || reconciled)
 }
 
-/// Nothing moves but for a START that is on record and is not over.
+/// Checks that nothing moves except for a START that is on record and not over.
 fn moves_by_an_intent(evidence: &Evidence) -> Result<(), String> {
     for (at, command, _) in motions(evidence) {
         let intent = evidence.written.iter().rfind(|w| w.at <= at && is_intent(w, 0));
@@ -70,7 +72,7 @@ fn moves_by_an_intent(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// Behind an abort nothing moves before a person has the job go on, or the next START is on record.
+/// Checks that nothing moves after an abort before a person resumes the job, or the next START is on record.
 fn nothing_after_an_abort(evidence: &Evidence) -> Result<(), String> {
     let mut aborted = None;
     for (at, deed) in &evidence.deeds {
@@ -92,7 +94,8 @@ fn nothing_after_an_abort(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// Below the clearance the probe goes straight up or down, and to a target that is right there. How it is homed is the machine's own.
+/// Checks that below the clearance the probe only moves straight up or down, and to a target directly there. Homing is
+/// excluded: the machine does it in its own way.
 fn travels_at_the_clearance(evidence: &Evidence) -> Result<(), String> {
     let touched = evidence.deeds.iter().filter_map(|(_, deed)| match deed {
         Deed::Touched { point_mm, .. } => Some(point_mm[2]),
@@ -115,7 +118,7 @@ fn travels_at_the_clearance(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// Every point of a measurement is where the machine touched last at one of its targets, in this very job.
+/// Checks that every point of a measurement is the last touch of the machine at one of its targets, in this very job.
 fn measured_is_touched(evidence: &Evidence) -> Result<(), String> {
     for cycle in 1.. {
         let folder = evidence.folder.join(format!("cycle-{cycle}"));
@@ -159,12 +162,12 @@ fn rows(file: &Path) -> Vec<[f64; 3]> {
     text.lines().filter_map(|line| numbers(line)?.try_into().ok()).collect()
 }
 
-/// Whether a line moves the machine.
+/// Returns true if a line moves the machine.
 fn is_motion(line: &str) -> bool {
     line.split_once(' ').is_some_and(|(_, command)| MOTIONS.iter().any(|motion| command.starts_with(motion)))
 }
 
-/// Nothing that moves the machine leaves the program while the cell shows that it stands.
+/// Checks that no command that moves the machine leaves the program while the cell shows standstill.
 fn told_nothing_while_it_stands(evidence: &Evidence) -> Result<(), String> {
     for spoken in evidence.wires.lines.iter().filter(|spoken| spoken.machine == 0 && is_motion(&spoken.line)) {
         let stands = [StateName::Held, StateName::Stopped, StateName::Aborted, StateName::Complete];
@@ -177,7 +180,7 @@ fn told_nothing_while_it_stands(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// Behind a hold or a stop no target is begun but the one that was on its way.
+/// Checks that after a hold or a stop no target begins, except the one that was already in progress.
 fn holds_at_the_next_target(evidence: &Evidence) -> Result<(), String> {
     for given in
         evidence.given.iter().filter(|given| matches!(given.what, "hold" | "stop") && given.done && given.moved[0])
@@ -193,7 +196,7 @@ fn holds_at_the_next_target(evidence: &Evidence) -> Result<(), String> {
                 && to.is_none_or(|to| spoken.at < to)
                 && spoken.line.contains(" PtMeas(")
         });
-        // Missed, a target is tried again.
+        // The machine retries a missed target.
         let mut targets: Vec<&str> =
             touches.filter_map(|spoken| spoken.line.split_once(' ').map(|(_, of)| of)).collect();
         targets.dedup();

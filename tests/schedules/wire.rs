@@ -1,4 +1,4 @@
-//! What leaves the program, seen where it goes onto the wire: the commands, and whether each question is asked as it should be.
+//! Traffic that leaves the program, observed at the wire: the commands, and whether each query follows the rules.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
@@ -10,37 +10,37 @@ use tokio::time::Instant;
 
 use crate::cue::Cues;
 
-/// A command as it left the program.
+/// Command as it left the program.
 #[derive(Clone, Copy, Debug)]
 pub struct Sent {
     pub at: Instant,
-    /// 0 is the CMM, 1 the grinder.
+    /// Index of the machine: 0 is the CMM, 1 the grinder.
     pub machine: usize,
     pub command: Command,
     pub frame: Frame,
 }
 
-/// A line as it left the program, without its end.
+/// Line as it left the program, without its line end.
 #[derive(Clone, Debug)]
 pub struct Spoken {
     pub at: Instant,
-    /// 0 is the CMM, 1 the grinder.
+    /// Index of the machine: 0 is the CMM, 1 the grinder.
     pub machine: usize,
     pub line: String,
 }
 
-/// What was seen on the wires.
+/// Observed traffic.
 #[derive(Clone, Debug, Default)]
 pub struct Traffic {
     pub sent: Vec<Sent>,
     pub lines: Vec<Spoken>,
-    /// Questions that should not have been asked as they were.
+    /// Queries that break the rules.
     pub wrong: Vec<(Instant, String)>,
 }
 
 pub type Wires = Arc<Mutex<Traffic>>;
 
-/// Watches a connection of the program over which lines go.
+/// Observer of a connection of the program that carries lines.
 pub struct Listening {
     wires: Wires,
     cues: Cues,
@@ -53,7 +53,7 @@ impl Listening {
         Self { wires: wires.clone(), cues: cues.clone(), machine, half: Vec::new() }
     }
 
-    /// Bytes leave the program.
+    /// Observes bytes that leave the program.
     pub fn hears(&mut self, bytes: &[u8]) {
         self.half.extend(bytes);
         while let Some(end) = self.half.iter().position(|byte| *byte == b'\n') {
@@ -72,16 +72,16 @@ impl Listening {
     }
 }
 
-/// Watches one connection of the program.
+/// Observer of one connection of the program.
 pub struct Watched {
     wires: Wires,
     cues: Cues,
     is_serial: bool,
-    /// A question has been asked, and so much of its answer has been read.
+    /// Part of the answer that has been read so far, if a query is open.
     open: Option<Vec<u8>>,
-    /// Units that have answered with what was written to them over this connection.
+    /// Units from which synchronization data, written over this connection, was read back: they are identified.
     proven: BTreeSet<u8>,
-    /// Units to which such a thing was written.
+    /// Units to which synchronization data was written.
     being_proven: BTreeSet<u8>,
 }
 
@@ -91,7 +91,7 @@ impl Watched {
         Self { wires: wires.clone(), cues: cues.clone(), is_serial, open: None, proven, being_proven }
     }
 
-    /// A question leaves the program, while so many bytes wait that it has not read.
+    /// Observes a query that leaves the program, and the number of received bytes that the program has not read.
     pub fn asks(&mut self, request: &[u8], waiting: usize) {
         if waiting > 0 {
             self.wrong(format!("it asks while {waiting} bytes of something else wait"));
@@ -111,7 +111,7 @@ impl Watched {
         }
     }
 
-    /// The program reads of an answer.
+    /// Observes bytes of an answer that the program reads.
     pub fn reads(&mut self, bytes: &[u8]) {
         self.open.iter_mut().for_each(|answer| answer.extend(bytes));
     }

@@ -1,5 +1,5 @@
-//! What comes from outside of the program otherwise on one system than on another: what ends it, who is at its terminal, where it is. A
-//! module for each system, with the same functions.
+//! System-dependent events and information from outside the program: what ends it, who uses its terminal, where it
+//! runs. Each system has its own module with the same functions.
 
 #[cfg(unix)]
 mod unix;
@@ -11,10 +11,10 @@ pub(super) use unix::*;
 #[cfg(windows)]
 pub(super) use windows::*;
 
-/// That the program is to end.
+/// Request to end the program.
 pub(super) struct Ending {
-    /// By what, for the record.
+    /// Source of the request, for the record.
     pub(super) by: &'static str,
-    /// Whether its terminal was closed; that may be said twice.
+    /// True if the terminal was closed. This event can arrive twice.
     pub(super) hung_up: bool,
 }

@@ -1,4 +1,4 @@
-//! Signals, terminals and process groups.
+//! Signals, terminals and process groups on Unix.
 
 use std::io;
 use std::path::PathBuf;
@@ -10,9 +10,9 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::Ending;
 
-/// What ends a program from outside: a terminal that is closed, a service that is stopped.
+/// Events that end a program from outside: a closed terminal, a stopped service.
 pub(crate) struct Endings {
-    /// None where whoever started the program wants it to outlive its terminal (`nohup`).
+    /// `None` if the program was started to outlive its terminal (`nohup`).
     hangup: Option<Signal>,
     terminate: Signal,
 }
@@ -23,7 +23,7 @@ impl Endings {
         Ok(Self { hangup, terminate: signal(SignalKind::terminate())? })
     }
 
-    /// Waits for the next; none where there will be none.
+    /// Waits for the next event. Returns `None` if no further event can arrive.
     pub(crate) async fn next(&mut self) -> Option<Ending> {
         tokio::select! {
             Some(()) = self.terminate.recv() => Some(Ending { by: "SIGTERM", hung_up: false }),
@@ -35,19 +35,20 @@ impl Endings {
     }
 }
 
-/// Whether SIGHUP, the first signal, is ignored by who started this program.
+/// Returns true if the parent process set SIGHUP (signal 1) to be ignored.
 fn ignores_hangup() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask & 1 == 1)
 }
 
-/// Throws away what was typed before somebody was asked.
+/// Discards input that was typed before the question.
 pub(crate) fn forget_what_was_typed() -> io::Result<()> {
     Ok(rustix::termios::tcflush(io::stdin(), rustix::termios::QueueSelector::IFlush)?)
 }
 
-/// Waits a while for Enter, no longer than it takes to come while this program has the terminal: none where it has not come yet.
+/// Waits for Enter, at most for `patience` and only while this program has the terminal. Returns `None` if Enter did
+/// not arrive yet.
 pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) -> Option<bool> {
     let mut terminal = [PollFd::from_borrowed_fd(rustix::stdio::stdin(), PollFlags::IN)];
     let patience = Timespec { tv_sec: 0, tv_nsec: i64::from(patience.subsec_nanos()) };
@@ -55,37 +56,39 @@ pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) 
     typed.then(|| io::stdin().read_line(&mut String::new()).is_ok_and(|read| read > 0))
 }
 
-/// Whether the terminal is this program's at the moment: who reads from it in the background is stopped by it, machines or not.
+/// Returns true if this program has the terminal at the moment. A background process that reads from it is stopped by
+/// the system, even if it drives machines.
 pub(crate) fn is_in_front() -> bool {
     rustix::termios::tcgetpgrp(io::stdin()).is_ok_and(|group| group == rustix::process::getpgrp())
 }
 
-/// Lets other programs of this computer go first.
+/// Lowers the priority of this program.
 #[cfg(feature = "plant")]
 pub(crate) fn give_way() {
-    // Who may not does its work all the same.
+    // Without the permission the program continues at its priority.
     let _ = rustix::process::nice(10);
 }
 
-/// Keeps Ctrl-C at this program's terminal from a program that it starts.
+/// Protects a child program from Ctrl-C at this program's terminal.
 pub(crate) fn set_apart(command: &mut Command) {
     std::os::unix::process::CommandExt::process_group(command, 0);
 }
 
-/// The name by which the operating system knows who started this program: a service may have none in its environment.
+/// Returns the name of the user who started this program, from the operating system. The environment of a service can
+/// lack it.
 pub(crate) fn own_name() -> String {
     use std::os::unix::fs::MetadataExt;
     let Ok(uid) = std::fs::metadata("/proc/self").map(|own| own.uid()) else { return "unknown".into() };
     regrind::formats::user_name(uid).unwrap_or_else(|| format!("uid {uid}"))
 }
 
-/// The name of this computer, if it has one.
+/// Returns the name of this computer, if it has one.
 pub(crate) fn host() -> Option<String> {
     let host = std::fs::read_to_string("/etc/hostname").unwrap_or_default();
     Some(host.trim().to_owned()).filter(|host| !host.is_empty())
 }
 
-/// Where programs keep their settings for this user, if anywhere.
+/// Returns the folder of this user's settings, if there is one.
 pub(crate) fn settings_folder() -> Option<PathBuf> {
     let folder = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     folder("XDG_CONFIG_HOME").or_else(|| Some(folder("HOME")?.join(".config")))

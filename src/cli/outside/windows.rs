@@ -1,4 +1,4 @@
-//! Events of a console, and what Windows tells of itself.
+//! Console events and system information on Windows.
 
 use std::io;
 use std::path::PathBuf;
@@ -11,11 +11,11 @@ use tokio::signal::windows::{ctrl_break, ctrl_close, ctrl_logoff, ctrl_shutdown}
 
 use super::Ending;
 
-/// The flag with which a program begins a group of its own (CREATE_NEW_PROCESS_GROUP).
+/// Flag that starts a program in its own process group (CREATE_NEW_PROCESS_GROUP).
 const NEW_GROUP: u32 = 0x0000_0200;
 
-/// What ends a program from outside: Ctrl-Break, a console that is closed, a session or a computer that ends. But for Ctrl-Break, Windows
-/// ends the program itself a few seconds after it was told, whatever it does by then.
+/// Events that end a program from outside: Ctrl-Break, a closed console, the end of a session or a shutdown. Except
+/// after Ctrl-Break, Windows itself ends the program a few seconds after the event, in any case.
 pub(crate) struct Endings {
     interrupt: CtrlBreak,
     close: CtrlClose,
@@ -33,7 +33,7 @@ impl Endings {
         })
     }
 
-    /// Waits for the next; none where there will be none.
+    /// Waits for the next event. Returns `None` if no further event can arrive.
     pub(crate) async fn next(&mut self) -> Option<Ending> {
         tokio::select! {
             Some(()) = self.interrupt.recv() => Some(Ending { by: "Ctrl-Break", hung_up: false }),
@@ -45,7 +45,7 @@ impl Endings {
     }
 }
 
-/// Throws away what was typed before somebody was asked.
+/// Discards input that was typed before the question.
 pub(crate) fn forget_what_was_typed() -> io::Result<()> {
     while event::poll(Duration::ZERO)? {
         event::read()?;
@@ -53,7 +53,8 @@ pub(crate) fn forget_what_was_typed() -> io::Result<()> {
     Ok(())
 }
 
-/// Waits a while for Enter, no longer than it takes to come while this program has the terminal: none where it has not come yet.
+/// Waits for Enter, at most for `patience` and only while this program has the terminal. Returns `None` if Enter did
+/// not arrive yet.
 pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) -> Option<bool> {
     if !event::poll(patience).is_ok_and(|typed| typed && has_terminal()) {
         return None;
@@ -62,31 +63,31 @@ pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) 
     event::read().is_ok_and(|typed| typed == Event::Key(enter)).then_some(true)
 }
 
-/// Whether the terminal is this program's at the moment: a console gives what is typed to whoever reads.
+/// Returns true if this program has the terminal at the moment. A console gives its input to every program that reads.
 pub(crate) fn is_in_front() -> bool {
     true
 }
 
-/// Other programs go first where the system says so; here it is left to it.
+/// Does nothing: on Windows the priority is left to the system.
 #[cfg(feature = "plant")]
 pub(crate) fn give_way() {}
 
-/// Keeps Ctrl-C at this program's terminal from a program that it starts.
+/// Protects a child program from Ctrl-C at this program's terminal.
 pub(crate) fn set_apart(command: &mut Command) {
     std::os::windows::process::CommandExt::creation_flags(command, NEW_GROUP);
 }
 
-/// The name by which the operating system knows who started this program.
+/// Returns the name of the user who started this program, from the operating system.
 pub(crate) fn own_name() -> String {
     regrind_windows::own_name().unwrap_or_else(|_| "unknown".into())
 }
 
-/// The name of this computer, if it has one.
+/// Returns the name of this computer, if it has one.
 pub(crate) fn host() -> Option<String> {
     std::env::var("COMPUTERNAME").ok().filter(|host| !host.is_empty())
 }
 
-/// Where programs keep their settings for this user on this computer, if anywhere.
+/// Returns the folder of this user's settings on this computer, if there is one.
 pub(crate) fn settings_folder() -> Option<PathBuf> {
     std::env::var_os("LOCALAPPDATA").filter(|value| !value.is_empty()).map(PathBuf::from)
 }

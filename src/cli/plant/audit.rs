@@ -1,4 +1,4 @@
-//! `regrind audit verify --plant`: the copy of the plant, proven by itself, and the journal here held against it.
+//! `regrind audit verify --plant`: verifies the plant's copy of a record, and compares it with the local journal.
 
 use std::path::Path;
 
@@ -11,14 +11,15 @@ use super::super::control::folder_of;
 use super::super::failure::Failure;
 use super::{open, read};
 
-/// What the plant's copy of a run is.
+/// Plant's copy of a run.
 pub(in super::super) struct Copy {
-    /// Whether the run lies here too.
+    /// True if the run is also stored here.
     pub(in super::super) is_here: bool,
     pub(in super::super) told: Value,
 }
 
-/// Proves the plant's copy of a run, and that what had arrived stands in the journal here, if there is one.
+/// Verifies the plant's copy of a run. If there is a local journal, also checks that it contains the records that have
+/// arrived at the plant.
 pub(in super::super) fn prove(
     plant: &Path,
     run: Option<&Path>,

@@ -1,4 +1,4 @@
-//! What a run begins with that other cells of the plant have learned.
+//! Initial knowledge of a run that other cells of the plant have learned.
 
 use std::path::Path;
 use std::time::Duration;
@@ -10,28 +10,29 @@ use regrind_plant::Knowledge;
 
 use super::super::failure::Failure;
 
-/// How long a run waits for the plant before it begins without.
+/// Timeout for the plant, after which a run begins without its knowledge.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// What became of the question.
+/// Result of the query.
 #[derive(Default)]
 pub(in super::super) struct Told {
-    /// What the task can begin with, where others tell anything of it.
+    /// Knowledge with which the task can begin, if other cells have any.
     pub(in super::super) learned: Option<Learned>,
-    /// What is to be said of it.
+    /// Messages about it.
     pub(in super::super) words: Vec<String>,
 }
 
-/// Asks the plant what other cells have learned of parts like that of a task. A plant that cannot be reached is in nobody's way.
+/// Queries the knowledge of other cells about similar parts. An unreachable plant does not prevent the run.
 pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<Told, Failure> {
     let config = super::read(plant)?;
-    // Who only tells live values has nobody to ask.
+    // A plant file for live values only has no database to query.
     if config.database.is_none() {
         return Ok(Told::default());
     }
     let (to, answer) = std::sync::mpsc::channel();
     let (kind, simulation) = (task.kind.clone(), task.simulation);
-    // A thread of its own, which is left where it hangs: neither a look for a name nor a file of a share that is gone can be called off.
+    // Own thread, which is abandoned if it hangs: neither a name lookup nor a file on a lost network share can be
+    // cancelled.
     std::thread::spawn(move || {
         let asked = super::super::runtime().and_then(|runtime| {
             runtime.block_on(async {
@@ -42,7 +43,7 @@ pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<Told, Failure> 
                 Ok::<_, Failure>((knowledge, alike))
             })
         });
-        // The run may have begun without.
+        // The run can have begun without the answer.
         let _ = to.send(asked.map_err(|error| error.to_string()));
     });
     let (knowledge, alike) = match answer.recv_timeout(PATIENCE) {
@@ -54,7 +55,7 @@ pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<Told, Failure> 
     Ok(Told { learned: task.from_others(&knowledge.lessons, &alike), words })
 }
 
-/// How alike machines are, by what somebody stated and by the recipes that two of them know.
+/// Returns the similarity of machines, from a stated value or from the recipes that two machines share.
 fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> Alike {
     let mut alike = Alike::default();
     if let Some(share) = machines_differ {

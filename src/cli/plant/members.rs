@@ -1,4 +1,4 @@
-//! `regrind plant init|enrol|retire|cells`: the layout of the database, and who may sign in to it.
+//! `regrind plant init|enrol|retire|cells`: the schema of the database, and the roles that can sign in.
 
 use std::path::PathBuf;
 
@@ -116,7 +116,7 @@ pub(super) fn enrol(arguments: &ToEnrol) -> Result<Outcome, Failure> {
     super::super::runtime()?.block_on(async {
         let mut link = open(&config).await?;
         let keys: Vec<String> = arguments.key.iter().map(ToString::to_string).collect();
-        // First the file: a password that nobody has is no use, and another can be made.
+        // The file is written first: a lost password is useless, and a new one can be generated.
         write_private(&arguments.password_file, format!("{password}\n").as_bytes())?;
         match arguments.role {
             Kind::Cell => enrol_cell(&mut link, &arguments.name, &role, &password, &keys).await?,
@@ -130,7 +130,7 @@ pub(super) fn enrol(arguments: &ToEnrol) -> Result<Outcome, Failure> {
     })
 }
 
-/// The role of a name: what needs no quotes anywhere.
+/// Returns the database role of a name. It needs no quotes in SQL.
 fn role_of(name: &str) -> String {
     let plain = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '_' };
     let role: String = name.chars().map(plain).take(48).collect();

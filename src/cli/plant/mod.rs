@@ -1,4 +1,4 @@
-//! `regrind plant`: the database of many cells: who is in it, and what stands there.
+//! `regrind plant`: the database of many cells, its members and its content.
 
 pub(super) mod audit;
 pub(super) mod knowledge;
@@ -90,39 +90,41 @@ impl Where {
     }
 }
 
-/// Reads a plant file, or shows what is wrong with it.
+/// Reads a plant file, or shows its problems.
 pub(super) fn read(file: &Path) -> Result<PlantConfig, Failure> {
     check::or_show(PlantConfig::read(file))
 }
 
-/// The database that a plant file names, or what is wrong with it.
+/// Returns the database settings of a plant file, or shows the problem.
 fn database(config: &PlantConfig) -> Result<&DatabaseSettings, Failure> {
     let missing = || config.problem("database", "is missing", "", "say where the database is, and who signs in");
     check::or_show(config.database.as_ref().ok_or_else(missing))
 }
 
-/// Signs in to the database of a plant file, whose layout may be any.
+/// Signs in to the database of a plant file, with any schema version.
 pub(super) async fn open_any(config: &PlantConfig) -> Result<Link, Failure> {
     Ok(Link::open(database(config)?).await?)
 }
 
-/// Signs in to the database of a plant file, which must be laid out as this program knows it.
+/// Signs in to the database of a plant file. Its schema must be the version of this program.
 pub(super) async fn open(config: &PlantConfig) -> Result<Link, Failure> {
     let link = open_any(config).await?;
     regrind_plant::is_known(link.client()).await?;
     Ok(link)
 }
 
-/// What goes on beside a run for the plant: programs of their own, which can neither slow the run down nor take it along. They end a little
-/// after the program that holds this, by whose end their standard input ends.
+/// Programs that replicate and publish a run for the plant while it is active. They are separate processes, so they can
+/// neither slow the run down nor stop it. They end shortly after the program that holds this value, because then their
+/// standard input ends.
 pub(super) struct Beside {
     _programs: Vec<Child>,
 }
 
 impl Beside {
-    /// Begins to ship the runs in a folder where the plant file names a database, and to tell live values where it says to whom.
+    /// Starts the replication of the runs in a folder if the plant file names a database, and the publication of live
+    /// values if it names a receiver.
     pub(super) fn begin(runs: &Path, plant: &Path) -> Result<Self, Failure> {
-        // What is wrong with the file is said here, before anything opens.
+        // Errors of the file are reported here, before anything opens.
         let config = read(plant)?;
         let tells = config.sparkplug.is_some() || config.opcua.is_some();
         let wanted = [("ship", config.database.is_some()), ("tell", tells)];

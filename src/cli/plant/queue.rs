@@ -1,4 +1,4 @@
-//! `regrind plant queue|unqueue|work`: the parts that are to be made.
+//! `regrind plant queue|unqueue|work`: the queue of parts to be made.
 
 use clap::Args;
 use regrind_plant::PlantRecipe;
@@ -78,7 +78,7 @@ pub(super) fn queue(arguments: &ToQueue) -> Result<Outcome, Failure> {
         let recipe = PlantRecipe::find(&link, &arguments.recipe, arguments.version).await?;
         let (sha256, due) = (recipe.sha256(), arguments.due.map(|due| due.to_string()));
         let text = "SELECT queue_work(s, decode($2, 'hex'), $3, $4::text::date) FROM unnest($1::text[]) AS s";
-        // All of them, or none.
+        // All parts are queued, or none.
         let made = link.ask(text, &[&arguments.serials, &sha256, &arguments.cell, &due]).await?;
         let numbers: Vec<i64> = made.iter().map(|row| row.get(0)).collect();
         let lines = numbers.iter().zip(&arguments.serials).map(|(number, serial)| {

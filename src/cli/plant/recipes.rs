@@ -1,4 +1,4 @@
-//! `regrind plant propose|approve|withdraw|recipes`: what parts are made by, in versions that two people have signed.
+//! `regrind plant propose|approve|withdraw|recipes`: the recipes of a plant, in versions that two people have signed.
 
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
@@ -125,7 +125,7 @@ pub(super) fn propose(arguments: &ToPropose) -> Result<Outcome, Failure> {
     })
 }
 
-/// The files that a recipe names, by the path in it.
+/// Returns the files that a recipe names, by their path in the recipe.
 pub(super) fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Failure> {
     let folder = recipe.path().parent().unwrap_or(Path::new(""));
     let mut files = BTreeMap::new();
@@ -145,7 +145,7 @@ pub(super) fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Fai
     Ok(files)
 }
 
-/// Whether a relative path leads nowhere but down.
+/// Returns true if a path is relative and does not leave its folder.
 pub(in super::super) fn is_below(path: &Path) -> bool {
     path.components().next().is_some() && path.components().all(|part| matches!(part, Component::Normal(_)))
 }

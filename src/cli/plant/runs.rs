@@ -1,4 +1,4 @@
-//! `regrind plant runs|fetch|incidents`: what the plant has of the runs of its cells.
+//! `regrind plant runs|fetch|incidents`: the plant's copies of the runs of its cells.
 
 use std::path::PathBuf;
 

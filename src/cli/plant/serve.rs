@@ -11,7 +11,7 @@ use super::super::failure::Failure;
 use super::super::serve::Door;
 use super::Where;
 
-/// Where the page is, if nothing else is said: beside that of a cell.
+/// Default address of the page. Its port follows that of a cell's page.
 const ADDRESS: &str = "127.0.0.1:7374";
 
 /// Show all cells, their parts and their trends as a page in the browser

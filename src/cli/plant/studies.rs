@@ -1,4 +1,4 @@
-//! `regrind study`: a recipe made many times in simulation, by as many workers as there are, and what came of it.
+//! `regrind study`: simulates a recipe many times on all available workers, and summarises the results.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -17,11 +17,11 @@ use super::super::{Outcome, check, name, outside};
 use super::recipes::files_of;
 use super::{Where, is_below, open};
 
-/// How often a worker asks for a job where there is none.
+/// Time between two queries of a worker while there is no job.
 const ROUND: Duration = Duration::from_secs(5);
-/// Most jobs of one study.
+/// Maximum number of jobs of one study.
 const MOST_JOBS: usize = 1_000_000;
-/// The quantile of the normal distribution for an interval of 95 %.
+/// Quantile of the normal distribution for a 95 % interval.
 const Z: f64 = 1.96;
 
 /// Make a recipe many times in simulation, on as many computers as there are, and tell what came of it
@@ -145,7 +145,7 @@ fn seeds(text: &str) -> Result<(u64, u64), String> {
     }
 }
 
-/// A dotted key, and values as TOML has them.
+/// Parses a dotted key and its values in TOML notation.
 fn variation(text: &str) -> Result<(String, Vec<Value>), String> {
     let (key, values) = text.split_once('=').ok_or("give a key and its values, such as compensation.gain=0.8,1.0")?;
     let key = key.trim();
@@ -163,7 +163,7 @@ fn variation(text: &str) -> Result<(String, Vec<Value>), String> {
     }
 }
 
-/// Every value of every key with every other.
+/// Returns every combination of the values of all keys.
 fn every_one(vary: &[(String, Vec<Value>)]) -> Vec<Map<String, Value>> {
     vary.iter().fold(vec![Map::new()], |all, (key, values)| {
         let mut every = Vec::with_capacity(all.len() * values.len());
@@ -178,7 +178,7 @@ fn every_one(vary: &[(String, Vec<Value>)]) -> Vec<Map<String, Value>> {
     })
 }
 
-/// The text of a recipe with other values.
+/// Returns the text of a recipe with other values.
 fn varied(text: &str, values: &Map<String, Value>) -> Result<String, String> {
     let mut recipe: toml::Table = text.parse().map_err(|error| format!("the recipe is no TOML: {error}"))?;
     for (key, value) in values {
@@ -199,7 +199,7 @@ fn begin(arguments: &ToBegin) -> Result<Outcome, Failure> {
     let sets = every_one(&arguments.vary);
     for values in &sets {
         let text = varied(recipe.text(), values).map_err(PlantError::Recipe)?;
-        // What a worker would be refused later is said now.
+        // Reports now the errors for which a worker would later refuse the job.
         check::or_show(Recipe::parse(recipe.path(), &text))?;
     }
     let (first, last) = arguments.seeds;
@@ -231,7 +231,7 @@ fn begin(arguments: &ToBegin) -> Result<Outcome, Failure> {
 
 fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
-    // Whoever works at this computer goes first.
+    // The work of a person at this computer has priority.
     outside::give_way();
     super::super::runtime()?.block_on(async {
         let mut workers = tokio::task::JoinSet::new();
@@ -249,7 +249,7 @@ fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
                         continue;
                     };
                     let study = Study::of(&link, &job).await?;
-                    // A run takes longer than a line should stand idle.
+                    // A run takes longer than a connection should stay idle.
                     drop(link);
                     let of = job.clone();
                     let result = tokio::task::spawn_blocking(move || made_of(&study, &of)).await;
@@ -268,7 +268,7 @@ fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
     })
 }
 
-/// Makes the run of a job, by a program of its own, and returns what a glance shows of it beside the truth.
+/// Runs a job in a separate process. Returns the summary of the run, together with the truth.
 fn made_of(study: &Study, job: &Job) -> Result<Value, String> {
     let words = |error: &dyn std::fmt::Display| error.to_string();
     let place = std::env::temp_dir().join(format!("regrind-study-{:032x}", rand::random::<u128>()));
@@ -327,7 +327,7 @@ fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
     })
 }
 
-/// A line for each set of values, in the order in which they were given.
+/// Returns one line per set of values, in the order of the input.
 fn in_words(jobs: &[Value]) -> String {
     let mut sets: BTreeMap<String, (i64, Vec<&Value>)> = BTreeMap::new();
     for job in jobs {
@@ -392,12 +392,12 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     Some((low + values.get(middle)?) / 2.0)
 }
 
-/// The interval of 95 % of a share, in per cent (Wilson 1927).
+/// Returns the 95 % interval of a share, in per cent (Wilson 1927).
 fn wilson(of: usize, all: usize) -> [f64; 2] {
     let (n, p) = (all as f64, of as f64 / all as f64);
     let middle = p + Z * Z / (2.0 * n);
     let half = Z * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
-    // Rounding leads no share below nothing or above all.
+    // Rounding must not produce a share below 0 or above 1.
     [middle - half, middle + half].map(|bound| (100.0 * bound / (1.0 + Z * Z / n)).clamp(0.0, 100.0))
 }
 

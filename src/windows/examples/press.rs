@@ -1,9 +1,10 @@
-//! Presses Ctrl-C or Ctrl-Break at the console of a program once it has said a word: what a script cannot do to a program of Windows.
+//! Sends Ctrl-C or Ctrl-Break to the console of a program after the program has printed a given word. A script cannot
+//! do this on Windows.
 //!
 //! ```text
 //! press c|break WORD PROGRAM [ARGUMENT...]
 //! ```
-//! Ends with the exit code of the program; whatever the program says is said on. Needs a console.
+//! Exits with the exit code of the program and passes its output on. Needs a console.
 
 #[cfg(windows)]
 fn main() -> std::io::Result<()> {
@@ -17,7 +18,7 @@ fn main() -> std::io::Result<()> {
     let [key, word, program, arguments @ ..] = &arguments[..] else { panic!("press c|break WORD PROGRAM ...") };
     let event = if key == "break" { CTRL_BREAK_EVENT } else { CTRL_C_EVENT };
     let mut child = Command::new(program).args(arguments).stdout(Stdio::piped()).spawn()?;
-    // SAFETY: the function stays for as long as the program, and may be called at any time.
+    // SAFETY: the function exists as long as the program, and can be called at any time.
     unsafe { SetConsoleCtrlHandler(Some(is_for_the_child), 1) };
     let mut pressed = false;
     for line in BufReader::new(child.stdout.take().expect("it is piped")).lines() {
@@ -25,9 +26,9 @@ fn main() -> std::io::Result<()> {
         println!("{line}");
         if !pressed && line.contains(word.as_str()) {
             pressed = true;
-            // Not before the program has its work.
+            // Gives the program time to begin its work.
             std::thread::sleep(std::time::Duration::from_secs(2));
-            // SAFETY: two numbers are handed over, and nothing is kept.
+            // SAFETY: the call takes two numbers and keeps nothing.
             if unsafe { GenerateConsoleCtrlEvent(event, 0) } == 0 {
                 return Err(std::io::Error::last_os_error());
             }
@@ -36,7 +37,7 @@ fn main() -> std::io::Result<()> {
     exit(child.wait()?.code().unwrap_or(-1))
 }
 
-/// Every program of the console gets what is pressed; this one lets it pass.
+/// Ignores the event: every program of the console receives it, but it is meant for the child.
 #[cfg(windows)]
 unsafe extern "system" fn is_for_the_child(_: u32) -> i32 {
     1

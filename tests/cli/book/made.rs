@@ -1,5 +1,5 @@
-//! What stands in the book between `<!-- made: WHAT -->` and `<!-- end -->` is made from the program. Written anew by
-//! `REGRIND_REWRITE=1 cargo test --workspace --test cli made`.
+//! Parts of the book that are generated from the program: the text between `<!-- made: WHAT -->` and `<!-- end -->`.
+//! `REGRIND_REWRITE=1 cargo test --workspace --test cli made` writes them again.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -23,7 +23,7 @@ fn schema(kind: &str) -> &'static Value {
     }
 }
 
-/// The forms of a table: one, or as many as a key `kind` or `shape` chooses among.
+/// Returns the forms of a table: one, or one for each value of its key `kind` or `shape`.
 fn forms(table: &Value) -> Vec<&Value> {
     match table.get("oneOf").and_then(Value::as_array) {
         Some(forms) => forms.iter().collect(),
@@ -31,7 +31,7 @@ fn forms(table: &Value) -> Vec<&Value> {
     }
 }
 
-/// The table of a schema at a path such as `cmm.wire.stations`.
+/// Returns the table of a schema at a path such as `cmm.wire.stations`.
 fn table_at<'a>(root: &'a Value, path: &str) -> &'a Value {
     path.split('.').fold(root, |table, name| {
         let found = forms(table).into_iter().find_map(|form| form["properties"].get(name));
@@ -40,13 +40,14 @@ fn table_at<'a>(root: &'a Value, path: &str) -> &'a Value {
     })
 }
 
-/// Whether a key is a table of its own, which has its own list of keys.
+/// Returns true if a key is a table with its own list of keys.
 fn is_table(value: &Value) -> bool {
     let of = value.get("items").unwrap_or(value);
     forms(of).iter().any(|form| form.get("properties").is_some())
 }
 
-/// The paths of all tables of a schema, those of a parent surface left out: they are those of any surface.
+/// Collects the paths of all tables of a schema, except those of a parent surface, which are the same as of any
+/// surface.
 fn tables(table: &Value, path: &str, found: &mut BTreeSet<String>) {
     for form in forms(table) {
         for (name, value) in form["properties"].as_object().into_iter().flatten() {
@@ -87,7 +88,7 @@ fn unit(key: &str) -> &'static str {
     UNITS.iter().find(|(ending, _)| key.ends_with(ending)).map_or("", |(_, unit)| unit)
 }
 
-/// A number as a person writes it.
+/// Returns a number as a person writes it.
 fn number(value: &Value) -> String {
     let text = value.to_string();
     text.strip_suffix(".0").map_or(text.clone(), str::to_owned)
@@ -101,7 +102,7 @@ fn shown(value: &Value) -> String {
     }
 }
 
-/// The words that a key may be, if it is a choice among words.
+/// Returns the allowed words of a key, if it is a choice among words.
 fn choices(value: &Value) -> Option<Vec<&str>> {
     if let Some(words) = value.get("enum").and_then(Value::as_array) {
         return words.iter().map(Value::as_str).collect();
@@ -109,7 +110,7 @@ fn choices(value: &Value) -> Option<Vec<&str>> {
     value.get("oneOf")?.as_array()?.iter().map(|one| one["const"].as_str()).collect()
 }
 
-/// What a key may be.
+/// Returns the allowed values of a key, as text.
 fn limits(value: &Value) -> String {
     if let Some(words) = choices(value) {
         return words.iter().map(|word| format!("`\"{word}\"`")).collect::<Vec<_>>().join(", ");
@@ -160,11 +161,11 @@ fn words(value: &Value) -> String {
     let of = |one: &Value| Some(format!("`\"{}\"`: {}", one["const"].as_str()?, one["description"].as_str()?));
     let chosen: Vec<String> = chosen.filter_map(of).map(|words| words.trim_end_matches('.').to_owned()).collect();
     let all = if chosen.is_empty() { said } else { format!("{said} {}.", chosen.join("; ")) };
-    // A bar would end the cell of the list.
+    // A bar would end the cell of the table.
     all.replace('\n', " ").replace('|', "\\|")
 }
 
-/// The list of the keys of a table, or of each of its forms.
+/// Returns the list of the keys of a table, or of each of its forms.
 fn list_of(table: &Value) -> String {
     let mut text = String::new();
     let forms = forms(table);
@@ -220,7 +221,7 @@ fn alarms() -> String {
     text
 }
 
-/// Makes what stands between two markers.
+/// Generates the text between two markers.
 fn make(what: &str) -> String {
     match what.split_once(' ') {
         None if what == "alarms" => alarms(),
@@ -233,7 +234,7 @@ fn make(what: &str) -> String {
     }
 }
 
-/// Returns a page with everything made anew, and what it has.
+/// Returns a page with all generated parts updated, and the names of these parts.
 fn made_anew(text: &str) -> (String, Vec<String>) {
     let (mut anew, mut found) = (String::new(), Vec::new());
     let mut rest = text;

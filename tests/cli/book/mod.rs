@@ -1,5 +1,5 @@
-//! The book in docs/: every command of its pages is typed, what its screens show is awaited, its examples are checked, and what is made from
-//! the program stands in it as the program has it.
+//! Tests of the book in docs/: every command of its pages runs, its screens are compared with the output, its examples
+//! are checked, and its generated parts match the program.
 
 mod made;
 mod pages;
@@ -23,10 +23,10 @@ fn text_of(page: &str) -> String {
 
 /// A fenced block of a page.
 struct Block {
-    /// The words behind the fence: the language, and for `sh` and `text` which terminal.
+    /// Words after the fence: the language, and for `sh` and `text` the terminal.
     info: Vec<String>,
     text: String,
-    /// Where it begins, from 1.
+    /// First line of the block, counted from 1.
     line: usize,
 }
 
@@ -36,7 +36,7 @@ impl Block {
     }
 }
 
-/// The fenced blocks of a page, in their order.
+/// Returns the fenced blocks of a page, in order.
 fn blocks(page: &str) -> Vec<Block> {
     let mut found = Vec::new();
     let mut open: Option<Block> = None;

@@ -1,7 +1,8 @@
-//! The pages, typed. A block `sh` is typed as it stands, in a folder with what ships; `sh second` in a second terminal beside it. A block
-//! `text` behind one is what its screen shows, where `...` stands for anything; a command that goes on is left to itself once that was seen,
-//! until its terminal is typed in again. A block `toml` that begins with the name of a file is that file; any other one takes the place of the
-//! same tables of a recipe or a cell file, and is checked. Blocks `console` need what a test has not, and are not typed.
+//! Runs the pages. A block `sh` runs unchanged, in a folder with the shipped files; `sh second` runs in a second
+//! terminal in parallel. A block `text` after it is the expected screen, in which `...` matches anything. A command
+//! that is still running then continues, until the page types into its terminal again. A block `toml` that begins with
+//! the name of a file is that file. Any other one replaces the same tables of a recipe or a cell file, and is checked.
+//! Blocks `console` need something that a test does not have, and are not run.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,10 +13,11 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use super::terminal::Terminal;
 use super::{blocks, root, text_of};
 
-/// The ports of machines and pages in the book, which are some that are free where it is typed.
+/// Ports of machines and pages in the book. The test replaces them with free ports.
 const PORTS: [&str; 2] = ["15021", "15022"];
 
-/// A port at which nothing listens, that the system gives to nobody by itself, and that is kept from other tests meanwhile.
+/// Port on which nothing listens, which the system does not assign by itself, and which is reserved against other
+/// tests.
 struct FreePort {
     port: u16,
     _kept: fs::File,
@@ -35,7 +37,7 @@ impl FreePort {
     }
 }
 
-/// A folder with the recipes and the cells that ship.
+/// Returns a folder with the shipped recipes and cells.
 fn shop() -> tempfile::TempDir {
     let home = tempfile::tempdir().unwrap();
     for folder in ["config", "recipes"] {
@@ -48,13 +50,13 @@ fn shop() -> tempfile::TempDir {
     home
 }
 
-/// The name that stands above a file.
+/// Returns the file name at the top of a block.
 fn file_name(block: &str) -> Option<&str> {
     let name = block.lines().next()?.strip_prefix("# ")?;
     (name.ends_with(".toml") && !name.contains(' ')).then_some(name)
 }
 
-/// Puts the tables of a fragment into the place of those of a file: the keys of a table replace all of its keys.
+/// Replaces tables of a file by those of a fragment: the keys of a table replace all of its keys.
 fn put(into: &mut toml::Table, from: toml::Table) {
     if from.contains_key("file") {
         into.clear();
@@ -69,7 +71,7 @@ fn put(into: &mut toml::Table, from: toml::Table) {
     }
 }
 
-/// Writes the shipped file that a fragment is one of, with its tables.
+/// Writes the shipped file to which a fragment belongs, with the fragment's tables.
 fn whole(fragment: &str, home: &Path) -> PathBuf {
     let tables: toml::Table = fragment.parse().unwrap_or_else(|e| panic!("{e}\n{fragment}"));
     let is_cell = tables.keys().all(|name| ["cell", "cmm", "grinder"].contains(&name.as_str()));
@@ -121,14 +123,14 @@ fn type_page(page: &str) {
         }
     }
     terminals.values_mut().for_each(Terminal::until_it_ends);
-    // What is still under way is ended, and what was made is kept for who proves it.
+    // End what is still running, and keep the generated files for the checks.
     drop(terminals);
     crate::keep::keep(home.path());
 }
 
 macro_rules! typed {
     ($($name:ident: $page:literal)+) => {
-        /// The pages that are typed here.
+        /// Pages that are typed in this test.
         pub(super) const TYPED: &[&str] = &[$($page),+];
 
         $(

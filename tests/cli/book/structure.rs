@@ -1,4 +1,4 @@
-//! How the pages hang together.
+//! Tests of the links between the pages.
 
 use std::fs;
 use std::path::PathBuf;
@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use super::pages::TYPED;
 use super::{blocks, path_of, root, text_of};
 
-/// The links of a page to other places of this repository.
+/// Returns the links of a page to other places of this repository.
 fn links(text: &str) -> Vec<String> {
     let mut found = Vec::new();
     let mut in_block = false;
@@ -18,7 +18,7 @@ fn links(text: &str) -> Vec<String> {
     found
 }
 
-/// The name by which a heading is linked to.
+/// Returns the anchor of a heading.
 fn anchor(heading: &str) -> String {
     let kept = |c: &char| c.is_alphanumeric() || matches!(c, ' ' | '-' | '_');
     heading.trim().to_lowercase().chars().filter(kept).map(|c| if c == ' ' { '-' } else { c }).collect()
@@ -36,7 +36,7 @@ fn anchors(text: &str) -> Vec<String> {
     found
 }
 
-/// The pages that the summary lists.
+/// Returns the pages that the summary lists.
 fn listed() -> Vec<String> {
     links(&text_of("SUMMARY.md"))
 }
@@ -78,7 +78,7 @@ fn next_to_nothing_is_left_untyped() {
             let known = ["sh", "text", "toml", "console", "csv", "json"];
             let plain = block.info.is_empty();
             assert!(plain || known.iter().any(|word| block.is(word)), "{page}:{}: {:?}", block.line, block.info);
-            // A formula is no command.
+            // A formula is not a command.
             assert!(!plain || !block.text.contains("regrind "), "{page}:{}", block.line);
             untyped += usize::from(block.is("console"));
         }

@@ -1,4 +1,4 @@
-//! A terminal in which a page is typed line by line, and what is seen there.
+//! Terminal in which a page is typed line by line, with its output.
 
 use std::ffi::OsString;
 use std::io::{BufRead, BufReader, Read};
@@ -9,12 +9,12 @@ use std::time::{Duration, Instant};
 
 use crate::program::PATIENCE;
 
-/// A command that was typed and has not been waited for yet.
+/// Command that was typed and not yet waited for.
 struct Typed {
     line: String,
     child: Child,
     lines: Receiver<String>,
-    /// The exit code with which it ends, as the page says behind the command; 0 where it says none.
+    /// Expected exit code, as the page gives it after the command; 0 if it gives none.
     code: i32,
 }
 
@@ -22,9 +22,9 @@ pub struct Terminal {
     home: PathBuf,
     folder: PathBuf,
     typed: Option<Typed>,
-    /// What it has shown since the last block was begun; what a screen of the page has shown is taken away.
+    /// Output since the start of the last block, without the lines that a screen of the page has already matched.
     shown: Vec<String>,
-    /// The same, for whoever looks why a test failed.
+    /// The same output in full, for the message of a failed test.
     log: Vec<String>,
 }
 
@@ -33,7 +33,7 @@ impl Terminal {
         Self { home: home.to_owned(), folder: home.to_owned(), typed: None, shown: Vec::new(), log: Vec::new() }
     }
 
-    /// Types a block: each line once the one before has ended. The last one is left to itself.
+    /// Types a block: each line after the one before has ended. The last one continues to run.
     pub fn types(&mut self, block: &str) {
         self.shown.clear();
         for line in commands(block) {
@@ -55,7 +55,7 @@ impl Terminal {
         path.push(std::env::var_os("PATH").unwrap_or_default());
         let mut command = Command::new("bash");
         command.args(["-c", line]).current_dir(&self.folder).env("PATH", path);
-        // A user of its own, who has no key and no settings.
+        // A separate user without a key and without settings.
         command.env_remove("REGRIND_KEY");
         for name in ["HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_STATE_HOME"] {
             command.env(name, self.home.join(".home"));
@@ -79,7 +79,7 @@ impl Terminal {
         self.shown.push(line);
     }
 
-    /// Waits for every line of a screen of the page; `^C` is pressed when the lines before it were seen.
+    /// Waits for every line of a screen of the page. Presses `^C` after the lines before it have appeared.
     pub fn shows(&mut self, screen: &str) {
         let began = Instant::now();
         for expected in screen.lines().filter(|line| !line.trim().is_empty() && line.trim() != "...") {
@@ -99,7 +99,7 @@ impl Terminal {
         }
     }
 
-    /// Takes away the first line that is as expected.
+    /// Removes the first line that matches the expected one.
     fn takes(&mut self, expected: &str) -> bool {
         let found = self.shown.iter().position(|line| fits(line, expected));
         found.map(|k| self.shown.remove(k)).is_some()
@@ -109,7 +109,7 @@ impl Terminal {
     fn interrupt(&self) {
         let typed = self.typed.as_ref().expect("a command that goes on");
         let began = Instant::now();
-        // No person is as fast as to come before it listens.
+        // A person is never fast enough to press it before the program handles it.
         while !heeds_interrupts(typed.child.id()) && began.elapsed() < PATIENCE {
             std::thread::park_timeout(Duration::from_millis(5));
         }
@@ -117,7 +117,7 @@ impl Terminal {
         assert!(done.success());
     }
 
-    /// Waits for the end of what was typed, which must be as the page says.
+    /// Waits for the end of the typed command, whose exit code must match the page.
     pub fn until_it_ends(&mut self) {
         let Some(mut typed) = self.typed.take() else { return };
         let began = Instant::now();
@@ -143,14 +143,14 @@ impl Terminal {
 impl Drop for Terminal {
     fn drop(&mut self) {
         if let Some(typed) = &mut self.typed {
-            // It may have ended meanwhile.
+            // The process has possibly ended already.
             let _ = typed.child.kill();
             let _ = typed.child.wait();
         }
     }
 }
 
-/// Whether a process would hear Ctrl-C; where the system does not tell, it is taken to.
+/// Returns true if a process handles Ctrl-C, or if the system does not report it.
 fn heeds_interrupts(id: u32) -> bool {
     let Ok(status) = std::fs::read_to_string(format!("/proc/{id}/status")) else { return true };
     let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:"));
@@ -159,7 +159,7 @@ fn heeds_interrupts(id: u32) -> bool {
     caught.is_none_or(|mask| mask & 0b10 != 0)
 }
 
-/// The commands of a block: a line each, which goes on behind a backslash and within quotes.
+/// Returns the commands of a block, one per line. A backslash at the end or an open quote continues the line.
 fn commands(block: &str) -> Vec<String> {
     let mut found: Vec<String> = Vec::new();
     let mut open = String::new();
@@ -175,7 +175,7 @@ fn commands(block: &str) -> Vec<String> {
     found
 }
 
-/// Whether a line is as a screen of the page has it, where `...` stands for any characters.
+/// Returns true if a line matches a line of the page, in which `...` matches any characters.
 fn fits(line: &str, expected: &str) -> bool {
     let mut pieces = expected.trim().split("...");
     let line = line.trim();

@@ -1,4 +1,4 @@
-//! A driver, the simulated server before the true part, and jobs between them.
+//! Test bench: a driver, the simulated server with the true part, and jobs between them.
 
 use std::time::{Duration, Instant};
 
@@ -17,7 +17,7 @@ use regrind_sim::world::World;
 
 pub const RADIUS_MM: f64 = 1.5;
 
-/// Longer than anything takes on a computer that is busy.
+/// Timeout longer than anything takes on a busy computer.
 const LONG: Duration = Duration::from_secs(60);
 
 pub struct Bench {
@@ -27,7 +27,7 @@ pub struct Bench {
     pub cmm: IppdmeCmm,
 }
 
-/// Limits that nothing meets by chance.
+/// Returns limits that no delay reaches by chance.
 pub fn patient() -> Limits {
     Limits {
         answer: Duration::from_secs(20),
@@ -38,7 +38,7 @@ pub fn patient() -> Limits {
     }
 }
 
-/// Limits for what never comes.
+/// Returns limits for answers that never come.
 pub fn hasty() -> Limits {
     let short = Duration::from_millis(400);
     Limits { answer: short, completion: short, abort: short, ..patient() }
@@ -63,7 +63,7 @@ pub fn settings(port: u16, limits: Limits) -> IppdmeSettings {
 }
 
 impl Bench {
-    /// A cell whose machine's time runs so much faster than ours.
+    /// Returns a cell whose machine's time runs at this multiple of real time.
     pub async fn new(speed: f64, limits: Limits) -> Self {
         Self::with(speed, limits, Options::default()).await
     }
@@ -81,12 +81,12 @@ impl Bench {
         Self { world, faults, serving, cmm }
     }
 
-    /// Another program that takes the machine up.
+    /// Returns another program's connection to the machine.
     pub fn another(&self) -> IppdmeCmm {
         IppdmeCmm::new(settings(self.serving.local_addr().port(), patient()))
     }
 
-    /// A plan of so many targets on the part, in an order that is not a short one.
+    /// Returns a plan with this number of targets on the part, in an order that is not a short path.
     pub fn plan(&self, count: u32) -> Plan {
         let target = |index: u32| {
             let k = (index * 7) % count;
@@ -105,13 +105,13 @@ impl Bench {
         }
     }
 
-    /// Meets the machine, brings a plan there and begins it.
+    /// Connects to the machine, transfers a plan and begins it.
     pub async fn begin(&mut self, plan: &Plan) -> Result<Armed, DeviceError> {
         self.cmm.connect().await?;
         begin(&mut self.cmm, plan).await
     }
 
-    /// Every point that was touched is one of the part as it is.
+    /// Asserts that every touched point lies on the true part.
     pub fn are_true(&self, plan: &Plan, measurement: &Measurement) {
         assert_eq!(measurement.points.len(), plan.targets.len());
         for (point, target) in measurement.points.iter().zip(&plan.targets) {
@@ -139,7 +139,7 @@ pub async fn begin(cmm: &mut IppdmeCmm, plan: &Plan) -> Result<Armed, DeviceErro
     Ok(armed)
 }
 
-/// Looks until the machine is as it should be; an error of the wire ends it.
+/// Polls until the status satisfies the condition; a communication error ends it.
 pub async fn until(cmm: &mut IppdmeCmm, is_so: impl Fn(&Status) -> bool) -> Result<Status, DeviceError> {
     let began = Instant::now();
     loop {
@@ -152,12 +152,12 @@ pub async fn until(cmm: &mut IppdmeCmm, is_so: impl Fn(&Status) -> bool) -> Resu
     }
 }
 
-/// Looks until nothing moves any more.
+/// Polls until nothing moves any more.
 pub async fn until_still(cmm: &mut IppdmeCmm) -> Result<Status, DeviceError> {
     until(cmm, |status| !status.state.moves()).await
 }
 
-/// Looks until so many points are there.
+/// Polls until this number of points is present.
 pub async fn until_points(cmm: &mut IppdmeCmm, count: u32) {
     until(cmm, |status| status.progress.is_some_and(|(done, _)| done >= count)).await.unwrap();
 }

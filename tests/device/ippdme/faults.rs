@@ -1,4 +1,4 @@
-//! Everything that goes wrong on the wire: no wrong point is taken, and nothing hangs.
+//! Every communication fault: no wrong point is accepted, and nothing hangs.
 
 use std::time::Duration;
 
@@ -11,7 +11,7 @@ use super::bench::{Bench, hasty, job, patient, until, until_points, until_still}
 
 const FAST: f64 = 5000.0;
 
-/// A job in which something goes wrong at the third touch.
+/// Runs a job with a fault at the third touch.
 async fn touching(fault: Fault, limits: regrind::device::ippdme::Limits) -> (Bench, Result<Status, DeviceError>) {
     going_wrong("PtMeas", 2, fault, limits).await
 }
@@ -32,7 +32,7 @@ async fn going_wrong(
     (bench, ended)
 }
 
-/// The job came to its end all the same, with true points.
+/// Asserts that the job finished anyway, with true points.
 async fn is_measured(bench: &mut Bench, ended: Result<Status, DeviceError>) {
     let status = ended.unwrap();
     assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
@@ -41,12 +41,13 @@ async fn is_measured(bench: &mut Bench, ended: Result<Status, DeviceError>) {
     bench.are_true(&plan, &measurement);
 }
 
-/// The wire was given up; met again, the machine stands, the job is held, and a resume brings the points that are missing.
+/// Asserts that the connection was given up; after a new connection, the machine is at rest, the job is held, and a
+/// resume brings the missing points.
 async fn is_taken_up(bench: &mut Bench, ended: Result<Status, DeviceError>) {
     let error = ended.unwrap_err();
     assert!(error.is_link(), "{error}");
     let plan = bench.plan(8);
-    // Which command hasty limits ran out for is no matter here: met again as often as it takes.
+    // It does not matter for which command the short timeout expired: reconnect until it succeeds.
     for _ in 0..20 {
         if bench.cmm.connect().await.is_err() {
             continue;
@@ -131,7 +132,7 @@ async fn a_connection_that_ends_in_a_job_loses_no_point() {
     bench.cmm.connect().await.unwrap();
     let armed = regrind::device::Armed { job: job(&plan), start_sequence: 1, token: 0, boot_id: 0 };
     let Reconciled::Running(status) = bench.cmm.reconcile(&armed).await.unwrap() else { panic!() };
-    // The third touch was made, but not said to be over.
+    // The third touch was made, but its end was not reported.
     assert_eq!((status.state, status.progress, status.clear_of_part), (State::Held, Some((2, 8)), None));
     bench.cmm.resume().await.unwrap();
     let ended = until_still(&mut bench.cmm).await;
@@ -167,7 +168,7 @@ async fn an_emergency_stop_between_jobs_is_seen() {
 #[tokio::test]
 async fn a_stop_that_a_server_only_warns_of_stops_all_the_same() {
     let mut bench = Bench::new(FAST, patient()).await;
-    // Out of the volume of the machine, which is smaller than the cell file has it.
+    // Outside the volume of the machine, which is smaller than in the cell file.
     bench.faults.add("GoTo", 0, Fault::Severity(1));
     let mut plan = bench.plan(3);
     for target in &mut plan.targets {

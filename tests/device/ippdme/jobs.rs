@@ -1,4 +1,4 @@
-//! Jobs from their beginning to their end, and what people and crashes do to them.
+//! Jobs from their beginning to their end, with interventions of people and crashes.
 
 use regrind::device::{
     Careful, Cmm, DeviceError, Interrupt, IppdmeCmm, Machine, Outcome, Plan, PointStatus, Reconciled, State,
@@ -9,9 +9,9 @@ use regrind_sim::wire::dme::ServingDme;
 
 use super::bench::{Bench, begin, is, job, patient, settings, until, until_points, until_still};
 
-/// So fast that a touch takes about a millisecond.
+/// Speed at which a touch takes about a millisecond.
 const FAST: f64 = 5000.0;
-/// So slow that a job of twenty touches is still running when it is told something.
+/// Speed at which a job of twenty touches is still running when the next command arrives.
 const SLOW: f64 = 50.0;
 
 #[tokio::test]
@@ -34,7 +34,7 @@ async fn a_plan_is_measured_and_its_points_are_those_of_the_part() {
 async fn the_part_in_a_frame_of_its_own_gives_the_same_points() {
     let bench = Bench::new(FAST, patient()).await;
     let plan = bench.plan(10);
-    // The part's frame is that of the machine here, once by numbers that do nothing and once turned all the way round.
+    // The part's frame equals that of the machine here, once by zeros and once by a full turn.
     for part_frame in [Some([0.0; 6]), Some([0.0, 0.0, 0.0, 0.0, 200.0, 160.0])] {
         let port = bench.serving.local_addr().port();
         let mut cmm = IppdmeCmm::new(regrind::device::IppdmeSettings { part_frame, ..settings(port, patient()) });
@@ -106,7 +106,7 @@ async fn an_abort_ends_it_where_it_is_and_the_machine_can_be_used_again() {
     assert_eq!(bench.cmm.abort().await.unwrap().state, State::Aborting);
     let status = until_still(&mut bench.cmm).await.unwrap();
     assert_eq!((status.state, status.outcome, status.clear_of_part), (State::Aborted, Outcome::Aborted, None));
-    // Nothing of it is left at the server.
+    // Nothing of the job remains at the server.
     assert_eq!(bench.serving.with(|server| server.due()), None);
     assert_eq!(bench.cmm.clear().await.unwrap().state, State::Idle);
     bench.cmm.prepare(job(&plan)).await.unwrap();
@@ -200,7 +200,7 @@ async fn targets_that_are_missed_are_tried_again_and_then_told() {
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
     bench.are_true(&plan, &measurement);
     let missed = measurement.points.iter().filter(|point| point.status == PointStatus::NotFound).count();
-    // Half of the first tries, and a quarter of both.
+    // Half of the first tries, and a quarter after the second ones.
     assert!((1..15).contains(&missed), "{missed}");
 }
 

@@ -1,4 +1,4 @@
-//! The driver of I++ DME against servers at the far end of its wire.
+//! Tests of the I++ DME driver against servers at the far end of its connection.
 
 mod bench;
 mod faults;

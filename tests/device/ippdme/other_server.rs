@@ -1,4 +1,5 @@
-//! Against a server that was written in another language, from the facts of the standard alone (server.py): a cap of a sphere.
+//! Test against a server that was written in another language, from the facts of the standard alone (server.py): a cap
+//! of a sphere.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -12,7 +13,7 @@ struct Python(Child);
 
 impl Drop for Python {
     fn drop(&mut self) {
-        // It may have ended by itself.
+        // The process has possibly ended by itself.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
@@ -38,7 +39,7 @@ async fn a_cap_of_a_sphere_is_measured() {
     let target = |index: u32| {
         let (tilt, turn) = (0.02 * f64::from(index), 2.4 * f64::from(index));
         let normal = [tilt.sin() * turn.cos(), tilt.sin() * turn.sin(), tilt.cos()];
-        // A little off the surface, as a real part is.
+        // A little off the surface, like a real part.
         let point_mm = [60.01 * normal[0], 60.01 * normal[1], 60.01 * normal[2] - 50.0];
         Target { index, what: TargetKind::Part, point_mm, normal }
     };

@@ -1,4 +1,4 @@
-//! Rows that are scanned: their points are those of the part, each at its target, and whatever goes wrong brings no wrong one.
+//! Scanned rows: their points lie on the part, each at its target, and no fault brings a wrong one.
 
 use regrind::device::{
     Cmm, DeviceError, Fault as MachineFault, Interrupt, IppdmeCmm, Machine, Outcome, Plan, PointStatus, Scanning,
@@ -20,7 +20,7 @@ async fn scanning(speed: f64, cmm: CmmSpec) -> Bench {
     bench
 }
 
-/// Three rows of twelve targets, there and back, and one target by itself.
+/// Returns a plan of three rows of twelve targets, back and forth, and one single target.
 fn rows(bench: &Bench) -> Plan {
     let row = |k: u32| {
         (0..12).map(move |i| (f64::from(if k.is_multiple_of(2) { i } else { 11 - i }) - 5.5, 3.0 * f64::from(k)))
@@ -57,7 +57,7 @@ async fn is_measured(bench: &mut Bench, ended: Result<Status, DeviceError>) {
 async fn rows_are_scanned_and_each_point_lies_at_its_target() {
     let (mut bench, ended) = going_wrong(None).await;
     is_measured(&mut bench, ended).await;
-    // One begins, however many points it brings: three rows and a touch, where touches alone are 37.
+    // A scan counts as one contact, however many points it brings: three rows and a touch, compared with 37 touches.
     assert_eq!(bench.serving.with(|server| server.machine().contacts()), 4);
 }
 
@@ -75,7 +75,7 @@ async fn lines_that_come_twice_or_byte_for_byte_are_one() {
     }
 }
 
-/// A scan that is not what was asked for: nothing of it is taken, and the machine stands.
+/// Asserts that a scan with this fault is rejected completely, and that the machine is at rest.
 async fn is_refused(fault: Fault, says: &str) {
     let (bench, ended) = going_wrong(Some(fault)).await;
     let status = ended.unwrap();
@@ -120,7 +120,7 @@ async fn a_row_that_loses_the_surface_is_touched() {
     bench.are_true(&plan, &measurement);
 }
 
-/// A job in its second row, which takes as long as a real one.
+/// Returns a job in its second row, which takes as long as a real one.
 async fn in_the_second_row(speed_mm_s: f64) -> Bench {
     let mut bench = scanning(FAST, CmmSpec::perfect()).await;
     let mut settings = settings(bench.serving.local_addr().port(), patient());
@@ -136,7 +136,7 @@ async fn in_the_second_row(speed_mm_s: f64) -> Bench {
 
 #[tokio::test]
 async fn a_hold_in_a_scan_begins_no_other_row_until_it_is_resumed() {
-    // The row goes to its end in some five seconds.
+    // The row ends after about five seconds.
     let mut bench = in_the_second_row(10.0).await;
     assert_eq!(bench.cmm.hold().await.unwrap().state, State::Holding);
     let held = until_still(&mut bench.cmm).await.unwrap();
@@ -154,7 +154,7 @@ async fn an_abort_in_a_scan_ends_it_there() {
     bench.cmm.abort().await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
     assert_eq!((status.state, status.outcome, status.clear_of_part), (State::Aborted, Outcome::Aborted, None));
-    // The row that was over before is there, and nothing of this one; nothing of it is left at the server.
+    // The row that was finished before is present, and nothing of this one. Nothing of this one remains at the server.
     assert_eq!(status.progress, Some((12, 37)));
     let left = bench.serving.with(|server| (server.due(), server.machine().contacts()));
     assert_eq!(left, (None, 2));

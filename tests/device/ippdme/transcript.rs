@@ -1,4 +1,4 @@
-//! What goes over the wire, line for line, against a server that answers by a list.
+//! Traffic on the wire, line for line, against a server that answers from a list.
 
 use std::sync::{Arc, Mutex};
 
@@ -8,13 +8,14 @@ use tokio::net::{TcpListener, TcpStream};
 
 use super::bench::{begin, job, patient, settings, until, until_still};
 
-/// The lines of a client.
+/// Lines of a client.
 type Heard = Arc<Mutex<Vec<String>>>;
 
-/// Instead of an answer: the connection ends.
+/// Pseudo-answer after which the connection ends.
 const HANGS_UP: &str = "hangs up";
 
-/// Answers each command by what stands for its beginning; nothing at all where that is `None`. Its clients come one after the other.
+/// Answers each command by the entry for its beginning; not at all if that is `None`. Clients are served one after the
+/// other.
 async fn canned(answers: fn(&str) -> Option<&'static str>) -> (u16, Heard) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -33,7 +34,7 @@ async fn attend(stream: TcpStream, answers: fn(&str) -> Option<&'static str>, he
     let mut lines = BufReader::new(reading).lines();
     while let Ok(Some(line)) = lines.next_line().await {
         let (tag, said) = line.split_once(' ').unwrap();
-        // A look at an idle machine comes when it comes.
+        // Polls of an idle machine come at any time.
         let is_look = said == "GetErrStatusE()";
         if !is_look {
             heard.lock().unwrap().push(line.clone());
@@ -125,7 +126,7 @@ async fn a_session_is_written_as_the_standard_has_it() {
 
 #[tokio::test]
 async fn an_abort_goes_out_while_a_motion_is_not_over() {
-    // The server never says that the motion is over, and takes the abort all the same.
+    // The server never reports the end of the motion, but accepts the abort.
     let (port, heard) = canned(|said| if said.starts_with("GoTo") { None } else { answers(said) }).await;
     let mut cmm = IppdmeCmm::new(settings(port, patient()));
     cmm.connect().await.unwrap();

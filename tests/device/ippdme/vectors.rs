@@ -1,4 +1,5 @@
-//! The lines of the NIST test suite: the good ones come back, the bad ones are refused by the number that stands beside them.
+//! Lines of the NIST test suite: the good ones are parsed and written back, the bad ones are refused with the number
+//! listed for them.
 
 use std::path::PathBuf;
 
@@ -21,12 +22,13 @@ fn files(extension: &str) -> Vec<(String, String)> {
     paths.into_iter().map(read).collect()
 }
 
-/// The strings of a file: a line of two backslashes stands for the end of a line on the wire, a colon for the end of the file.
+/// Returns the strings of a file: a line of two backslashes represents the end of a line on the wire, a colon the end
+/// of the file.
 fn lines(text: &str) -> impl Iterator<Item = &str> {
     text.lines().map(|line| line.trim_end_matches('\r')).filter(|line| !matches!(*line, "\\\\" | ":" | ""))
 }
 
-/// A refused line, and the number that stands two lines below it.
+/// Returns the refused lines, each with the number that is two lines below it.
 fn refused(text: &str) -> Vec<(&str, u16)> {
     let lines: Vec<&str> = text.lines().map(|line| line.trim_end_matches('\r')).collect();
     let number = |line: &str| (line.trim().len() == 4).then(|| line.trim().parse().ok()).flatten();
@@ -101,7 +103,7 @@ fn every_answer_is_read() {
 #[ignore = "needs the real measurements that REGRIND_DATA names"]
 fn no_broken_number_becomes_a_value() {
     for (_, answers) in files("res").iter().filter(|(name, _)| name == "numbersErrorRes") {
-        // A number of more digits than the standard has is a number all the same.
+        // A number with more digits than the standard allows is still a number.
         let broken = lines(answers).filter(|line| !line.contains("12345678901234567"));
         for line in broken {
             assert!(Response::read(line).is_err(), "{line}");

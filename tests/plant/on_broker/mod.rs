@@ -1,4 +1,4 @@
-//! The live values of a cell on a real broker, as an independent host of Sparkplug B sees them.
+//! Live values of a cell on a real broker, as an independent host of Sparkplug B sees them.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -14,7 +14,7 @@ use crate::only_run;
 use crate::peers::Peer;
 use crate::program::{Running, regrind, run, small_recipe};
 
-/// A cell that is told to a broker, and a host that listens there.
+/// Cell that publishes to a broker, and a host that listens there.
 struct Told {
     home: TempDir,
     broker: Broker,
@@ -45,12 +45,12 @@ fn listens(host: &mut Peer, from: usize) {
     host.until(from, "subscription", |said| said.iter().any(|line| line["listens"] == true).then_some(()));
 }
 
-/// Waits for a message of a kind from a place on.
+/// Waits for a message of a kind after a position.
 fn heard(host: &mut Peer, from: usize, kind: &str) -> Value {
     host.until(from, kind, |said| said.iter().find(|line| line["heard"] == kind).cloned())
 }
 
-/// What the host takes for the values, after all that it heard.
+/// Returns the values that the host has after all messages that it received.
 fn values(said: &[Value]) -> serde_json::Map<String, Value> {
     let mut values = serde_json::Map::new();
     for line in said {
@@ -64,7 +64,7 @@ fn values(said: &[Value]) -> serde_json::Map<String, Value> {
     values
 }
 
-/// Waits until a value is told; returns all values as they were then.
+/// Waits until a value is published; returns all values at that moment.
 fn until_value(host: &mut Peer, name: &str, wanted: &Value) -> serde_json::Map<String, Value> {
     host.until(0, &format!("{name} = {wanted}"), |said| {
         let told = (0..said.len()).find(|last| said[*last]["metrics"].get(name) == Some(wanted));
@@ -170,7 +170,7 @@ fn births_and_deaths_come_through_the_end_of_the_broker_and_of_who_tells() {
     teller.line("that nobody is told", |line| line.contains("\"waits\""));
     told.broker.go_on();
     listens(&mut told.host, from);
-    // The host asks who is there, as one does that may have missed the birth.
+    // The host requests a rebirth, as one does that has possibly missed the birth.
     told.host.does(&json!({ "name": "Node Control/Rebirth", "type": "BOOLEAN", "value": true }));
     assert_eq!(heard(&mut told.host, from, "NBIRTH")["metrics"]["bdSeq"], 1);
 
@@ -181,7 +181,7 @@ fn births_and_deaths_come_through_the_end_of_the_broker_and_of_who_tells() {
     let mut teller = told.tell();
     assert_eq!(heard(&mut told.host, from, "NBIRTH")["metrics"]["bdSeq"], 2);
 
-    // Two tell the same cell by turns, not against each other.
+    // Two publishers of the same cell take turns instead of interfering.
     let mut second = told.tell();
     let from = told.host.place();
     teller.signal("TERM");
@@ -218,7 +218,7 @@ fn a_run_is_told_beside_it_and_one_whose_program_has_gone_is_not_called_idle() {
         (&values["Figures/PV"], &values["Status/StateName"], &values["Last Run/Name"]),
         (&Value::Null, &Value::Null, &json!(name))
     );
-    // Nor after somebody has looked at another run, or made a folder.
+    // Nor after a report of another run, or after a new folder.
     let (code, _, errors) = run(&["report", &format!("runs/{name}")], told.home.path());
     assert_eq!(code, 0, "{errors}");
     fs::create_dir(told.home.path().join("runs/empty")).unwrap();

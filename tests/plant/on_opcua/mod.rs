@@ -1,4 +1,4 @@
-//! The live values of a cell by OPC UA, as an independent client sees them.
+//! Live values of a cell by OPC UA, as an independent client sees them.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use crate::held::{held_run, until_recorded};
 use crate::peers::Peer;
 use crate::program::{Running, regrind, run};
 
-/// What the client asks for all the time.
+/// Values that the client polls all the time.
 const LOOKED_AT: [&str; 3] = ["Status/StateCurrent", "Message", "Figures/PV"];
 
 fn home() -> TempDir {
@@ -20,7 +20,7 @@ fn home() -> TempDir {
     home
 }
 
-/// Begins to tell; returns where.
+/// Starts publishing; returns the address.
 fn tell(home: &Path) -> (Running, String) {
     let mut teller = Running::new(regrind(&["tell", "--plant", "plant.toml", "--json"], home));
     let line = teller.line("address", |line| line.contains("\"tells\""));
@@ -34,7 +34,7 @@ fn client(home: &Path, url: &str) -> Peer {
     client
 }
 
-/// Waits for an answer of a kind from a place on.
+/// Waits for an answer of a kind after a position.
 fn answer(client: &mut Peer, from: usize, kind: &str) -> Value {
     client.until(from, kind, |said| {
         let ended = said.iter().find(|line| !line["ended"].is_null());
@@ -219,7 +219,7 @@ fn a_server_that_was_killed_is_found_again_and_tells_what_is_so() {
     teller.signal("KILL");
     answer(&mut first, 0, "lost");
 
-    // At the same address: a client looks where it looked before.
+    // At the same address, because the client reconnects to it.
     let address = url.trim_start_matches("opc.tcp://").trim_end_matches('/');
     let text = fs::read_to_string(home.path().join("plant.toml")).unwrap().replace("127.0.0.1:0", address);
     fs::write(home.path().join("plant.toml"), text).unwrap();

@@ -1,4 +1,4 @@
-//! A plant that is brought back from its backup on another computer is evidence as before, and its cells go on with it.
+//! Restoring a plant from its backup on another computer: it is evidence as before, and its cells continue with it.
 
 use std::fs;
 use std::io::Write;
@@ -14,7 +14,7 @@ fn a_plant_comes_back_from_its_backup() {
     let mut plant = Plant::new();
     let (_, name) = made(&plant);
     plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
-    // As docs/plant.md says it: the roles, and the database.
+    // As docs/plant.md describes it: the roles, and the database.
     let roles = plant.postgres.tool("pg_dumpall").arg("--globals-only").output().unwrap();
     let dump = plant.path("regrind.dump");
     let dumped = plant
@@ -36,12 +36,12 @@ fn a_plant_comes_back_from_its_backup() {
         .spawn()
         .unwrap();
     psql.stdin.take().unwrap().write_all(&roles.stdout).unwrap();
-    // The owner is there already, which is told and does not matter.
+    // The owner exists already. The error message does not matter.
     psql.wait().unwrap();
     let restored = other.tool("pg_restore").args(["--dbname=regrind", "--exit-on-error"]).arg(&dump).output().unwrap();
     assert!(restored.status.success(), "{}", String::from_utf8_lossy(&restored.stderr));
 
-    // The plant files lead to the other computer; nothing else is changed.
+    // The plant files point to the other computer; nothing else is changed.
     let [from, to] = [&plant.postgres, &other].map(|server| server.socket().display().to_string());
     for file in ["owner.toml", "cell-1.toml"] {
         let text = fs::read_to_string(plant.path(file)).unwrap();
@@ -53,6 +53,6 @@ fn a_plant_comes_back_from_its_backup() {
     plant.does(&["plant", "fetch", &name, "--plant", "owner.toml", "--out", "back"]);
     plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
     assert_eq!(other.sql("regrind", "SELECT count(*) FROM regrind.record"), count);
-    // Rights came along.
+    // The rights were restored too.
     assert!(other.ask_as("cell_1", &plant.password("cell-1"), "regrind", "DELETE FROM regrind.record").is_err());
 }

@@ -1,4 +1,4 @@
-//! docs/plant.md, typed as it stands, from an empty database to the second cell's part.
+//! Runs docs/plant.md unchanged, from an empty database to the second cell's part.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -10,7 +10,7 @@ use tempfile::TempDir;
 use crate::postgres::Postgres;
 use crate::program::{root, small_recipe};
 
-/// The blocks of a language on a page, in their order, and whether each is a file, by the name above it.
+/// Returns the blocks of a language on a page, in order, each with the file name above it if it is a file.
 fn blocks(page: &str) -> Vec<(String, String)> {
     let mut found = Vec::new();
     let mut open: Option<(String, String)> = None;
@@ -25,7 +25,7 @@ fn blocks(page: &str) -> Vec<(String, String)> {
     found
 }
 
-/// Types a block in a folder; returns what its screen shows.
+/// Types a block in a folder; returns its output.
 fn typed(home: &Path, text: &str) -> String {
     let program = Path::new(env!("CARGO_BIN_EXE_regrind")).parent().unwrap().display().to_string();
     let path = format!("{program}:{}", std::env::var("PATH").unwrap());
@@ -44,7 +44,7 @@ fn the_page_of_the_plant_is_walked_through() {
     let home = TempDir::new().unwrap();
     let at = |name: &str| home.path().join(name);
     fs::create_dir(at("recipes")).unwrap();
-    // A coarser grid; the name is that of the page.
+    // A coarser grid, under the name on the page.
     fs::rename(small_recipe(home.path(), 1000.0), at("recipes/freeform-mirror.toml")).unwrap();
     postgres.write_owner_password(&at("owner.password"));
     let page = fs::read_to_string(root().join("docs/plant.md")).unwrap();
@@ -81,7 +81,7 @@ fn the_page_of_the_plant_is_walked_through() {
         left.lines().last().unwrap().contains("open") && !left.contains("begun"),
         "the end of the other has arrived: {left}"
     );
-    // Another computer's certificate is not taken for it.
+    // A certificate of another computer is not accepted.
     let mode = fs::metadata(at("cell-1/plant.password")).unwrap().permissions().mode();
     assert_eq!(mode & 0o077, 0);
     let other = "openssl req -new -x509 -nodes -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -subj /CN=localhost -addext subjectAltName=DNS:localhost \

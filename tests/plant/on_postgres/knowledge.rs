@@ -1,4 +1,4 @@
-//! What one cell has learned, at another that grinds the same recipe for the first time.
+//! Use of one cell's learning at another cell that grinds the same recipe for the first time.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,7 +8,7 @@ use serde_json::Value;
 use crate::Plant;
 use crate::program::{records_with, replaced, small_recipe};
 
-/// A plant of two cells, the first of which has made a part and told what it learned.
+/// Returns a plant of two cells, of which the first has made a part and published its learning.
 fn taught() -> (Plant, String) {
     let plant = Plant::new();
     for name in ["cell-1", "cell-2"] {
@@ -25,7 +25,7 @@ fn taught() -> (Plant, String) {
     (plant, name)
 }
 
-/// Has a cell make a part of a world; returns its folder, and what was said.
+/// Lets a cell make a part of a world; returns its folder, and its output.
 fn made(plant: &Plant, cell: &str, seed: &str) -> (PathBuf, String) {
     let folders = || fs::read_dir(plant.path(cell)).into_iter().flatten().map(|entry| entry.unwrap().path());
     let before: Vec<PathBuf> = folders().collect();
@@ -53,7 +53,7 @@ fn first_rms_mm(run: &Path) -> f64 {
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
 fn a_second_cells_first_part_begins_with_what_the_first_one_taught() {
     let (mut plant, taught_by) = taught();
-    // How alike the machines are nobody knows, and unknown opens nothing: what is told of the form is harmless.
+    // The similarity of the machines is unknown. In that case the learned form has no weight, and does no harm.
     let (alone, said) = made(&plant, "cell-2", "2");
     assert!(said.contains(&format!("cell-1 (run {taught_by}) taught of the form")), "{said}");
     assert!(said.contains("nobody knows") && said.contains("machines_differ"), "{said}");
@@ -65,13 +65,13 @@ fn a_second_cells_first_part_begins_with_what_the_first_one_taught() {
     assert!(said.contains(&format!("begins with what cell-1 (run {taught_by}) taught: machines are taken")), "{said}");
     let [without, with] = [&alone, &second].map(|run| first_rms_mm(run));
     assert!(with < 0.5 * without, "{with} mm after the first pass, {without} mm without");
-    // Where it came from is on record, and the run stands by its own files.
+    // The origin is on record, and the run depends only on its own files.
     let begin = &records_with(&second, "content")[0]["content"];
     assert_eq!(begin["taught_by"]["runs"][0]["run"], *taught_by, "{begin}");
     let kept: Value = serde_json::from_slice(&fs::read(second.join("learned_from.json")).unwrap()).unwrap();
     assert_eq!(kept["taught_by"]["runs"][0]["cell"], "cell-1");
     plant.does(&["audit", "verify", &second.display().to_string()]);
-    // Its next part begins with its own, and what it learned is told in turn, as a comparison of the two machines.
+    // Its next part begins with its own learning, which it publishes in turn, as a comparison of the two machines.
     let (_, said) = made(&plant, "cell-2", "2");
     assert!(said.contains("begins with what") && said.contains("found to come back"), "{said}");
     plant.does(&["ship", "--once", "--plant", "cell-2.toml", "--runs", "cell-2"]);
@@ -99,7 +99,7 @@ fn lessons_are_told_by_their_own_run_alone_and_read_by_asking() {
     plant.sql("CREATE VIEW lesson_kind_for_test AS SELECT kind FROM lesson; GRANT SELECT ON lesson_kind_for_test TO regrind_cell");
     assert_eq!(plant.asked_by("cell-2", given).unwrap(), "cell-1");
     assert_eq!(plant.asked_by("cell-1", given).unwrap(), "", "its own is no news to it");
-    // A lesson of another's run, and one that is not on record.
+    // Learning that belongs to another's run, and learning that is not on record.
     let before = plant.incidents().len();
     let sha256 = plant.sql("SELECT encode(sha256, 'hex') FROM lesson");
     let foreign = format!("SELECT teach(1, 'all', decode('{sha256}', 'hex'))");
@@ -117,7 +117,7 @@ fn lessons_are_told_by_their_own_run_alone_and_read_by_asking() {
 fn a_lesson_that_cannot_be_believed_is_left_alone_and_told() {
     let (plant, taught_by) = taught();
     states(&plant, "0.1");
-    // Whoever has all rights to the database: a content under a hash that is not its own, and under its own.
+    // An attacker with all rights to the database: a content under a wrong hash, and under the right one.
     let broken = "jsonb_set(convert_from(content, 'UTF8')::jsonb, '{known,response,0}', '7')::text";
     let tries =
         [(broken, false, "it is not what was on record"), (broken, true, "cannot be"), ("'{'", true, "learned.json")];

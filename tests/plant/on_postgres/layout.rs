@@ -1,4 +1,4 @@
-//! The layout of the database, and the way to it.
+//! Layout of the database, and its migrations.
 
 use crate::Plant;
 

@@ -1,4 +1,4 @@
-//! Ignored unless PostgreSQL is asked for.
+//! Tests that are ignored unless PostgreSQL is requested.
 
 mod backup;
 mod book;

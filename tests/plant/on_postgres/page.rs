@@ -1,4 +1,4 @@
-//! The page of a plant: what it says is what was planted, what comes from a cell stays words, and it changes nothing.
+//! The page of a plant: it shows the planted data, treats text from a cell as text only, and changes nothing.
 
 use std::fs;
 use std::path::Path;
@@ -13,14 +13,14 @@ use crate::browser::Browser;
 use crate::http::{Answer, Visitor};
 use crate::program::{PATIENCE, Running, regrind, root};
 
-/// A text that would be an element of a page, end an attribute and a text of SQL, and turn what is read.
+/// Text that would inject an element of a page, end an attribute and an SQL string, and change the reading direction.
 const HOSTILE: &str =
     "<script>alert(1)</script>'\"><img src=x onerror=alert(2)>&\u{202e}'); DROP TABLE regrind.run; --";
 
-/// The ten values of NIST/SEMATECH e-Handbook 6.3.2.2, whose limits stand there: 45.8159 and 55.8041 about 50.81.
+/// The ten values of NIST/SEMATECH e-Handbook 6.3.2.2, which gives these limits: 45.8159 and 55.8041 about 50.81.
 const FLOW: [f64; 10] = [49.6, 47.6, 49.9, 51.3, 47.8, 51.2, 52.6, 52.4, 53.6, 52.1];
 
-/// A page of a plant, and who looks at it.
+/// Page of a plant, and its visitor.
 struct Shown {
     _page: Running,
     url: String,
@@ -39,7 +39,7 @@ impl Shown {
         Self { _page: page, visitor: Visitor::with_key(&url), url }
     }
 
-    /// What is shown at a path.
+    /// Returns the text of the page at a path.
     fn text(&self, path: &str) -> String {
         let answer = self.visitor.get(path);
         assert_eq!(answer.status, 200, "{path}: {}", answer.text());
@@ -47,12 +47,12 @@ impl Shown {
     }
 }
 
-/// A body whose length is told in pieces or at once.
+/// Returns a body that is sent in chunks or with its length.
 fn body(answer: &Answer) -> String {
     answer.text()
 }
 
-/// What stands between the tags, a space for each, in one line.
+/// Returns the text between the tags, with a space for each tag, in one line.
 fn words(html: &str) -> String {
     let mut inside = false;
     let text: String = html
@@ -70,7 +70,7 @@ fn quoted(text: &str) -> String {
     format!("'{}'", text.replace('\'', "''"))
 }
 
-/// Makes a cell known that nobody signs in as.
+/// Registers a cell that nobody signs in as.
 fn cell(plant: &Plant, name: &str) -> i32 {
     let role = format!("role_{}", plant.sql("SELECT count(*) FROM cell"));
     plant
@@ -79,12 +79,12 @@ fn cell(plant: &Plant, name: &str) -> i32 {
         .unwrap()
 }
 
-/// A run as it stands when its cell has told everything of it.
+/// Run in the database after its cell has shipped everything.
 struct Planted<'a> {
     cell: i32,
     serial: &'a str,
     recipe: &'a str,
-    /// Hours since it began; it took one.
+    /// Hours since the start of the run, which took one hour.
     hours: u32,
     result: &'a str,
     cycles: i32,
@@ -143,7 +143,7 @@ fn tell(plant: &Plant, cell: i32, ago: &str, run: Option<&str>, snapshot: &Value
     ));
 }
 
-/// What a cell tells while it grinds.
+/// Returns the status that a cell publishes while it grinds.
 fn grinding(serial: &str) -> Value {
     serde_json::json!({ "state": "Execute", "words": "grinding", "simulation": false, "part": "Mirror", "serial": serial, "cycle": 2, "max_cycles": 6,
         "progress": { "device": "Grinder", "done": 30, "total": 100, "left_s": [140.0, 210.0] }, "alarms": [] })
@@ -174,7 +174,7 @@ fn the_first_page_says_how_cells_are_and_counts_what_they_made() {
     let mut runs: Vec<Planted> = (0..5).map(|_| of("accepted", 1)).collect();
     runs.extend((0..2).map(|_| of("accepted", 3)));
     runs.extend([of("not accepted", 4), of("aborted", 1), of("stopped", 2)]);
-    // What is simulated, what is long ago, and what is not over is not counted with them.
+    // Simulated runs, old runs and unfinished runs are not counted.
     runs.push(Planted { real: false, ..of("accepted", 1) });
     runs.push(Planted { hours: 24 * 40, ..of("accepted", 1) });
     runs.push(of("open", 1));
@@ -197,7 +197,7 @@ fn the_first_page_says_how_cells_are_and_counts_what_they_made() {
         "{said}"
     );
     assert!(said.contains("cell-3 never heard of"), "{said}");
-    // Ten ended, seven were accepted, five at once: 24 to 76 % by Wilson.
+    // Ten ended, seven were accepted, five of these after one pass: 24 to 76 % by Wilson.
     assert!(said.contains("mirror 10 7 70 % 50 % 24 – 76 %") && said.contains("lens 1 0 0 % 0 %"), "{said}");
     assert!(said.contains("cell-1 10 7 70 % 50 %") && said.contains("cell-3 1 0 0 %"), "{said}");
     assert!(html.contains("11 ended, 7 accepted, 5 at the first measurement"), "the bar of the day");
@@ -244,7 +244,7 @@ fn trends_have_the_limits_of_the_handbook_and_other_programs_read_them() {
     );
     assert!(said.contains("10 of 10 above what is allowed; 0 out of limits") && said.contains("preliminary"), "{said}");
     assert!(!said.contains("900.000") && html.contains(&format!("href=\"/runs/{first}\"")), "{said}");
-    // The first measurement lies 10 um above that after one correction.
+    // The first measurement is 10 um above the one after the first correction.
     let said = words(&shown.text("/trend?at=first&cell=cell-1&recipe=mirror"));
     assert!(said.contains("mean 60.810 µm, limits 55.815 and 65.805 µm"), "{said}");
     let said = words(&shown.text("/trend?recipe=lens"));
@@ -257,7 +257,7 @@ fn trends_have_the_limits_of_the_handbook_and_other_programs_read_them() {
         assert!(shown.text(&format!("/trend?{name}={value}")).contains("50.810"), "{name}");
         assert!(words(&shown.text(&format!("/trend?{name}=other"))).contains(": 0 parts"), "{name}");
     }
-    // One more part that is out.
+    // One more part outside the control limits.
     plant_runs(&plant, &[Planted { cell: one, serial: "SN-OUT", hours: 2, pv_um: 80.0, ..Planted::default() }]);
     let html = shown.text("/trend");
     assert!(
@@ -294,7 +294,7 @@ fn cells_that_differ_are_told_and_parts_are_found() {
     let plant = Plant::new();
     let cells = ["cell-1", "cell-2", "cell-3"].map(|name| cell(&plant, name));
     let serials: Vec<String> = (0..120).map(|k| format!("SN-{k:03}")).collect();
-    // The parts of the third are worse by more than the spread of all.
+    // The parts of the third machine are worse by more than the spread of all.
     let run = |k: u32| {
         let cell = cells[(k % 3) as usize];
         let worse = if k % 3 == 2 { 0.8 } else { 0.0 };
@@ -313,7 +313,7 @@ fn cells_that_differ_are_told_and_parts_are_found() {
     let said = words(&shown.text("/parts?serial=SN-11"));
     assert!(said.contains("SN-110") && said.contains("SN-119") && !said.contains("SN-109"), "{said}");
     assert!(words(&shown.text("/parts?serial=sn-11")).contains("No part"), "small letters are others");
-    // Page by page everything comes once.
+    // Over all result pages, everything appears once.
     let found = |path: &str| -> (Vec<String>, Option<String>) {
         let html = shown.text(path);
         let serials = words(&html).split(' ').filter(|word| word.starts_with("SN-")).map(str::to_owned).collect();
@@ -403,7 +403,7 @@ fn a_run_is_proven_before_anything_is_made_of_it() {
     let plant = Plant::new();
     let (folder, name) = made(&plant);
     plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
-    // Somebody with all rights has changed a record.
+    // An attacker with all rights has changed a record.
     plant.sql("UPDATE record SET text = replace(text, 'Ada', 'Eve') WHERE seq = 1");
     {
         let shown = Shown::of(&plant);
@@ -422,7 +422,7 @@ fn a_run_is_proven_before_anything_is_made_of_it() {
     assert!(said.contains("Proven at") && said.contains(&format!("{records} records in an unbroken chain")), "{said}");
     assert!(said.contains("by a key that the plant knows of the cell") && said.contains("SIMULATION"), "{said}");
 
-    // What is made of the copy is what is made at the cell.
+    // The report from the copy equals the report at the cell.
     let report = shown.visitor.get("/runs/1/report");
     assert!(report.header("content-security-policy")[0].starts_with("default-src 'none'"), "{report:?}");
     assert!(report.text() == fs::read_to_string(folder.join("report.html")).unwrap(), "the report of the cell itself");
@@ -443,7 +443,7 @@ fn a_run_is_proven_before_anything_is_made_of_it() {
     assert!(said.contains("is not what was written"), "{said}");
 }
 
-/// The page of a run when it says what came of its proof.
+/// Returns the page of a run after it shows the result of its verification.
 fn until_proven(shown: &Shown, path: &str) -> String {
     let began = Instant::now();
     loop {
@@ -479,7 +479,7 @@ fn a_database_that_goes_away_is_said_and_comes_back_by_itself() {
         plant.postgres.go_on();
     }
     assert!(shown.text("/").contains("cell-1"));
-    // One that began without it waits for it.
+    // A page that started without the database waits for it.
     plant.postgres.kill();
     let late = Shown::of(&plant);
     assert_eq!(late.visitor.get("/").status, 503);
@@ -516,14 +516,14 @@ fn the_page_is_for_who_has_its_key_and_changes_nothing() {
     let foreign =
         format!("GET / HTTP/1.1\r\nHost: plant.example\r\nCookie: {}\r\nConnection: close\r\n\r\n", other.cookies);
     assert_eq!(crate::http::raw(&other.place, foreign.as_bytes()).status, 421);
-    // There is nothing to order.
+    // The page accepts no orders.
     let origin = shown.visitor.origin();
     for path in ["/", "/trend", "/runs/1", "/runs/1/orders", "/parts"] {
         let token = shown.visitor.token();
         let answer = shown.visitor.post(path, &[("Origin", &origin), ("X-Regrind-Token", &token)], b"{}");
         assert!([404, 405].contains(&answer.status), "{path}: {answer:?}");
     }
-    // Its role may not, whatever it asks.
+    // Its role does not allow it, whatever the query.
     for text in [
         "UPDATE run SET part = 'x'",
         "DELETE FROM record",
@@ -567,7 +567,7 @@ fn every_question_of_the_dashboard_for_grafana_has_an_answer() {
     questions.extend(variables.map(|of| of["query"].as_str().unwrap().to_owned()));
     assert_eq!(questions.len(), 9, "seven panels and two variables");
     for question in questions {
-        // As Grafana does before it asks: its macros, then its variables.
+        // As Grafana does before a query: it replaces its macros, then its variables.
         let (from, to) = ("'2000-01-01T00:00:00Z'", "'2999-01-01T00:00:00Z'");
         let mut asked = question.clone();
         for column in ["began", "at"] {

@@ -1,4 +1,4 @@
-//! The records of a cell on their way to the plant, as evidence there, and back.
+//! Records of a cell: replication to the plant, use as evidence there, and retrieval.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use serde_json::Value;
 use crate::program::{Running, regrind, run, small_recipe};
 use crate::{Plant, only_run};
 
-/// A part of the small recipe made by cell-1, signed, and shipped meanwhile.
+/// Makes a part of the small recipe at cell-1, signed, and shipped in the meantime.
 pub fn made(plant: &Plant) -> (std::path::PathBuf, String) {
     let key = plant.path("audit.key").display().to_string();
     let told: Value = serde_json::from_str(&plant.does(&["audit", "key", "--key", &key, "--json"])).unwrap();
@@ -37,7 +37,7 @@ fn a_cell_whose_run_was_left_is_not_called_idle() {
     running.end();
     plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
     assert_eq!(told(), "0", "what it does is not known");
-    // Whoever made another part has seen to the machines.
+    // A person who made another part has prepared the machines.
     let recipe = small_recipe(plant.home.path(), 1000.0).display().to_string();
     let (code, out, errors) = run(&["run", &recipe, "--cell", "sim"], plant.home.path());
     assert!(code == 0 && told() == "0", "{out}{errors}");
@@ -64,7 +64,7 @@ fn a_run_is_shipped_once_proven_there_and_brought_back() {
     }
     assert_eq!(plant.sql("SELECT encode(head, 'hex') FROM run"), before.last().unwrap().hash);
 
-    // What a glance shows is what the record tells.
+    // The summary agrees with the record.
     let shown = regrind::report::run_summary(&folder).unwrap();
     let [[pv, pv_u], [rms, rms_u]] = shown.cycles.last().unwrap().figures.unwrap();
     let row = plant.sql(
@@ -74,12 +74,12 @@ fn a_run_is_shipped_once_proven_there_and_brought_back() {
     assert_eq!(row, format!("cell-1|SN-0042|Ada|t|accepted|{count}|{pv}|{pv_u}|{rms}|{rms_u}"));
     let named = plant.sql("SELECT recipe, part_name, cmm IS NOT NULL, grinder IS NOT NULL, wheel, probe FROM part_run");
     assert!(named.starts_with("small|") && named.contains("|t|t|R ") && named.ends_with("|R 1.500 mm"), "{named}");
-    // A database has microseconds.
+    // A database has a resolution of microseconds.
     let ended = format!("{}Z", plant.sql("SELECT ended AT TIME ZONE 'UTC' FROM part_run").replace(' ', "T"));
     let [there, here] = [ended, shown.ended.unwrap()].map(|at| at.parse::<jiff::Timestamp>().unwrap().as_nanosecond());
     assert!((there - here).abs() <= 1000, "{there} {here}");
 
-    // The copy is evidence by itself, and with the journal of the cell beside it.
+    // The copy is evidence alone, and together with the journal of the cell.
     let both = plant.does(&["audit", "verify", "--plant", "cell-1.toml"]);
     assert!(both.contains("they stand in the journal here") && both.contains("sound       "), "{both}");
     let told: Value =
@@ -118,10 +118,10 @@ fn large_files_lie_in_a_folder_and_are_put_right_there() {
         let text = fs::read_to_string(&file).unwrap();
         fs::write(file, format!("{text}\n[artefacts]\nfolder = \"files\"\nfrom_mb = 0.001\n")).unwrap();
     }
-    // What was given by the run itself is in the database; it is taken out, as if nothing of it had been shipped.
+    // Remove from the database what the run itself has stored, as if nothing had been shipped.
     plant.sql("TRUNCATE artefact_of, artefact, record; UPDATE run SET records = 0, head = decode(repeat('00', 32), 'hex'), ended = NULL");
     plant.sql("TRUNCATE run_artefact");
-    // Somebody who writes into the folder too has put another content there.
+    // Another program with write access to the folder has replaced a content.
     let recipe = regrind::journal::sha256_hex(&fs::read(folder.join("recipe.toml")).unwrap());
     fs::create_dir(files.join(&recipe[..2])).unwrap();
     fs::write(files.join(&recipe[..2]).join(&recipe), "another").unwrap();
@@ -135,7 +135,7 @@ fn large_files_lie_in_a_folder_and_are_put_right_there() {
     assert!(told.contains("recipe.toml"), "{told}");
 }
 
-/// Cuts the end off a journal as somebody does who knows how: the anchor goes along.
+/// Cuts the end off a journal as an expert attacker does: together with the anchor.
 fn cut(folder: &Path, keeps: usize) {
     let journal = Connection::open(folder.join("journal.sqlite")).unwrap();
     for trigger in ["record_is_not_changed", "record_is_not_deleted"] {
@@ -163,7 +163,7 @@ fn a_journal_that_is_cut_after_it_was_shipped_is_found() {
     let last = incidents.last().unwrap();
     assert_eq!((last["by"].as_str(), last["run"].as_str()), (Some("cell-1"), Some(&*name)), "{last}");
     assert!(last["what"] == "a journal that differs" && last["words"].as_str().unwrap().contains(&words), "{last}");
-    // The copy of the plant is as it was, and proves itself.
+    // The copy of the plant is unchanged, and verifies.
     plant.does(&["plant", "fetch", &name, "--plant", "owner.toml", "--out", "back"]);
     assert_eq!(records(&plant.path("back").join(&name)).len(), all);
 }
@@ -177,7 +177,7 @@ fn a_plant_that_was_changed_is_found() {
     let verify = ["audit", "verify", &name, "--plant", "owner.toml"];
     fs::rename(plant.path("runs"), plant.path("elsewhere")).unwrap();
     let all: usize = plant.sql("SELECT count(*) FROM record").parse().unwrap();
-    // Somebody with all rights, and what is undone behind each.
+    // Manipulations by an attacker with all rights, each with the statement that undoes it.
     let harm = [
         (
             "SET text = replace(text, 'Ada', 'Eve') WHERE seq = 1",

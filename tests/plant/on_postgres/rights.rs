@@ -1,4 +1,4 @@
-//! Who is a cell, and means harm to the plant: what it may read, and what becomes of what it tries.
+//! A cell account as an attacker on the plant: what it can read, and the results of its attempts.
 
 use std::fs;
 
@@ -7,10 +7,10 @@ use serde_json::json;
 
 use crate::Plant;
 
-/// Words that end a text of SQL, and begin another.
+/// Text that ends an SQL string, and begins another statement.
 const SQL: &str = "x'); DROP TABLE regrind.record CASCADE; --\" \\ $$ {} % \u{1}";
 
-/// A journal of a few records below a folder of runs.
+/// Writes a journal of a few records below a folder of runs.
 fn journal(plant: &Plant, runs: &str, name: &str, part: &str) -> Vec<Record> {
     let folder = plant.path(runs).join(name);
     let header = Header {
@@ -31,7 +31,7 @@ fn journal(plant: &Plant, runs: &str, name: &str, part: &str) -> Vec<Record> {
     Reader::open(&folder).unwrap().records(1).map(Result::unwrap).collect()
 }
 
-/// The call by which records are shipped, as who writes it by hand.
+/// Returns the call that ships records, as written by hand.
 fn ship(run: &str, from: u64, records: &[Record]) -> String {
     let hashes: Vec<String> = records.iter().map(|r| format!("decode('{}', 'hex')", r.hash)).collect();
     let texts: Vec<String> =
@@ -111,10 +111,10 @@ fn a_cell_reads_its_own_alone_and_writes_nothing_by_hand() {
     for text in tries {
         assert!(plant.asked_by("cell-2", text).is_err(), "{text}");
     }
-    // A table of its own that is called as one of the plant's is not what its functions see.
+    // The functions of the plant do not see an attacker's table with the same name as one of the plant's.
     let shadow = "CREATE TEMP TABLE cell (id int, role name, retired_at timestamptz); INSERT INTO pg_temp.cell VALUES (1, 'cell_2', NULL); SELECT regrind.own_cell()";
     assert_eq!(plant.asked_by("cell-2", shadow).unwrap(), "2");
-    // Nobody else signs in.
+    // Nobody else can sign in.
     assert!(plant.postgres.ask_as("cell_2", "wrong", "regrind", "SELECT 1").is_err());
     plant.does(&["plant", "retire", "cell-2", "--plant", "owner.toml"]);
     let (_, told) = plant.ends(&["ship", "--once", "--plant", "cell-2.toml", "--runs", "runs-2"], 2);
@@ -163,26 +163,26 @@ fn forged_records_are_refused_and_put_down() {
             "{what}: {last}"
         );
     }
-    // A chain that is whole in itself, of another run under this one's name.
+    // A valid chain of another run under the name of this one.
     let run_4 = plant.asked_by("cell-1", "SELECT id FROM open_run('another')").unwrap();
     let said = plant.asked_by("cell-1", &ship(&run_4, 1, &another_run)).unwrap();
     assert!(said.contains("begins another run than another"), "{said}");
-    // The other cell adds to a run that is not its own, and tells of it.
+    // The other cell appends to a run that is not its own; the answer and the incident show it.
     let said = plant.asked_by("cell-2", &ship(&run, 3, &other[2..])).unwrap();
     assert!(said.contains("which is none of this cell's"), "{said}");
     plant.asked_by("cell-2", "SELECT tell_run(1, '{\"cycles\":[],\"result\":\"accepted\"}')").unwrap();
     assert_eq!(plant.sql("SELECT count(*) FROM incident WHERE what = 'a foreign run'"), "2");
     assert_eq!(plant.sql("SELECT result IS NULL OR result <> 'accepted' FROM run WHERE id = 1"), "t");
-    // Records that stand already change nothing, whatever is in them; the rest goes on where it stands.
+    // Records that exist already change nothing, whatever their content; the rest must continue the chain.
     let said = plant.asked_by("cell-1", &ship(&run, 1, &another_run)).unwrap();
     assert_eq!(said, format!("{stands}|"));
     let said = plant.asked_by("cell-1", &ship(&run, 3, &other[2..])).unwrap();
     assert_eq!(said, format!("{}|", other.len()));
-    // To know the hash of another's file is not to have its content.
+    // Knowledge of the hash of another cell's file does not give access to its content.
     let known = plant.sql("SELECT encode(sha256, 'hex') FROM artefact LIMIT 1");
     assert_eq!(plant.asked_by("cell-2", &format!("SELECT place_artefact(decode('{known}', 'hex'), 1)")).unwrap(), "f");
     assert_eq!(plant.asked_by("cell-2", "SELECT count(*) FROM artefact").unwrap(), "0");
-    // A content under a hash that it has not.
+    // A content under a wrong hash.
     let given = plant.asked_by("cell-1", "SELECT give_artefact(decode(repeat('00', 32), 'hex'), 'x')").unwrap();
     assert_eq!(given, "f");
     assert_eq!(plant.incidents().last().unwrap()["what"], "a wrong file");

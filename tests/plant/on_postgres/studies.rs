@@ -1,4 +1,4 @@
-//! A study: what its workers bring is what a run by hand gives, whatever becomes of one of them.
+//! A study: its workers give the same results as runs by hand, even if one of them dies.
 
 use serde_json::Value;
 
@@ -42,7 +42,7 @@ fn a_study_is_made_by_whoever_works_and_each_run_is_that_of_its_seed() {
     let (code, _, told) = begin("acceptance.rms_um=1.0");
     assert!(code == 2 && told.contains("there is a study \"limits\""), "{told}");
 
-    // One worker dies with a job, whose time passes faster here.
+    // One worker dies with a job, whose lease expires faster here.
     let mut dies = Running::new(regrind(&["study", "work", "--plant", "farm-1.toml"], plant.home.path()));
     dies.until("a job", |_| (plant.sql("SELECT count(*) FROM study_job WHERE state = 'leased'") == "1").then_some(()));
     dies.signal("KILL");
@@ -64,7 +64,7 @@ fn a_study_is_made_by_whoever_works_and_each_run_is_that_of_its_seed() {
     for seed in [7, 8] {
         assert_eq!(of(seed, 1.0)["result"]["result"], "accepted");
         assert_eq!(of(seed, 0.002)["result"]["result"], "not accepted");
-        // The same truth from the same seed, and it is what the measurement says within its uncertainty.
+        // The same seed gives the same truth, and the measurement agrees with it within its uncertainty.
         let run = &of(seed, 1.0)["result"];
         let last = run["cycles"].as_array().unwrap().last().unwrap();
         let [is, seen, u] = [&run["truth"]["rms_um"], &last["rms_um"], &last["rms_u_um"]].map(|v| v.as_f64().unwrap());

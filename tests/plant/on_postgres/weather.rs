@@ -1,5 +1,6 @@
-//! Cells that make parts of one queue and tell a broker how they are, while the network is cut, database and broker are killed, and they
-//! themselves are: every record is in the plant once, no part is begun twice, and every cell is told again.
+//! Cells that make parts of one queue and publish live values to a broker, while the network is cut and database,
+//! broker and cells are killed. Every record reaches the plant once, no part begins twice, and every cell is published
+//! again.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -18,10 +19,10 @@ use crate::network::Network;
 use crate::outlived::{began_once, follow, on_serial_lines};
 use crate::program::{PATIENCE, Running, changed, regrind};
 
-/// How often the program of a cell is killed for each part that it makes, at most.
+/// Maximum number of kills of a cell's program for each part that it makes.
 const KILLS_A_PART: usize = 2;
 
-/// The recipe of the parts: two or three seconds each, confirmed by nobody.
+/// Returns the recipe of the parts: two or three seconds each, without confirmation by a person.
 fn recipe() -> String {
     let changes = [
         ("columns = 60", "columns = 12"),
@@ -34,13 +35,13 @@ fn recipe() -> String {
     changed("recipes/freeform-mirror.toml", &changes)
 }
 
-/// A cell and its folder.
+/// Cell and its folder.
 struct Cell {
     name: String,
     home: PathBuf,
 }
 
-/// A cell whose plant file leads through the network, and its machines, which outlive its programs.
+/// Returns a cell whose plant file points to the network, and its machines, which outlive its programs.
 fn cell(plant: &Plant, number: usize, approvers: &str, broker: &Broker) -> (Cell, Running) {
     let name = format!("cell-{number}");
     let home = plant.path(&name);
@@ -73,7 +74,7 @@ impl Cell {
         Running::new(command)
     }
 
-    /// The run that is not over, but for those that were left.
+    /// Returns the unfinished run, except those that were abandoned.
     fn open_run(&self, left: &BTreeSet<PathBuf>) -> Option<PathBuf> {
         let runs = fs::read_dir(self.runs()).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
         let mut open = runs.filter(|run| {
@@ -83,7 +84,7 @@ impl Cell {
         open.next()
     }
 
-    /// Makes parts until none is left, whatever happens to its programs.
+    /// Makes parts until none remains, whatever happens to its programs.
     fn works(&self, seed: u64, parts: &AtomicUsize) {
         let mut chance = StdRng::seed_from_u64(seed);
         let (mut kills, mut left) = (0, BTreeSet::new());
@@ -97,7 +98,7 @@ impl Cell {
             kills += usize::from(code.is_none());
             let told = running.told.clone();
             running = match self.open_run(&left) {
-                // It was killed before anything was asked of a machine.
+                // The program was killed before any request to a machine.
                 Some(run) if told.contains("begin a new run") => {
                     assert!(left.insert(run.clone()), "seed {seed}: {told}");
                     let serial = Reader::open(&run).unwrap().last().unwrap().unwrap().part;
@@ -107,7 +108,7 @@ impl Cell {
                     let run = run.strip_prefix(&self.home).unwrap().display().to_string();
                     self.resumed(&run)
                 }
-                // It was killed before its run had a record.
+                // The program was killed before its run had a record.
                 Some(run) => {
                     fs::remove_dir_all(run).unwrap();
                     self.does(&make)
@@ -119,18 +120,18 @@ impl Cell {
                 None => {
                     let waits = code == Some(0) || code == Some(3) || code.is_none() || told.contains("is not over");
                     assert!(waits || told.contains("part "), "seed {seed}, {}: {code:?} {told}", self.name);
-                    // Others may give back what they have taken.
+                    // Other cells can return the parts that they have leased.
                     std::thread::park_timeout(Duration::from_millis(200));
                     self.does(&make)
                 }
             };
         }
-        // What runs on makes no further part.
+        // A program that is still running makes no more parts.
         running.signal("KILL");
         running.end();
     }
 
-    /// Goes on with a run that broke off.
+    /// Resumes an interrupted run.
     fn resumed(&self, run: &str) -> Running {
         let mut command = regrind(&["resume", run, "--json"], &self.home);
         command.env("REGRIND_KEY", self.home.join("audit.key"));
@@ -138,12 +139,12 @@ impl Cell {
     }
 }
 
-/// Whether a run has its end on record.
+/// Returns true if the end of a run is on record.
 fn is_over(run: &Path) -> bool {
     run.join("journal.sqlite").is_file() && verify(run).is_ok_and(|verified| verified.closed)
 }
 
-/// So many cells make so many parts, in weather that is drawn from a number.
+/// Runs this number of cells and parts under faults that are drawn from a seed.
 fn weather(seed: u64, cells: usize, parts: usize) {
     println!("seed {seed}");
     let mut plant = Plant::new();
@@ -193,7 +194,7 @@ fn weather(seed: u64, cells: usize, parts: usize) {
             }
             std::thread::park_timeout(2 * a_while);
             deeds += 1;
-            // The time of a lease whose cell was killed passes a little faster here.
+            // The lease of a killed cell expires a little faster here.
             plant.sql("UPDATE work SET leased_until = now() - interval '1 second' WHERE state = 'leased' AND leased_until < now() + interval '290 seconds'");
             left.store(open_parts(&plant, &cells, parts), Ordering::SeqCst);
         }
@@ -205,7 +206,7 @@ fn weather(seed: u64, cells: usize, parts: usize) {
     cells.iter().for_each(|cell| is_told(cell, &broker));
 }
 
-/// A cell is born once more to the broker, whatever became of the two before.
+/// Asserts that a cell publishes another birth to the broker, whatever happened to the network and to the broker.
 fn is_told(cell: &Cell, broker: &Broker) {
     let births = || broker.log().matches(&format!("spBv1.0/plant/NBIRTH/{}'", cell.name)).count();
     let (before, began) = (births(), Instant::now());
@@ -216,7 +217,7 @@ fn is_told(cell: &Cell, broker: &Broker) {
     }
 }
 
-/// How many parts have no run that is over, by the records at the cells.
+/// Returns the number of parts without a finished run, by the records at the cells.
 fn open_parts(plant: &Plant, cells: &[Cell], parts: usize) -> usize {
     let begun: usize = plant.sql("SELECT count(*) FROM work WHERE state IN ('begun', 'ended')").parse().unwrap();
     let over = cells.iter().flat_map(|cell| runs_of(&cell.runs())).filter(|run| is_over(run));
@@ -251,7 +252,7 @@ fn is_once_and_whole(plant: &Plant, cells: &[Cell], parts: usize, seed: u64) {
             assert!(!was_driven || made.insert(last.part.clone()), "seed {seed}: {} was begun twice", last.part);
             all += records.len();
         }
-        // By the machines themselves each pass and each measurement began once.
+        // The machines' own logs show that each pass and each measurement began once.
         began_once(&cell.home);
     }
     assert_eq!((made.len(), plant.sql("SELECT count(*) FROM record")), (parts, all.to_string()), "seed {seed}");

@@ -1,4 +1,5 @@
-//! Work and what it is made by, between planners, approvers, cells, and whoever would have a part made by something else.
+//! Work orders and their recipes, between planners, approvers, cells, and attackers who want a part to be made by
+//! another recipe.
 
 use std::fs;
 use std::process::Stdio;
@@ -9,7 +10,8 @@ use serde_json::{Value, json};
 use crate::Plant;
 use crate::program::{Running, regrind, small_recipe};
 
-/// A plant with two approvers, a planner and a recipe that both have signed; returns the table of approvers for plant files.
+/// Sets up a plant with two approvers, a planner and a recipe that both have signed; returns the table of approvers for
+/// plant files.
 fn approved(plant: &Plant) -> String {
     plant.somebody("planner", "planner");
     let recipe = small_recipe(plant.home.path(), 1000.0).display().to_string();
@@ -17,7 +19,7 @@ fn approved(plant: &Plant) -> String {
     ["Ada", "Bob"].map(|person| approves(plant, person, "small")).concat()
 }
 
-/// A person signs a recipe; returns what a plant file says of the person.
+/// Signs a recipe as a person; returns the person's entry for a plant file.
 pub fn approves(plant: &Plant, person: &str, recipe: &str) -> String {
     let file = format!("{person}.key");
     let told: Value = serde_json::from_str(&plant.does(&["audit", "key", "--key", &file, "--json"])).unwrap();
@@ -25,7 +27,7 @@ pub fn approves(plant: &Plant, person: &str, recipe: &str) -> String {
     format!("\n[[approver]]\nname = \"{person}\"\nkey = {}\n", told["public_key"])
 }
 
-/// A cell that knows approvers.
+/// Enrols a cell that knows approvers.
 fn cell(plant: &Plant, name: &str, approvers: &str) {
     plant.cell(name, &[]);
     let file = plant.path(&format!("{name}.toml"));
@@ -57,7 +59,7 @@ fn parts_are_made_in_the_order_in_which_they_are_due() {
         plant.ends(&["plant", "queue", "SN-9", "--recipe", "small", "--cell", "cell-9", "--plant", "planner.toml"], 2);
     assert!(told.contains("there is no cell cell-9"), "{told}");
 
-    // By serial number on the command line, by what is typed, and by what is typed wrong.
+    // By serial number on the command line, by typed input, and by wrong typed input.
     let said = plant.does(&["work", "--plant", "cell-1.toml", "--part", "SN-0", "--once"]);
     assert!(said.contains("by version 1 of small, signed by Ada and Bob, due 2026-12-01"), "{said}");
     for (typed, does, ends) in [("SN-2", "it is given back", 1), ("", "it is given back", 1), ("SN-1", "record in", 0)]
@@ -124,7 +126,7 @@ fn a_recipe_that_is_not_what_two_people_signed_is_refused_and_put_down() {
         let last = incidents.last().unwrap();
         assert!(incidents.len() > before && last["what"] == "recipe refused" && last["by"] == "cell-1", "{last}");
     };
-    // Nobody can have an old recipe under a new name, or sign twice.
+    // Nobody can propose an old recipe under a new name, or sign twice.
     let again = ["plant", "propose", "small.toml", "--name", "panel", "--plant", "planner.toml"];
     let (_, told) = plant.ends(&again, 2);
     assert!(told.contains("panel is version 1 of small"), "{told}");
@@ -133,7 +135,8 @@ fn a_recipe_that_is_not_what_two_people_signed_is_refused_and_put_down() {
         plant.ends(&["plant", "approve", "small", "--person", "Ada", "--key", "Bob.key", "--plant", "planner.toml"], 2);
     assert!(told.contains("another person signs it"), "{told}");
 
-    // Somebody with all rights in the database gives an old recipe a new name, changes a text, and forges a signature.
+    // An attacker with all rights in the database gives an old recipe a new name, changes a text, and forges a
+    // signature.
     queue(&plant, "SN-1", &[]);
     plant.sql("CREATE TABLE kept AS SELECT * FROM recipe; ALTER TABLE recipe DROP CONSTRAINT recipe_check");
     for harm in ["name = 'panel'", "version = 7", "text = replace(text, 'columns = 20', 'columns = 21')"] {
@@ -143,11 +146,11 @@ fn a_recipe_that_is_not_what_two_people_signed_is_refused_and_put_down() {
     }
     plant.sql("UPDATE approval SET signature = repeat('ab', 64) WHERE person = 'Bob'");
     refused("is signed by Ada of those in this cell's plant file");
-    // A cell that knows only one of the two.
+    // A cell that knows only one of the two approvers.
     let one = approvers.split("\n[[approver]]").nth(1).unwrap();
     cell(&plant, "cell-2", &format!("\n[[approver]]{one}"));
     plant.ends(&["work", "--plant", "cell-2.toml", "--once", "--part", "SN-1"], 2);
-    // It is still there for a cell that may make it, and nobody has begun it.
+    // The part remains available to a cell that is allowed to make it, and nobody has begun it.
     assert_eq!(work(&plant)[0]["state"], "open");
     plant.does(&["plant", "withdraw", "small", "--version", "1", "--why", "wrong wheel", "--plant", "planner.toml"]);
     let said = plant.does(&make);
@@ -169,7 +172,7 @@ fn a_lease_that_is_over_opens_nothing_and_what_was_begun_is_its_runs() {
     plant.sql("UPDATE work SET leased_until = now() - interval '1 second'");
     assert!(by("cell-1", "SELECT begin_work(1, 1, 'run-1')").contains("its lease ended at"));
     assert_eq!(by("cell-2", "SELECT id, lease FROM take_work(60)"), "1|2");
-    // The old lease, and that of the other cell, played again.
+    // A replay of the old lease, and of that of the other cell.
     for (cell, lease) in [("cell-1", 1), ("cell-1", 2), ("cell-2", 1)] {
         for step in ["begin_work(1, {}, 'run-1')", "renew_work(1, {}, 60)", "return_work(1, {}, 'why')"] {
             let before = plant.incidents().len();
@@ -191,7 +194,7 @@ fn a_lease_that_is_over_opens_nothing_and_what_was_begun_is_its_runs() {
     plant.sql("UPDATE work SET leased_until = now() - interval '1 day'");
     assert_eq!(by("cell-1", "SELECT id FROM take_work(60)"), "", "what was begun belongs to its run");
 
-    // The cell died before the run began: it takes nothing more until somebody has looked.
+    // The cell died before the run began: it takes no more parts until a person has checked.
     let make = ["work", "--plant", "cell-2.toml", "--part", "SN-1", "--once"];
     let (_, told) = plant.ends(&make, 1);
     assert!(told.contains("SN-1 was begun in run run-1, of which there is no record in runs"), "{told}");
@@ -199,14 +202,14 @@ fn a_lease_that_is_over_opens_nothing_and_what_was_begun_is_its_runs() {
     plant.does(&["work", "--plant", "cell-2.toml", "--give-back", "SN-1"]);
     plant.does(&make);
     let run = plant.sql("SELECT run FROM work");
-    // Its run has begun: nobody gives it back.
+    // Its run has begun: nobody can return the part.
     plant.does(&["ship", "--once", "--plant", "cell-2.toml"]);
     plant.sql("UPDATE work SET state = 'begun'");
     let said = by("cell-2", &format!("SELECT give_back_work(1, '{run}', 'why')"));
     assert!(said.contains("something was asked of a machine"), "{said}");
 }
 
-/// A part that cell-1 has begun in a run whose program died; what it had on record by then.
+/// Simulates a part that cell-1 has begun in a run whose program died, with this number of events on record.
 fn begun_and_died(plant: &Plant, run: &str, events: usize) {
     assert_eq!(
         plant
@@ -241,13 +244,13 @@ fn a_run_that_cannot_be_gone_on_with_does_not_hold_up_its_cell() {
     let make = ["work", "--plant", "cell-1.toml", "--part", "SN-1", "--once"];
     let back = ["work", "--plant", "cell-1.toml", "--give-back", "SN-1"];
     let up = ["work", "--plant", "cell-1.toml", "--give-up", "SN-1", "--why", "its program is gone"];
-    // Nothing was asked of a machine: the part is as it was.
+    // No request was sent to a machine: the part is unchanged.
     begun_and_died(&plant, "run-1", 0);
     let (_, told) = plant.ends(&make, 1);
     assert!(told.contains("nothing was asked of a machine") && told.contains("--give-back SN-1"), "{told}");
     plant.does(&back);
     assert_eq!(work(&plant)[0]["state"], "open");
-    // Something was: the part is this run's for good, and whether it is made anew is for a planner to say.
+    // A request was sent: the part belongs to this run for good. A planner decides whether it is made again.
     begun_and_died(&plant, "run-2", 3);
     let (_, told) = plant.ends(&make, 1);
     assert!(

@@ -1,5 +1,5 @@
-//! Those who look at live values, in Python: other people's programs, in an environment that is made once below the target folder, or with
-//! the Python that REGRIND_PYTHON names, which has to have what they need.
+//! Independent clients for live values, in Python. They run in an environment that is made once below the target
+//! folder, or with the Python that REGRIND_PYTHON names, which must have the required packages.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ fn scripts() -> PathBuf {
     root().join("tests/plant/peers")
 }
 
-/// A Python that has what the peers need, made once.
+/// Returns a Python with the packages that the peers need, installed once.
 fn python() -> &'static Path {
     static PYTHON: OnceLock<Result<PathBuf, String>> = OnceLock::new();
     PYTHON
@@ -41,7 +41,7 @@ fn find_python() -> Result<PathBuf, String> {
         return Ok(python);
     }
     done(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&home))?;
-    // A network that fails once must not fail the tests.
+    // A single network failure must not fail the tests.
     let mut install = Command::new(&python);
     install.args(["-m", "pip", "install", "--quiet", "--retries", "10", "--timeout", "60", "-r"]).arg(list);
     (0..2).find_map(|_| done(&mut install).ok()).map_or_else(|| done(&mut install), Ok)?;
@@ -57,7 +57,7 @@ fn done(command: &mut Command) -> Result<(), String> {
     }
 }
 
-/// A program in Python that prints lines of JSON, and reads them.
+/// Python program that prints lines of JSON, and reads them.
 pub struct Peer {
     running: Running,
     to: ChildStdin,
@@ -72,22 +72,22 @@ impl Peer {
         Self { running, to }
     }
 
-    /// Has it do something.
+    /// Sends a command to the peer.
     pub fn does(&mut self, what: &Value) {
         writeln!(self.to, "{what}").unwrap();
     }
 
-    /// How much it has said so far: a place from which to look on.
+    /// Returns the number of messages so far: a position from which to search later.
     pub fn place(&mut self) -> usize {
         self.running.has_said()
     }
 
-    /// Waits until something is so of all that it said from a place on.
+    /// Waits until the messages from a position on satisfy a condition.
     pub fn until<T>(&mut self, from: usize, what: &str, is_so: impl Fn(&[Value]) -> Option<T>) -> T {
         self.running.until(what, |said| is_so(&parsed(&said[from.min(said.len())..])))
     }
 
-    /// All that it has said.
+    /// Returns all messages of the peer.
     pub fn said(&mut self) -> Vec<Value> {
         self.running.has_said();
         parsed(&self.running.said)
