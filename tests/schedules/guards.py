@@ -38,7 +38,7 @@ GUARDS = {
     "a station looks again after the loop has hung": (
         "src/drive/station.rs", "if self.seen.connected => if pulse.is_felt() {", "if self.seen.connected && pulse.is_felt() => if true {"),
     "holding goes on when the link is lost": (
-        "src/cell/act.rs", "        if is_holding {\n", "        if false && is_holding {\n            unreachable!();\n        } else if is_holding {\n            self.go(Held(out_of_sight(phase)));\n        } else if false {\n"),
+        "src/cell/act.rs", "        if is_holding && phase.moving() == Some(device) {\n", "        if is_holding && phase.moving() == Some(device) {\n            self.go(Held(out_of_sight(phase)));\n        } else if false {\n"),
     "a job found running while holding is told to hold": (
         "src/cell/act.rs", "                self.go(self.same(run));\n                self.push(Command::HoldMachine { device });\n", "                self.go(self.same(run));\n"),
     "a machine that moves while the cell stands is told to hold": (
