@@ -176,6 +176,12 @@ fn told(case: Case) -> Told {
         if high_um < 0.9 * touched_um {
             write!(faults, " PV up to {high_um:.2} where {touched_um:.2} um were touched;").unwrap();
         }
+        // In a deep scratch the ball rests on the flanks. A truth without the ball says nothing of its touch.
+        let true_um = (0..used.len()).filter(|&k| !seen.without_ball[k]).map(|k| 1e3 * best_mm[k]);
+        let true_um = true_um.clone().fold(f64::NEG_INFINITY, f64::max) - true_um.fold(f64::INFINITY, f64::min);
+        if high_um < 0.9 * true_um && used.iter().all(|used| *used) {
+            write!(faults, " PV up to {high_um:.2} of {true_um:.2} um;").unwrap();
+        }
     }
     let limits_um = ran.tolerance_mm.map(|mm| 1e3 * mm);
     let accepted = ran.accepted();

@@ -101,6 +101,9 @@ pub struct Snapshot {
     pub places_mm: Vec<[f64; 2]>,
     /// Heights of the ball centre above the offset surface of the nominal at these positions, in mm.
     pub heights_mm: Vec<f64>,
+    /// True for each position at which the ball finds no contact along the nominal normal. The height there is the true
+    /// deviation without the ball.
+    pub without_ball: Vec<bool>,
 }
 
 /// Result of a run.
@@ -219,9 +222,11 @@ impl Eye {
         let centres = measured.iter().map(|row| back(&placement, [row[0], row[1], row[2]]));
         let places_mm: Vec<[f64; 2]> = centres.map(|centre| foot(world, centre).0).collect();
         // A touch at the very edge of the part may have its projection beyond the edge.
-        let touched = world.touched_mm(&places_mm, *radius_mm).into_iter().zip(&places_mm);
+        let touched = world.touched_mm(&places_mm, *radius_mm);
+        let without_ball = touched.iter().map(Option::is_none).collect();
+        let touched = touched.into_iter().zip(&places_mm);
         let heights_mm = touched.map(|(height, &[x, y])| height.unwrap_or_else(|| world.deviation_mm(x, y))).collect();
-        taken.push(Snapshot { cycle, placement, places_mm, heights_mm });
+        taken.push(Snapshot { cycle, placement, places_mm, heights_mm, without_ball });
     }
 }
 
