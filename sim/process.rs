@@ -14,7 +14,7 @@
 //! ```
 //!
 //! Machine and part deflect, so a share mu of the excess height remains: h becomes mu h + (1 - mu) cmd where h > cmd.
-//! Where h <= cmd, the wheel cuts air. Spark-out repeats the stroke.
+//! The wheel cuts air if h <= cmd. Spark-out repeats the stroke.
 //!
 //! **Scallops.** The wheel is a ball. Where it cuts, it leaves a groove around each track: h is the bottom of the
 //! grooves, and the ridges between them belong to the part that is measured ([`crate::part`]). Grooves lie at the

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 /// falls; never raise one.
 const ALLOWED: [(&str, [usize; 3]); 21] = [
     ("src/cell", [1, 7, 2]),
-    ("src/cli", [7, 17, 44]),
+    ("src/cli", [7, 17, 43]),
     ("src/config", [0, 1, 16]),
     ("src/control", [1, 1, 0]),
     ("src/core", [6, 49, 18]),

@@ -132,7 +132,7 @@ struct Begun {
     table_version: u32,
     #[serde(default)]
     rehearsal: bool,
-    /// What may be lost of the record, where a person goes on all the same.
+    /// Text about records that may be lost, if a person continues in spite of it.
     #[serde(skip)]
     lost: Option<String>,
     /// The last cycle of the record.
