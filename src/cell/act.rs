@@ -1317,6 +1317,7 @@ fn gate_alarm(why: &GateFailure) -> (AlarmId, String) {
         GateFailure::Foreign(message) => (AlarmId::ForeignResult, message.clone()),
         GateFailure::Broken(message) => (AlarmId::BrokenResult, message.clone()),
         GateFailure::Temperature(message) => (AlarmId::Temperature, message.clone()),
+        GateFailure::Moved(message) => (AlarmId::PartMoved, message.clone()),
     }
 }
 

@@ -232,6 +232,13 @@ catalogue! {
         ["See how the part is loaded: turned round, on swarf, in another seat.", "Stop the run, load the part as drawn, and start a run that begins with a measurement.",
          "If it lay well all along, resume to measure again."]
     }
+    /// Gate: control points have moved between the touches of one measurement.
+    PartMoved {
+        "The part is not where it was at the first touches of this measurement",
+        "The repeated touches are not used: they belong to another place of the part.", Operator,
+        ["Check that the part is clamped and that nobody has moved it.", "Wait until the temperature of part and room is stable.",
+         "Order RESUME to measure the whole part again."]
+    }
     /// Gate: wrong radius of the probe.
     ProbeRadius {
         "The radius of the probe is not the one in the recipe", "Nothing is made of this measurement: every deviation would be off by it.", ProcessEngineer,

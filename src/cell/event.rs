@@ -292,6 +292,8 @@ pub enum GateFailure {
     Broken(String),
     /// The temperature was outside its window.
     Temperature(String),
+    /// Touches that were repeated are not where they were: the part, its frame or its temperature has changed.
+    Moved(String),
 }
 
 /// Figures of a registration on which the cell decides.

@@ -240,7 +240,12 @@ fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
 fn of_computations(cycle: u32) -> Vec<Event> {
     let text = String::new;
     let failures = [GateFailure::NoPart, GateFailure::Contacts, GateFailure::Inches, GateFailure::Coverage(text())];
-    let more = [GateFailure::Foreign(text()), GateFailure::Broken(text()), GateFailure::Temperature(text())];
+    let more = [
+        GateFailure::Foreign(text()),
+        GateFailure::Broken(text()),
+        GateFailure::Temperature(text()),
+        GateFailure::Moved(text()),
+    ];
     let gates = failures.into_iter().chain(more).map(Gate::Failed).chain([Gate::Passed]);
     let mut events: Vec<_> = gates.map(|gate| Event::Collected { cycle, targets: 100, found: 99, gate }).collect();
     events.push(Event::Collected { cycle, targets: 100, found: 10, gate: Gate::Passed });

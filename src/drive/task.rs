@@ -278,13 +278,26 @@ pub(super) struct Registered {
     pub(super) again: Option<Again>,
 }
 
-/// Outliers to be touched again, with a few targets around each.
+/// Outliers to be touched again, with a few targets around each and control points elsewhere.
 #[derive(Clone, Debug)]
 pub(super) struct Again {
     /// Numbers of the points to touch again.
     pub(super) points: Vec<usize>,
-    /// Targets: one for each of these points, then those around them.
+    /// Control points, which show whether part, frame and temperature are those of the first touches.
+    pub(super) controls: Vec<ControlPoint>,
+    /// Largest change of a control point that the noise of two touches explains.
+    pub(super) max_control_change_mm: f64,
+    /// Targets: one for each outlier, one for each control point, then those around the outliers.
     pub(super) targets: Vec<measuring::Target>,
+}
+
+/// Good touch that is repeated as a control.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ControlPoint {
+    /// Number of the point.
+    pub(super) point: usize,
+    /// Normal of the nominal surface at the point, in the CMM frame.
+    pub(super) normal: Vector,
 }
 
 /// Usable points of a measurement.

@@ -1,6 +1,6 @@
 //! Adaptive measurement, in which the touches are chosen: evaluation after a batch, and choice of the next targets.
 
-use super::task::{Adaptive, Again, Cycle, Points, Task};
+use super::task::{Adaptive, Again, ControlPoint, Cycle, Points, Task};
 use crate::compensation::{ErrorMap, told_map};
 use crate::device::Number;
 use crate::geometry::{Sample, Vector};
@@ -59,13 +59,18 @@ pub(super) fn look(
     }
 }
 
-/// Returns the outliers and a few targets around each, to be touched again. Returns `None` if the machine has no plan
-/// of this program, if there are no outliers, or if they are too many to be bad touches.
+/// Returns the outliers and a few targets around each, to be touched again, with control points. Returns `None` if the
+/// machine has no plan of this program, if there are no outliers, or if they are too many to be bad touches.
 ///
 /// The targets around lie on the way to the nearest other touched points: if the probe can touch two points, it can
-/// also reach the places between them.
-pub(super) fn again(task: &Task, found: &Registration, points: &Points) -> Option<Again> {
+/// also reach the places between them. The control points are good touches as far apart as possible.
+pub(super) fn again(task: &Task, found: &Registration, points: &Points, noise_sigma_mm: f64) -> Option<Again> {
     const MOST: usize = 20;
+    const CONTROLS: usize = 6;
+    /// Limit of the change of a control point, in standard deviations of the difference of two touches.
+    const CONTROL_SIGMAS: f64 = 5.0;
+    /// Change of a control point that is always allowed: the repeatability of a very good machine.
+    const MIN_CHANGE_MM: f64 = 5e-5;
     const AROUND: usize = 4;
     /// Share of the way to the neighbour.
     const SHARE: f64 = 0.4;
@@ -80,6 +85,10 @@ pub(super) fn again(task: &Task, found: &Registration, points: &Points) -> Optio
     let foot = |d: &Deviation| d.point - d.normal * d.deviation_mm;
     let mut targets: Vec<Target> = Vec::new();
     let mut around: Vec<Target> = Vec::new();
+    let used: Vec<usize> =
+        (0..found.deviations.len()).filter(|&k| found.deviations[k].status == PointStatus::Used).collect();
+    let places: Vec<_> = used.iter().map(|&k| (foot(&found.deviations[k]), found.deviations[k].normal)).collect();
+    let controls = farthest_points(&places, CONTROLS);
     for &k in &alone {
         let lone = &found.deviations[k];
         let at = foot(lone);
@@ -97,8 +106,12 @@ pub(super) fn again(task: &Task, found: &Registration, points: &Points) -> Optio
             }
         }
     }
+    targets.extend(controls.iter().map(|&k| Target { point: places[k].0, normal: places[k].1 }));
     targets.append(&mut around);
-    Some(Again { points: alone, targets })
+    let direction = |k: usize| found.cmm_from_model.direction(&places[k].1);
+    let controls = controls.iter().map(|&k| ControlPoint { point: used[k], normal: direction(k) }).collect();
+    let max_control_change_mm = (CONTROL_SIGMAS * 2f64.sqrt() * noise_sigma_mm).max(MIN_CHANGE_MM);
+    Some(Again { points: alone, controls, max_control_change_mm, targets })
 }
 
 /// Projects a target onto the nominal surface, along its normal.

@@ -15,7 +15,7 @@ use crate::cell::{
     LeftOut, ParameterTold, Response, TouchOn,
 };
 use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassError, Seen, Sense, error_map, response};
-use crate::device::{BesidePlan, Coordinates, Identified, Measurement, Plan, PointStatus, TargetKind};
+use crate::device::{BesidePlan, Coordinates, Identified, MeasuredPoint, Measurement, Plan, PointStatus, TargetKind};
 use crate::form::pv_of_most;
 use crate::formats::{
     FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_form, save_registration,
@@ -28,7 +28,7 @@ use crate::registration::{Options, PointStatus as Fate, Registration, Verdict, w
 
 use super::maps;
 use super::record::{Files, Unfinished, unfinished};
-use super::task::{Again, Cycle, Points, Product, Registered, Task, readings, used};
+use super::task::{Again, ControlPoint, Cycle, Points, Product, Registered, Task, readings, used};
 use super::touches;
 
 /// Checks if the measurement of a cycle can be used, and writes its points.
@@ -53,13 +53,8 @@ pub(super) fn gate_cycle(
         Some(failure) => (0, Err(failure)),
         None => {
             if let Some((again, points)) = again {
-                if measurement.coordinates == points.coordinates {
-                    let (points, found) = touched_again(again, points, measurement);
-                    (found, Ok(points))
-                } else {
-                    let message = "probe centres and contact points cannot be parts of one measurement; measure again";
-                    (0, Err(GateFailure::Broken(message.to_owned())))
-                }
+                touched_again(again, points, measurement)
+                    .map_or_else(|why| (0, Err(why)), |(points, found)| (found, Ok(points)))
             } else {
                 let [part, sphere] = touched(&plan, planned, measurement);
                 let told = (measurement.coordinates, measurement.temperature_c.filter(|told| told.is_finite()));
@@ -92,19 +87,62 @@ pub(super) fn gate_cycle(
 /// Replaces the touches that were repeated and adds those around them. Returns the points and the number of touches
 /// found.
 ///
-/// A miss leaves the old touch in place: only a touch replaces a touch.
-fn touched_again(again: &Again, points: &Points, measurement: &Measurement) -> (Points, u32) {
+/// A miss leaves the old touch in place: only a touch replaces a touch. The control points keep their first touches.
+///
+/// # Errors
+/// Other coordinates than those of the first touches, or control points that have moved: the two sets of touches are
+/// not of one measurement.
+fn touched_again(again: &Again, points: &Points, measurement: &Measurement) -> Result<(Points, u32), GateFailure> {
+    if measurement.coordinates != points.coordinates {
+        let message = "probe centres and contact points cannot be parts of one measurement; measure again";
+        return Err(GateFailure::Broken(message.to_owned()));
+    }
+    let (outliers, planned) = (again.points.len(), again.points.len() + again.controls.len());
+    if measurement.points.len() < planned {
+        let found = measurement.points.len();
+        return Err(GateFailure::Broken(format!("{found} points came for {planned} targets and more")));
+    }
+    let found = measurement.points.iter().filter(|point| point.status == PointStatus::Touched).count();
+    let (repeated, rest) = measurement.points.split_at(outliers);
+    let (controls, around) = rest.split_at(again.controls.len());
+    check_controls(again, points, controls)?;
     let mut all = points.clone();
     all.rounds += 1;
-    let mut found = 0;
-    for (k, point) in measurement.points.iter().enumerate().filter(|(_, p)| p.status == PointStatus::Touched) {
-        found += 1;
-        match again.points.get(k).and_then(|&number| all.part.get_mut(number)) {
-            Some(before) => *before = point.at_mm.into(),
-            None => all.part.push(point.at_mm.into()),
-        }
+    for (point, &number) in repeated.iter().zip(&again.points).filter(|(p, _)| p.status == PointStatus::Touched) {
+        all.part[number] = point.at_mm.into();
     }
-    (all, found)
+    all.part.extend(around.iter().filter(|p| p.status == PointStatus::Touched).map(|p| Point::from(p.at_mm)));
+    Ok((all, found as u32))
+}
+
+/// Compares the repeated control points with their first touches, along the normals.
+///
+/// One control point may be a wrong touch, so the second largest change decides.
+///
+/// # Errors
+/// A change that the noise of the probe does not explain, or fewer than two control points that were touched.
+fn check_controls(again: &Again, points: &Points, repeated: &[MeasuredPoint]) -> Result<(), GateFailure> {
+    let pairs = again.controls.iter().zip(repeated).filter(|(_, p)| p.status == PointStatus::Touched);
+    let change_mm = |control: &ControlPoint, now: &MeasuredPoint| {
+        (Point::from(now.at_mm) - points.part[control.point]).dot(&control.normal).abs()
+    };
+    let mut changes_mm: Vec<f64> = pairs.map(|(control, now)| change_mm(control, now)).collect();
+    changes_mm.sort_by(|a, b| b.total_cmp(a));
+    let limit_mm = again.max_control_change_mm;
+    match changes_mm.get(1) {
+        Some(&second_mm) if second_mm <= limit_mm => Ok(()),
+        Some(&second_mm) => Err(GateFailure::Moved(format!(
+            "{} control points lie {:.2} µm and more from their first touches, limit {:.2} µm",
+            changes_mm.iter().filter(|&&change| change > limit_mm).count(),
+            1e3 * second_mm,
+            1e3 * limit_mm,
+        ))),
+        None => Err(GateFailure::Moved(format!(
+            "{} of {} control points were found, at least 2 are required",
+            changes_mm.len(),
+            again.controls.len()
+        ))),
+    }
 }
 
 /// Returns the touched points of the part and of the reference sphere. A machine without a plan of this program gives
@@ -410,7 +448,10 @@ fn registered(
         figures.form = None;
     }
     let next = next.map(|(next, _)| next);
-    let again = if looked_at { None } else { touches::again(task, &found, points) };
+    // Without a model, the residuals of the fit bound the noise from above.
+    let noise_sigma_mm =
+        form.as_ref().map_or(found.verdict.residual_sigma_mm, |form| form.hyperparameters.noise_sigma_mm);
+    let again = if looked_at { None } else { touches::again(task, &found, points, noise_sigma_mm) };
     if let Some(left_out) = figures.left_out.as_mut() {
         left_out.again = again.is_some();
     }
@@ -762,4 +803,108 @@ fn save_points(task: &Task, files: &mut Files, points: &Points) -> Result<(), Fo
         write_points(files.place("reference_sphere.csv"), header, &points.sphere)?;
     }
     write_points(files.place("measured.csv"), header, &points.part)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Standard limit of the tests: changes of control points up to 2 µm are noise.
+    const LIMIT_MM: f64 = 2e-3;
+
+    /// Returns five points in a row on a plane, of which the last is an outlier and the others are control points.
+    fn first_touches() -> (Again, Points) {
+        let part: Vec<Point> = (0..5).map(|k| Point::new(f64::from(k), 0.0, 1.0)).collect();
+        let normal = Vector::z();
+        let again = Again {
+            points: vec![4],
+            controls: (0..4).map(|point| ControlPoint { point, normal }).collect(),
+            max_control_change_mm: LIMIT_MM,
+            targets: Vec::new(),
+        };
+        let points = Points {
+            part,
+            sphere: Vec::new(),
+            radius_mm: None,
+            coordinates: Coordinates::Centres,
+            radius_sigma_mm: 0.0,
+            probe_scatter_mm: [0.0; 2],
+            temperature_c: None,
+            tried: Vec::new(),
+            of: Vec::new(),
+            rounds: 0,
+        };
+        (again, points)
+    }
+
+    /// Returns a repetition: the outlier, the four control points, and one point around the outlier. `None` is a miss.
+    fn repeated(heights_mm: [Option<f64>; 6]) -> Measurement {
+        let x_mm = [4.0, 0.0, 1.0, 2.0, 3.0, 3.6];
+        let points = heights_mm.iter().zip(x_mm).zip(0..).map(|((height, x), index)| MeasuredPoint {
+            index,
+            at_mm: [x, 0.0, height.unwrap_or(0.0)],
+            status: if height.is_some() { PointStatus::Touched } else { PointStatus::NotFound },
+            quality: 0,
+        });
+        Measurement {
+            points: points.collect(),
+            coordinates: Coordinates::Centres,
+            probe_radius_mm: None,
+            temperature_c: None,
+            duration_s: None,
+            plan_identity: [0; 32],
+            job: 1,
+            cycle: 1,
+            done: 1,
+        }
+    }
+
+    fn heights(controls_mm: [f64; 4]) -> [Option<f64>; 6] {
+        let [a, b, c, d] = controls_mm;
+        [Some(0.5), Some(a), Some(b), Some(c), Some(d), Some(0.75)]
+    }
+
+    #[test]
+    fn repeated_touches_replace_outliers_and_keep_controls() {
+        let (again, points) = first_touches();
+        let (all, found) = touched_again(&again, &points, &repeated(heights([1.001; 4]))).unwrap();
+        assert_eq!((found, all.rounds, all.part.len()), (6, 1, 6));
+        assert_eq!(all.part[4], Point::new(4.0, 0.0, 0.5));
+        assert_eq!(all.part[5], Point::new(3.6, 0.0, 0.75));
+        assert_eq!(all.part[..4], points.part[..4]);
+    }
+
+    #[test]
+    fn a_missed_outlier_keeps_its_first_touch() {
+        let (again, points) = first_touches();
+        let missed = [None, Some(1.0), Some(1.0), Some(1.0), Some(1.0), None];
+        let (all, found) = touched_again(&again, &points, &repeated(missed)).unwrap();
+        assert_eq!((found, all.part), (4, points.part));
+    }
+
+    #[test]
+    fn a_part_that_moved_between_the_touches_is_refused() {
+        let (again, points) = first_touches();
+        // A tilt changes only the far control points.
+        for controls in [[1.0021; 4], [0.9979; 4], [1.0, 1.001, 1.0022, 1.0033]] {
+            let refused = touched_again(&again, &points, &repeated(heights(controls)));
+            assert!(matches!(refused, Err(GateFailure::Moved(_))), "{controls:?}");
+        }
+        // A single wrong touch says nothing about the part.
+        assert!(touched_again(&again, &points, &repeated(heights([1.0, 1.0, 9.0, 1.0]))).is_ok());
+    }
+
+    #[test]
+    fn without_two_control_points_the_touches_are_refused() {
+        let (again, points) = first_touches();
+        let missed = [Some(1.0), Some(1.0), None, None, None, Some(1.0)];
+        assert!(matches!(touched_again(&again, &points, &repeated(missed)), Err(GateFailure::Moved(_))));
+    }
+
+    #[test]
+    fn centres_and_contact_points_are_not_mixed() {
+        let (again, points) = first_touches();
+        let contacts = Measurement { coordinates: Coordinates::Contacts, ..repeated(heights([1.0; 4])) };
+        assert!(matches!(touched_again(&again, &points, &contacts), Err(GateFailure::Broken(_))));
+    }
 }

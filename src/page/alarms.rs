@@ -184,6 +184,12 @@ catalogue! { german:
         ["Prüfen, wie das Teil liegt: verdreht, auf Spänen, in einem anderen Sitz.", "Den Lauf beenden, das Teil nach Zeichnung einlegen und einen Lauf beginnen, der mit einer Messung anfängt.",
          "Lag es die ganze Zeit richtig, misst RESUME noch einmal."]
     }
+    PartMoved {
+        "Das Teil liegt nicht mehr dort, wo es bei den ersten Antastungen dieser Messung lag",
+        "Die wiederholten Antastungen werden nicht verwendet: sie gehören zu einer anderen Lage des Teils.",
+        ["Prüfen, ob das Teil gespannt ist und niemand es bewegt hat.", "Warten, bis Teil und Raum ihre Temperatur halten.",
+         "RESUME misst das ganze Teil noch einmal."]
+    }
     ProbeRadius {
         "Der Radius des Tasters ist nicht der im Rezept", "Diese Messung wird nicht verwendet: jede Abweichung wäre um ihn falsch.",
         ["Kugel und Referenzkugel reinigen.", "Den Taster an der Maschine einmessen oder den richtigen einsetzen.",
@@ -340,6 +346,7 @@ catalogue! { chinese:
     Coverage { "工件被测量的部分太少", "本次测量不予使用。", ["检查工件上是否有冷却液、切屑或压板，测针是否磨损或弯曲。", "按 RESUME 重新测量。"] }
     NoPart { "在应有的位置没有找到工件", "本次测量不予使用。", ["确认工件已装夹，且是正确的工件。", "按 RESUME 重新测量，或结束运行。"] }
     PartMisplaced { "工件偏离预期位置超过配方允许", "不生成误差图：否则会磨在错误的位置。", ["查看工件的装夹：转向、下有切屑、在别的座上。", "结束运行，按图装夹工件，开始以测量为起点的运行。", "如果它一直放置正确，按 RESUME 重新测量。"] }
+    PartMoved { "工件已不在本次测量首次触测时的位置", "重复触测的点不予使用：它们属于工件的另一位置。", ["检查工件是否夹紧、是否有人移动过它。", "等待工件和室温稳定。", "按 RESUME 重新测量整个工件。"] }
     ProbeRadius { "测头半径与配方不符", "本次测量不予使用：每个偏差都会因此出错。", ["清洁测球和标准球。", "在设备上校准测头，或换上正确的测针。", "按 RESUME 重新测量；半径不同的配方需要新的运行。"] }
     Contacts { "设备给出的是接触点，而应为测球中心", "本次测量不予使用：会有一个测头半径的误差。", ["关闭测量程序的半径补偿。", "按 RESUME 重新测量。"] }
     ForeignResult { "结果属于另一个工件、方案或循环", "不予使用。", ["查看设备执行了哪个任务。", "按 RESUME 重新测量。"] }

@@ -293,7 +293,8 @@ pub(super) fn gate_words(gate: &Gate) -> String {
             GateFailure::Coverage(words)
             | GateFailure::Foreign(words)
             | GateFailure::Broken(words)
-            | GateFailure::Temperature(words),
+            | GateFailure::Temperature(words)
+            | GateFailure::Moved(words),
         ) => format!("not usable: {words}"),
     }
 }

@@ -816,6 +816,7 @@ fn a_measurement_that_fails_its_gate_makes_no_map_and_is_repeated_under_the_next
         (GateFailure::Contacts, AlarmId::Contacts),
         (GateFailure::Inches, AlarmId::Inches),
         (GateFailure::Coverage("3 of 9".into()), AlarmId::Coverage),
+        (GateFailure::Moved("3 points".into()), AlarmId::PartMoved),
     ];
     for (why, alarm) in failures {
         let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
