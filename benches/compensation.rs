@@ -113,10 +113,10 @@ fn correction(bencher: Bencher, spacing_mm: f64) {
     let limits = CorrectionLimits {
         depth_of_cut_mm: 0.01,
         least_depth_mm: 0.0005,
-        largest_correction_mm: 0.1,
+        max_correction_mm: 0.1,
         allowance_mm: 0.06,
         removal_budget_mm: 1.0,
-        largest_depth_mm: 1.0,
+        max_depth_mm: 1.0,
     };
     bencher.bench(|| now.next(&error, &black_box(&known).after(&seen), None, &limits).expect("a correction"));
 }

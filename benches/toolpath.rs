@@ -134,10 +134,10 @@ fn from_deviations_to_a_program(bencher: Bencher) {
     let limits = CorrectionLimits {
         depth_of_cut_mm: 0.01,
         least_depth_mm: 0.0005,
-        largest_correction_mm: 0.1,
+        max_correction_mm: 0.1,
         allowance_mm: 0.06,
         removal_budget_mm: 1.0,
-        largest_depth_mm: 1.0,
+        max_depth_mm: 1.0,
     };
     let begin = LearningState::new(GainRule::Wavelength, &options, [100.0, 60.0], None);
     bencher.bench(|| {

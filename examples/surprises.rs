@@ -151,7 +151,7 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
         probability: Tolerance::USUAL,
         pv_of: PvOf::MostPoints,
     };
-    let adaptive = Adaptive { tolerance, accepted_risk: 0.025, most_cycles: 5 };
+    let adaptive = Adaptive { tolerance, accepted_risk: 0.025, max_cycles: 5 };
     let given =
         ModelInputs { look_risk: adaptive.look_risk(), probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() };
     let mut tried = vec![None; targets.len()];

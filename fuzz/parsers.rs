@@ -14,7 +14,7 @@ use regrind::cell::{Command, Ending, Event, Judgement};
 use regrind::compensation::Correction;
 use regrind::compensation::path::{Field, Wanted};
 use regrind::config::CellConfig;
-use regrind::device::exchange::Wanted as WantedResult;
+use regrind::device::exchange::ResultRequirements;
 use regrind::document::Problems;
 use regrind::drive::{Reply, Request};
 use regrind::formats::Unit;
@@ -141,10 +141,11 @@ pub fn result(bytes: &[u8]) -> bool {
         assert!(told.into_iter().flatten().all(f64::is_finite));
         let targets = [0, 1, 2, 7];
         for targets in [None, Some(&targets[..])] {
-            let wanted = WantedResult { targets, content: &content, probe_radius_mm: 1.5, probe_tolerance_mm: 0.01 };
+            let wanted =
+                ResultRequirements { targets, content: &content, probe_radius_mm: 1.5, probe_tolerance_mm: 0.01 };
             if let Ok(read) = wanted.read(path(), bytes) {
-                let matched = wanted.matched(path(), &read);
-                assert!(matched.is_err() || targets.is_none() || matched.is_ok_and(|all| all.len() == 4));
+                let assigned = wanted.assign_by_index(path(), &read);
+                assert!(assigned.is_err() || targets.is_none() || assigned.is_ok_and(|all| all.len() == 4));
             }
         }
     }
@@ -365,7 +366,7 @@ pub fn payload(bytes: &[u8]) -> bool {
     match kind % 6 {
         0 => comes_back_exactly(bytes, payload::Plan::decode, |plan| Some(plan.encode())),
         1 => comes_back_exactly(bytes, payload::Map::decode, |map| {
-            assert!(map.at(0.0, 0.0).is_finite() && map.largest_mm() >= 0.0);
+            assert!(map.displacement_at(0.0, 0.0).is_finite() && map.max_abs_mm() >= 0.0);
             Some(map.encode())
         }),
         2 => comes_back_exactly(bytes, payload::Pass::decode, |pass| Some(pass.encode())),

@@ -61,7 +61,7 @@ pub struct Progress {
 
 /// Result that a finished or stopped job puts into the outbox.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Outcome {
+pub struct ResultData {
     /// Kind: 4 points, 5 pass record.
     pub kind: u16,
     /// Format of the records.
@@ -86,7 +86,7 @@ pub struct Outcome {
 ///
 /// The handshake calls `prepare`, `begin`, then `advance` in small steps of the machine's own time while the state is
 /// EXECUTE. It calls `retract` when the machine must hold, stop or abort, and `outcome` when the job has ended.
-pub trait Body: Send {
+pub trait Physics: Send {
     /// Returns the kind of machine.
     fn kind(&self) -> Kind;
     /// Returns the name and serial number of the machine, at most 32 ASCII characters.
@@ -107,16 +107,16 @@ pub trait Body: Send {
     fn advance(&mut self, seconds: f64) -> Progress;
     /// Moves clear of the part; the job can then continue with `advance` or end with `outcome`.
     fn retract(&mut self);
-    /// Returns true if [`Body::so_far`] is supported.
-    fn tells_so_far(&self) -> bool {
+    /// Returns true if [`Physics::partial_result`] is supported.
+    fn has_partial_result(&self) -> bool {
         false
     }
     /// Returns the final part of the result of a running job; `None` if the machine gives its result only at the end.
-    fn so_far(&self) -> Option<Outcome> {
+    fn partial_result(&self) -> Option<ResultData> {
         None
     }
     /// Ends the job as complete (1), stopped (2), aborted (3) or failed (4), and returns its result.
-    fn outcome(&mut self, result: u16) -> Outcome;
+    fn end_job(&mut self, result: u16) -> ResultData;
     /// Returns the interlock bits of docs/modbus.md, including bit 1, clear of the part.
     fn interlocks(&self) -> u16;
     /// Returns the temperature in the status block, in °C.

@@ -19,12 +19,12 @@ use std::sync::{Arc, Mutex};
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
 
-use crate::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
+use crate::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
 use crate::part::{Approach, Contact, touch_sphere};
 use crate::payload::{BROKEN, Feature, INTERLOCK, Plan, PointRecord, Status, Target, encode_points, outside};
 use crate::probe::Placement;
-use crate::spec::{CmmSpec, Faults, REFERENCE_C};
-use crate::truth::{Source, State, locked, nothing_done, stream};
+use crate::spec::{CmmSpec, REFERENCE_C, WorldFaults};
+use crate::truth::{Source, WorldState, empty_result, locked, stream};
 use crate::{Rng, Vec3};
 
 /// Millimetres per count of scaled points: a nanometre.
@@ -37,7 +37,7 @@ impl CmmSpec {
     }
 
     /// Refuses a plan that moves the probe beyond its travel.
-    fn reaches(&self, plan: &Plan) -> Result<(), Refusal> {
+    fn check_travel(&self, plan: &Plan) -> Result<(), Refusal> {
         let highest = plan.targets.iter().map(|t| t.point_mm[2]).fold(f64::NEG_INFINITY, f64::max);
         let travel_mm = highest + plan.safe_height_mm;
         let (least, most) = (self.travel_least_mm, self.travel_most_mm);
@@ -49,7 +49,7 @@ impl CmmSpec {
         };
         check("height of the travel in mm", travel_mm, 2)?;
         for target in &plan.targets {
-            let way = way(target, plan, plan.probe_radius_mm);
+            let way = approach_to(target, plan, plan.probe_radius_mm);
             for t in [way.from_mm, way.to_mm] {
                 for axis in 0..3 {
                     let value = way.point_mm[axis] + t * way.direction[axis];
@@ -62,7 +62,7 @@ impl CmmSpec {
 }
 
 /// Returns the way of the centre of a ball with the given radius to a target; the machine steers by the stated radius.
-fn way(target: &Target, plan: &Plan, radius_mm: f64) -> Approach {
+fn approach_to(target: &Target, plan: &Plan, radius_mm: f64) -> Approach {
     Approach {
         point_mm: target.point_mm,
         direction: target.normal,
@@ -112,7 +112,7 @@ impl Run {
         }
     }
 
-    fn begin(&mut self, state: &mut State) {
+    fn begin(&mut self, state: &mut WorldState) {
         state.measurements_begun += 1;
         self.placement = state.load_on_table();
         self.due_s = Self::due_s(&self.plan, &state.spec.cmm);
@@ -147,10 +147,10 @@ impl Run {
     }
 
     /// Returns the result with the present records, as the machine reports it.
-    fn told(&self, state: &State) -> Outcome {
+    fn to_result(&self, state: &WorldState) -> ResultData {
         let (spec, faults) = (&state.spec.cmm, &state.spec.faults);
         let scale = spec.scaled_points.then_some(COUNT_MM);
-        Outcome {
+        ResultData {
             kind: 4,
             format: if spec.scaled_points { 2 } else { 1 },
             bytes: encode_points(&self.records, scale),
@@ -164,7 +164,7 @@ impl Run {
     }
 
     /// Touches one target.
-    fn measure(&mut self, state: &State, target: &Target) -> PointRecord {
+    fn measure(&mut self, state: &WorldState, target: &Target) -> PointRecord {
         let spec = &state.spec.cmm;
         let shift = self.disturbance(spec);
         let missed = self.not_found.random::<f64>() < spec.not_found_share;
@@ -187,9 +187,9 @@ impl Run {
     }
 
     /// Computes the contact in the machine's frame.
-    fn contact(&self, state: &State, target: &Target) -> Contact {
+    fn contact(&self, state: &WorldState, target: &Target) -> Contact {
         let spec = &state.spec.cmm;
-        let in_machine = way(target, &self.plan, self.plan.probe_radius_mm + 1e-3 * spec.probe_radius_error_um);
+        let in_machine = approach_to(target, &self.plan, self.plan.probe_radius_mm + 1e-3 * spec.probe_radius_error_um);
         if target.feature == Feature::ReferenceSphere {
             return touch_sphere(spec.sphere_centre_mm, spec.sphere_radius_mm, &in_machine);
         }
@@ -208,8 +208,8 @@ impl Run {
             to_mm: in_machine.to_mm / growth,
         };
         match state.part.touch(&in_part) {
-            Contact::Touched { centre_mm, foot_mm } => {
-                Contact::Touched { centre_mm: self.placement.apply(centre_mm.map(|c| c * growth)), foot_mm }
+            Contact::Touched { centre_mm, contact_mm: foot_mm } => {
+                Contact::Touched { centre_mm: self.placement.apply(centre_mm.map(|c| c * growth)), contact_mm: foot_mm }
             }
             other => other,
         }
@@ -235,7 +235,7 @@ fn untouched(target: &Target, status: Status) -> PointRecord {
 }
 
 /// Returns the position that this machine, with its faults, reports for a centre.
-fn reported(faults: &Faults, target: &Target, stated_radius_mm: f64, centre_mm: Vec3) -> Vec3 {
+fn reported(faults: &WorldFaults, target: &Target, stated_radius_mm: f64, centre_mm: Vec3) -> Vec3 {
     let back = if faults.returns_contact_points { stated_radius_mm } else { 0.0 };
     let unit = if faults.inches { 25.4 } else { 1.0 };
     let sign = if faults.cmm_mirrored { [1.0, -1.0, 1.0] } else { [1.0; 3] };
@@ -244,20 +244,20 @@ fn reported(faults: &Faults, target: &Target, stated_radius_mm: f64, centre_mm: 
 
 /// Measuring machine of a world.
 pub struct Cmm {
-    world: Arc<Mutex<State>>,
+    world: Arc<Mutex<WorldState>>,
     ready: Option<Run>,
     running: Option<Run>,
 }
 
 impl Cmm {
-    pub(crate) fn new(world: Arc<Mutex<State>>) -> Self {
+    pub(crate) fn new(world: Arc<Mutex<WorldState>>) -> Self {
         Self { world, ready: None, running: None }
     }
 }
 
 /// Result of a touch.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Touch {
+pub enum TouchResult {
     /// The ball touched; its centre.
     Centre(Vec3),
     /// The ball met nothing.
@@ -267,13 +267,13 @@ pub enum Touch {
 }
 
 /// Probe of the measuring machine, controlled touch by touch by a server that has no plan.
-pub struct Led {
-    world: Arc<Mutex<State>>,
+pub struct TouchProbe {
+    world: Arc<Mutex<WorldState>>,
     run: Option<Run>,
 }
 
-impl Led {
-    pub(crate) fn new(world: Arc<Mutex<State>>) -> Self {
+impl TouchProbe {
+    pub(crate) fn new(world: Arc<Mutex<WorldState>>) -> Self {
         Self { world, run: None }
     }
 
@@ -300,10 +300,10 @@ impl Led {
         point_mm: Vec3,
         normal: Vec3,
         [probe_radius_mm, approach_mm, search_mm]: [f64; 3],
-    ) -> Touch {
+    ) -> TouchResult {
         let mut state = locked(&self.world);
-        if state.unknown || !state.take(Kind::Cmm) {
-            return Touch::Unexpected;
+        if state.part_unknown || !state.claim_part(Kind::Cmm) {
+            return TouchResult::Unexpected;
         }
         let feature = feature(&state.spec.cmm, point_mm);
         let target = Target { index: 0, feature, point_mm, normal };
@@ -329,14 +329,14 @@ impl Led {
         let record = run.measure(&state, &target);
         self.run = Some(run);
         match record.status {
-            Status::Touched => Touch::Centre(record.position_mm),
-            Status::NotFound => Touch::Missed,
-            Status::NotReached => Touch::Unexpected,
+            Status::Touched => TouchResult::Centre(record.position_mm),
+            Status::NotFound => TouchResult::Missed,
+            Status::NotReached => TouchResult::Unexpected,
         }
     }
 
     /// Moves the probe clear of the part, so that the other machine can take the part.
-    pub fn let_go(&mut self) {
+    pub fn release_part(&mut self) {
         locked(&self.world).release(Kind::Cmm);
     }
 }
@@ -360,7 +360,7 @@ fn progress(run: &Run) -> Progress {
     }
 }
 
-impl Body for Cmm {
+impl Physics for Cmm {
     fn kind(&self) -> Kind {
         Kind::Cmm
     }
@@ -374,7 +374,7 @@ impl Body for Cmm {
             return Err(Refusal { answer: BROKEN, reason: format!("a CMM has no use for a payload of kind {kind}") });
         }
         let plan = Plan::decode(&payload.bytes)?;
-        locked(&self.world).spec.cmm.reaches(&plan)
+        locked(&self.world).spec.cmm.check_travel(&plan)
     }
 
     fn prepare(&mut self, _job: u32, _cycle: u16, payloads: &Payloads) -> Result<Progress, Refusal> {
@@ -382,8 +382,8 @@ impl Body for Cmm {
         let missing = || Refusal { answer: BROKEN, reason: "there is no plan".to_owned() };
         let plan = Plan::decode(&payloads.plan.as_ref().ok_or_else(missing)?.bytes)?;
         let state = locked(&self.world);
-        state.spec.cmm.reaches(&plan)?;
-        if state.taken_by_other(Kind::Cmm) {
+        state.spec.cmm.check_travel(&plan)?;
+        if state.is_held_by_other(Kind::Cmm) {
             return Err(Refusal { answer: INTERLOCK, reason: "the part is in the grinder".to_owned() });
         }
         let run = Run::new(plan);
@@ -395,7 +395,7 @@ impl Body for Cmm {
     fn begin(&mut self) {
         let Some(mut run) = self.ready.take() else { return };
         let mut state = locked(&self.world);
-        if state.take(Kind::Cmm) {
+        if state.claim_part(Kind::Cmm) {
             run.begin(&mut state);
             self.running = Some(run);
         }
@@ -421,28 +421,28 @@ impl Body for Cmm {
             }
         }
         if run.finished() || run.fault != 0 {
-            state.clear(Kind::Cmm);
+            state.disengage(Kind::Cmm);
         }
         progress(run)
     }
 
     fn retract(&mut self) {
-        locked(&self.world).clear(Kind::Cmm);
+        locked(&self.world).disengage(Kind::Cmm);
     }
 
-    fn tells_so_far(&self) -> bool {
+    fn has_partial_result(&self) -> bool {
         true
     }
 
-    fn so_far(&self) -> Option<Outcome> {
+    fn partial_result(&self) -> Option<ResultData> {
         let run = self.running.as_ref()?;
-        Some(run.told(&locked(&self.world)))
+        Some(run.to_result(&locked(&self.world)))
     }
 
-    fn outcome(&mut self, _result: u16) -> Outcome {
+    fn end_job(&mut self, _result: u16) -> ResultData {
         let mut state = locked(&self.world);
         self.ready = None;
-        let Some(mut run) = self.running.take() else { return nothing_done(state.spec.cmm.part_temperature_c) };
+        let Some(mut run) = self.running.take() else { return empty_result(state.spec.cmm.part_temperature_c) };
         state.release(Kind::Cmm);
         let faults = &state.spec.faults;
         let rest = run.plan.targets[run.records.len()..].iter();
@@ -452,7 +452,7 @@ impl Body for Cmm {
         if let (true, Some(record)) = (faults.non_finite_point, run.records.get_mut(kept / 2)) {
             record.position_mm[0] = f64::NAN;
         }
-        let outcome = run.told(&state);
+        let outcome = run.to_result(&state);
         state.heat *= (-outcome.duration_s / state.spec.grinder.thermal_tau_s).exp();
         outcome
     }

@@ -3,7 +3,7 @@
 
 use serde::Serialize;
 
-use crate::words::{Image, WordOrder, bytes_of, crc16};
+use crate::words::{RegisterBlock, WordOrder, bytes_of, crc16};
 
 /// States of docs/modbus.md.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -70,7 +70,7 @@ impl Command {
     ];
 
     /// Returns the command with a number.
-    pub fn of(number: u16) -> Option<Self> {
+    pub fn from_number(number: u16) -> Option<Self> {
         Self::ALL.get(usize::from(number).checked_sub(1)?).copied()
     }
 
@@ -112,7 +112,7 @@ pub enum Answer {
 
 /// Command block of 20 registers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct Frame {
+pub struct CommandFrame {
     /// Sequence number; 0 is never used.
     pub sequence: u32,
     /// Number of the command.
@@ -133,10 +133,10 @@ pub struct Frame {
     pub argument: u32,
 }
 
-impl Frame {
+impl CommandFrame {
     /// Returns the 20 registers.
     pub fn registers(&self, order: WordOrder) -> Vec<u16> {
-        let mut words = Image::new(order, 20)
+        let mut words = RegisterBlock::new(order, 20)
             .u32(0, self.sequence)
             .u16(2, self.command)
             .u16(3, self.cycle)

@@ -14,7 +14,7 @@
 //!
 //! **Tracks.** A track begins when the wheel comes near the part, and ends when it lifts off or turns back in x. A
 //! track grinds the strip half way to its neighbours, with the depth at its own y: the ridges between are the
-//! [`Grooves`] of the part. A track is therefore ground only when the next one or [`Wheel::settle`] comes. Beyond the
+//! [`Grooves`] of the part. A track is therefore ground only when the next one or [`Wheel::finish_waiting_track`] comes. Beyond the
 //! outermost track, the wheel leaves its own curve. Tracks must run along x.
 //!
 //! **Passes.** A pass lasts from when the wheel comes to the part until the part is taken away; the wheel is dressed
@@ -26,9 +26,9 @@ use crate::Vec3;
 use crate::body::Kind;
 use crate::part::{Grooves, HeightGrid, NODE_SPACING_MM, Part};
 use crate::process::{cut, smooth};
-use crate::shape::foot;
+use crate::shape::project_onto;
 use crate::spec::{SpecError, WorldSpec};
-use crate::truth::{Source, State, Sweep, locked, stream};
+use crate::truth::{ExecutedPass, Source, WorldState, locked, stream};
 
 /// Maximum height over the part at which the wheel is at the part, in mm.
 const NEAR_MM: f64 = 1.0;
@@ -37,12 +37,12 @@ const TOO_DEEP_MM: f64 = 2.0;
 /// Extension of a strip beyond a border without a neighbour, as a share of its half width.
 const ON_BORDER: f64 = 0.05;
 /// Width that the wheel grinds beyond its outermost track, in mm.
-const BESIDE_MM: f64 = 1.5;
+const OUTER_STRIP_MM: f64 = 1.5;
 
 /// Projection of the wheel's centre onto the part.
 #[derive(Clone, Copy, Debug)]
-struct Foot {
-    at_mm: [f64; 2],
+struct WheelProjection {
+    position_mm: [f64; 2],
     /// Height that the wheel would leave over the nominal surface, in mm.
     height_mm: f64,
     seconds: f64,
@@ -50,12 +50,12 @@ struct Foot {
 
 /// Track over the part.
 struct Track {
-    feet: Vec<Foot>,
+    projections: Vec<WheelProjection>,
     y_mm: f64,
 }
 
 /// Values that are fixed from the beginning of a pass.
-struct Pass {
+struct PassState {
     /// Systematic and random error at every node, in mm.
     fixed_mm: Vec<f64>,
     /// Curvature of the grooves, if there are any.
@@ -72,14 +72,14 @@ struct Pass {
 
 /// Wheel of a grinder with an external controller.
 pub struct Wheel {
-    world: Arc<Mutex<State>>,
+    world: Arc<Mutex<WorldState>>,
     stated_radius_mm: f64,
     last: Option<(Vec3, f64)>,
     guess_mm: [f64; 2],
-    pass: Option<Pass>,
-    feet: Vec<Foot>,
+    pass: Option<PassState>,
+    projections: Vec<WheelProjection>,
     /// Track that waits for the next one.
-    waiting: Option<Track>,
+    waiting_track: Option<Track>,
     /// Half the spacing of the tracks, once there are two, and the side on which they follow each other.
     half_mm: Option<f64>,
     side: f64,
@@ -88,54 +88,70 @@ pub struct Wheel {
 }
 
 impl Wheel {
-    pub(crate) fn new(world: Arc<Mutex<State>>, stated_radius_mm: f64) -> Result<Self, SpecError> {
+    pub(crate) fn new(world: Arc<Mutex<WorldState>>, stated_radius_mm: f64) -> Result<Self, SpecError> {
         if !(0.1..=1000.0).contains(&stated_radius_mm) {
             return Err(SpecError { key: "radius of the wheel", value: stated_radius_mm, limit: "0.1 to 1000 mm" });
         }
         let (last, guess_mm, pass, feet, waiting) = (None, [0.0; 2], None, Vec::new(), None);
         let (half_mm, side, reached_mm) = (None, 1.0, None);
-        Ok(Self { world, stated_radius_mm, last, guess_mm, pass, feet, waiting, half_mm, side, reached_mm })
+        Ok(Self {
+            world,
+            stated_radius_mm,
+            last,
+            guess_mm,
+            pass,
+            projections: feet,
+            waiting_track: waiting,
+            half_mm,
+            side,
+            reached_mm,
+        })
     }
 
     /// Moves the wheel: position of its centre in the frame of the part, and time by the controller's clock.
-    pub fn at(&mut self, place_mm: Vec3, seconds: f64) {
+    pub fn move_to(&mut self, place_mm: Vec3, seconds: f64) {
         let Some((from_mm, then)) = self.last.replace((place_mm, seconds)) else { return };
         if from_mm == place_mm {
             return;
         }
         let world = Arc::clone(&self.world);
         let state = &mut *locked(&world);
-        match self.foot(state, [from_mm, place_mm], [then, seconds]) {
-            Some(foot) => self.come_over(state, foot),
-            None => self.leave(state),
+        match self.project(state, [from_mm, place_mm], [then, seconds]) {
+            Some(foot) => self.add_projection(state, foot),
+            None => self.lift_off(state),
         }
     }
 
     /// Handles an unknown position, as before homing or after power-off: the wheel does not touch the part.
-    pub fn away(&mut self) {
+    pub fn set_position_unknown(&mut self) {
         self.last = None;
         let world = Arc::clone(&self.world);
-        self.leave(&mut locked(&world));
+        self.lift_off(&mut locked(&world));
     }
 
     /// Handles a lost part of the path: the state of the part is then unknown.
-    pub fn lost(&mut self) {
-        self.away();
-        locked(&self.world).unknown = true;
+    pub fn path_lost(&mut self) {
+        self.set_position_unknown();
+        locked(&self.world).part_unknown = true;
     }
 
     /// Grinds the waiting track as one without a next neighbour. If the wheel is at the part, its present track
     /// continues.
-    pub fn settle(&mut self) {
+    pub fn finish_waiting_track(&mut self) {
         let world = Arc::clone(&self.world);
         let state = &mut *locked(&world);
-        if self.feet.is_empty() {
+        if self.projections.is_empty() {
             self.grind_waiting(state, None);
         }
     }
 
     /// Projects the wheel's centre onto the part, if it is near it.
-    fn foot(&mut self, state: &mut State, [from_mm, place_mm]: [Vec3; 2], [then, seconds]: [f64; 2]) -> Option<Foot> {
+    fn project(
+        &mut self,
+        state: &mut WorldState,
+        [from_mm, place_mm]: [Vec3; 2],
+        [then, seconds]: [f64; 2],
+    ) -> Option<WheelProjection> {
         let error_mm = 1e-3 * state.spec.grinder.wheel_radius_error_um;
         let stated_mm = self.stated_radius_mm;
         let radius_mm = *state.true_wheel_radius_mm.get_or_insert(stated_mm + error_mm);
@@ -148,39 +164,39 @@ impl Wheel {
         centre[2] += radius_mm - stated_mm;
         let near = [place_mm[0], place_mm[1]];
         let (at_mm, distance_mm) =
-            [self.guess_mm, near].into_iter().find_map(|from| foot(state.part.shape.as_ref(), centre, from))?;
+            [self.guess_mm, near].into_iter().find_map(|from| project_onto(state.part.shape.as_ref(), centre, from))?;
         self.guess_mm = at_mm;
         let height_mm = distance_mm - radius_mm;
         let over_mm = height_mm - state.part.height.at(at_mm[0], at_mm[1]).0;
-        state.unknown |= over_mm < -TOO_DEEP_MM && state.part.aperture.contains(at_mm[0], at_mm[1]);
-        (over_mm < NEAR_MM).then_some(Foot { at_mm, height_mm, seconds })
+        state.part_unknown |= over_mm < -TOO_DEEP_MM && state.part.aperture.contains(at_mm[0], at_mm[1]);
+        (over_mm < NEAR_MM).then_some(WheelProjection { position_mm: at_mm, height_mm, seconds })
     }
 
-    fn come_over(&mut self, state: &mut State, foot: Foot) {
-        if !state.take(Kind::Grinder) {
+    fn add_projection(&mut self, state: &mut WorldState, foot: WheelProjection) {
+        if !state.claim_part(Kind::Grinder) {
             // The probe is at the part.
-            state.unknown = true;
+            state.part_unknown = true;
             return;
         }
         if self.pass.is_none() || state.on_table {
             self.begin(state, foot.seconds);
         }
-        if let [first, .., last] = &self.feet[..] {
-            let forth = last.at_mm[0] - first.at_mm[0];
-            if forth * (foot.at_mm[0] - last.at_mm[0]) < 0.0 {
+        if let [first, .., last] = &self.projections[..] {
+            let forth = last.position_mm[0] - first.position_mm[0];
+            if forth * (foot.position_mm[0] - last.position_mm[0]) < 0.0 {
                 self.end_track(state);
             }
         }
-        self.feet.push(foot);
+        self.projections.push(foot);
     }
 
-    fn leave(&mut self, state: &mut State) {
+    fn lift_off(&mut self, state: &mut WorldState) {
         self.end_track(state);
         state.release(Kind::Grinder);
     }
 
-    fn begin(&mut self, state: &mut State, seconds: f64) {
-        (self.waiting, self.half_mm, self.reached_mm) = (None, None, None);
+    fn begin(&mut self, state: &mut WorldState, seconds: f64) {
+        (self.waiting_track, self.half_mm, self.reached_mm) = (None, None, None);
         state.on_table = false;
         state.passes_begun += 1;
         state.passes_of_blank += 1;
@@ -194,7 +210,7 @@ impl Wheel {
         state.part.height.add(&fresh, &mut fixed_mm);
         let radius_mm = state.true_wheel_radius_mm.unwrap_or(self.stated_radius_mm);
         let nodes = state.part.height.nodes().filter(|[x, y]| state.part.aperture.contains(*x, *y)).count() as f64;
-        self.pass = Some(Pass {
+        self.pass = Some(PassState {
             fixed_mm,
             bend: bend(&state.spec, &state.part, radius_mm),
             began_s: seconds,
@@ -204,33 +220,35 @@ impl Wheel {
             in_air: 0,
             first_mm: None,
         });
-        state.sweeps.push(Sweep::default());
+        state.executed_passes.push(ExecutedPass::default());
     }
 
     /// Ends the track after the wheel has lifted off or turned back.
-    fn end_track(&mut self, state: &mut State) {
-        let feet = std::mem::take(&mut self.feet);
+    fn end_track(&mut self, state: &mut WorldState) {
+        let feet = std::mem::take(&mut self.projections);
         let [half_x, half_y] = state.part.aperture.half_mm();
-        let on_part = |foot: &&Foot| foot.at_mm[0].abs() <= half_x && foot.at_mm[1].abs() <= half_y + BESIDE_MM;
+        let on_part = |foot: &&WheelProjection| {
+            foot.position_mm[0].abs() <= half_x && foot.position_mm[1].abs() <= half_y + OUTER_STRIP_MM
+        };
         let (sum, count) =
-            feet.iter().filter(on_part).fold((0.0, 0.0), |(sum, n), foot| (sum + foot.at_mm[1], n + 1.0));
+            feet.iter().filter(on_part).fold((0.0, 0.0), |(sum, n), foot| (sum + foot.position_mm[1], n + 1.0));
         if count > 0.0 && feet.len() > 1 {
-            let track = Track { y_mm: sum / count, feet };
+            let track = Track { y_mm: sum / count, projections: feet };
             self.grind_waiting(state, Some(track.y_mm));
-            self.waiting = Some(track);
+            self.waiting_track = Some(track);
         }
     }
 
     /// Grinds the waiting track, half way to the next one.
-    fn grind_waiting(&mut self, state: &mut State, next_mm: Option<f64>) {
-        let Some(track) = self.waiting.take() else { return };
+    fn grind_waiting(&mut self, state: &mut WorldState, next_mm: Option<f64>) {
+        let Some(track) = self.waiting_track.take() else { return };
         let Some(mut pass) = self.pass.take() else { return };
         let step = next_mm.map(|next| next - track.y_mm).filter(|step| self.is_neighbour(*step));
         if let Some(step) = step {
             (self.half_mm, self.side) = (Some(0.5 * step.abs()), step.signum());
         }
         pass.first_mm.get_or_insert(track.y_mm);
-        leave_grooves(state, &pass, &track, self.half_mm);
+        update_grooves(state, &pass, &track, self.half_mm);
         let half = self.half_mm.unwrap_or(0.5 * NODE_SPACING_MM);
         let (far, near) = (track.y_mm + self.side * half, track.y_mm - self.side * half);
         let joined = self.reached_mm.filter(|reached| (reached - near).abs() < 0.2 * half);
@@ -255,7 +273,7 @@ impl Wheel {
 /// Returns the curvature of the grooves that a wheel leaves over the whole part, if it leaves any.
 fn bend(spec: &WorldSpec, part: &Part, radius_mm: f64) -> Option<HeightGrid> {
     spec.grinder.scallops.then(|| {
-        let mut bend = HeightGrid::over(part.aperture.half_mm(), 0.0);
+        let mut bend = HeightGrid::new(part.aperture.half_mm(), 0.0);
         bend.heights_mm = bend.nodes().map(|at| Grooves::bend_at(part.shape.as_ref(), radius_mm, at)).collect();
         bend
     })
@@ -263,11 +281,11 @@ fn bend(spec: &WorldSpec, part: &Part, radius_mm: f64) -> Option<HeightGrid> {
 
 /// Updates the grooves: they lie at the tracks of this pass. Where it has not come, those of the pass before keep their
 /// height.
-fn leave_grooves(state: &mut State, pass: &Pass, track: &Track, half_mm: Option<f64>) {
+fn update_grooves(state: &mut WorldState, pass: &PassState, track: &Track, half_mm: Option<f64>) {
     let (Some(half), Some(first_mm)) = (half_mm, pass.first_mm) else { return };
     let number = ((track.y_mm - first_mm) / (2.0 * half)).round();
     let spacing_mm = if number == 0.0 { 2.0 * half } else { (track.y_mm - first_mm) / number };
-    if let Some(sweep) = state.sweeps.last_mut() {
+    if let Some(sweep) = state.executed_passes.last_mut() {
         sweep.spacing_mm = spacing_mm;
     }
     if pass.bend.is_none() {
@@ -275,22 +293,28 @@ fn leave_grooves(state: &mut State, pass: &Pass, track: &Track, half_mm: Option<
         return;
     }
     let before = state.part.grooves.take().map(|grooves| grooves.bend);
-    let bend = before.unwrap_or_else(|| HeightGrid::over(state.part.aperture.half_mm(), 0.0));
+    let bend = before.unwrap_or_else(|| HeightGrid::new(state.part.aperture.half_mm(), 0.0));
     let wheel_radius_mm = state.true_wheel_radius_mm.unwrap_or_default();
     state.part.grooves = Some(Grooves { first_mm, spacing_mm, wheel_radius_mm, bend });
 }
 
 /// Lets a track grind the nodes of its strip and, next to it where there is no other track, those that its own curve
 /// reaches.
-fn grind(state: &mut State, pass: &mut Pass, track: &Track, strip: [f64; 2], beside: impl Iterator<Item = f64>) {
+fn grind(
+    state: &mut WorldState,
+    pass: &mut PassState,
+    track: &Track,
+    strip: [f64; 2],
+    beside: impl Iterator<Item = f64>,
+) {
     let spec = &state.spec.grinder;
     let strokes = |visits: u64| visits as f64 / pass.nodes.max(1.0);
     let worn = state.worn_strokes;
     let wear_um = spec.wear_at_um(worn + strokes(pass.visits)) - spec.wear_at_um(worn);
-    let seconds = track.feet.last().map_or(0.0, |foot| foot.seconds) - pass.began_s;
+    let seconds = track.projections.last().map_or(0.0, |foot| foot.seconds) - pass.began_s;
     let heat = 1.0 - (1.0 - pass.heat_at_begin) * (-seconds / spec.thermal_tau_s).exp();
     let drift_mm = 1e-3 * (wear_um - spec.thermal_um * (heat - pass.heat_at_begin));
-    for (node, [x, y], height_mm) in crossed(&state.part.height, track, strip) {
+    for (node, [x, y], height_mm) in nodes_in_strip(&state.part.height, track, strip) {
         let bend = pass.bend.as_ref().map(|bend| bend.heights_mm[node]);
         let has_cut = cut(state, node, height_mm + pass.fixed_mm[node] + drift_mm, bend);
         if state.part.aperture.contains(x, y) {
@@ -300,7 +324,8 @@ fn grind(state: &mut State, pass: &mut Pass, track: &Track, strip: [f64; 2], bes
     }
     for side in beside {
         let edge = if (strip[1] - strip[0]) * side > 0.0 { strip[1] } else { strip[0] };
-        for (node, [x, y], height_mm) in crossed(&state.part.height, track, [edge, edge + side * BESIDE_MM]) {
+        for (node, [x, y], height_mm) in nodes_in_strip(&state.part.height, track, [edge, edge + side * OUTER_STRIP_MM])
+        {
             let radius_mm = state.true_wheel_radius_mm.unwrap_or(f64::INFINITY);
             // A wheel without grooves is straight across its tracks.
             let across = pass.bend.as_ref().map(|_| Grooves::bend_at(state.part.shape.as_ref(), radius_mm, [x, y]));
@@ -309,19 +334,19 @@ fn grind(state: &mut State, pass: &mut Pass, track: &Track, strip: [f64; 2], bes
         }
     }
     state.heat = heat;
-    if let Some(sweep) = state.sweeps.last_mut() {
+    if let Some(sweep) = state.executed_passes.last_mut() {
         let [strokes, strokes_in_air] = [pass.visits, pass.in_air].map(|n| n as f64 / pass.nodes.max(1.0));
-        *sweep = Sweep { strokes, strokes_in_air, tracks: sweep.tracks + 1, seconds, ..*sweep };
+        *sweep = ExecutedPass { strokes, strokes_in_air, tracks: sweep.tracks + 1, seconds, ..*sweep };
     }
 }
 
 /// Returns the nodes of a track within a strip of y, with the height that the wheel would leave at each: that at the
 /// track's own y.
-fn crossed(grid: &HeightGrid, track: &Track, strip: [f64; 2]) -> Vec<(usize, [f64; 2], f64)> {
+fn nodes_in_strip(grid: &HeightGrid, track: &Track, strip: [f64; 2]) -> Vec<(usize, [f64; 2], f64)> {
     let mut nodes = Vec::new();
-    for pair in track.feet.windows(2) {
+    for pair in track.projections.windows(2) {
         let [a, b] = [pair[0], pair[1]];
-        let (from, to) = (a.at_mm[0], b.at_mm[0]);
+        let (from, to) = (a.position_mm[0], b.position_mm[0]);
         nodes.extend(grid.within([from, to], strip).map(|(node, [x, y])| {
             let share = (x - from) / (to - from);
             (node, [x, y], a.height_mm + share * (b.height_mm - a.height_mm))

@@ -11,9 +11,9 @@ struct Rule<Place, Fault> {
 }
 
 /// Pending faults, each at a place as the machine names it. Clones share them.
-pub struct Faults<Place, Fault>(Arc<Mutex<Vec<Rule<Place, Fault>>>>);
+pub struct PendingFaults<Place, Fault>(Arc<Mutex<Vec<Rule<Place, Fault>>>>);
 
-impl<Place, Fault> Faults<Place, Fault> {
+impl<Place, Fault> PendingFaults<Place, Fault> {
     /// Returns a list without faults.
     pub fn none() -> Self {
         Self(Arc::default())
@@ -31,7 +31,7 @@ impl<Place, Fault> Faults<Place, Fault> {
 
     /// Returns the fault that happens now, if any, at a place that matches. The first of several is taken, and the
     /// others wait.
-    pub(crate) fn at(&self, is_meant: impl Fn(&Place) -> bool) -> Option<Fault> {
+    pub(crate) fn next_at(&self, is_meant: impl Fn(&Place) -> bool) -> Option<Fault> {
         let mut rules = self.rules();
         let mut met = None;
         for (k, rule) in rules.iter_mut().enumerate().filter(|(_, rule)| is_meant(&rule.place)) {
@@ -48,7 +48,7 @@ impl<Place, Fault> Faults<Place, Fault> {
     }
 }
 
-impl<Place, Fault> Clone for Faults<Place, Fault> {
+impl<Place, Fault> Clone for PendingFaults<Place, Fault> {
     fn clone(&self) -> Self {
         Self(Arc::clone(&self.0))
     }
@@ -60,12 +60,12 @@ mod tests {
 
     #[test]
     fn each_comes_once_at_its_place_after_those_that_go_well() {
-        let faults = Faults::<String, u8>::none();
+        let faults = PendingFaults::<String, u8>::none();
         faults.add("a", 1, 1);
         faults.add("a", 1, 2);
         faults.add("b", 0, 3);
         let shared = faults.clone();
-        let at = |name: &str| shared.at(|place| place == name);
+        let at = |name: &str| shared.next_at(|place| place == name);
         assert_eq!([at("c"), at("a"), at("a"), at("a"), at("a")], [None, None, Some(1), Some(2), None]);
         assert_eq!([at("b"), at("b")], [Some(3), None]);
         faults.add("b", 0, 4);

@@ -3,16 +3,16 @@
 
 use crate::part::Part;
 use crate::program::Program;
-use crate::shape::foot;
+use crate::shape::project_onto;
 
 /// Maximum distance of consecutive samples along a move, in mm.
-const APART_MM: f64 = 0.15;
+const SAMPLE_SPACING_MM: f64 = 0.15;
 /// Maximum distance of the ball from the nominal contact at which it grinds, in mm.
 const NEAR_MM: f64 = 1.0;
 
 /// Place where the ball touches or would touch, and its height over the nominal surface, in mm.
 #[derive(Clone, Copy, Debug)]
-struct Touch {
+struct BallSample {
     at_mm: [f64; 2],
     height_mm: f64,
 }
@@ -20,8 +20,8 @@ struct Touch {
 /// Returns at every node of a part the height over the nominal surface that a ball of this radius leaves, in mm; NaN
 /// where the ball does not come.
 pub(crate) fn heights_mm(part: &Part, program: &Program, radius_mm: f64, track_mm: f64) -> Vec<f64> {
-    let reach_mm = (1.6 * track_mm).max(2.0 * APART_MM);
-    let cells = Cells::of(touches(part, program, radius_mm), reach_mm);
+    let reach_mm = (1.6 * track_mm).max(2.0 * SAMPLE_SPACING_MM);
+    let cells = SampleIndex::new(touches(part, program, radius_mm), reach_mm);
     part.height.nodes().map(|at| cells.level_mm(on_part(part, at))).collect()
 }
 
@@ -41,11 +41,11 @@ fn on_part(part: &Part, at_mm: [f64; 2]) -> [f64; 2] {
     at(on)
 }
 
-fn touches(part: &Part, program: &Program, radius_mm: f64) -> Vec<Touch> {
+fn touches(part: &Part, program: &Program, radius_mm: f64) -> Vec<BallSample> {
     let mut found = Vec::new();
-    for pair in program.stops.windows(2).filter(|pair| pair[1].feed_mm_min.is_some()) {
+    for pair in program.waypoints.windows(2).filter(|pair| pair[1].feed_mm_min.is_some()) {
         let (from, to) = (&pair[0], &pair[1]);
-        let count = (program.way_mm(from, to) / APART_MM).ceil().max(1.0);
+        let count = (program.length_mm(from, to) / SAMPLE_SPACING_MM).ceil().max(1.0);
         for k in 1..=count as usize {
             found.extend(touch(part, program.centre_mm(from, to, k as f64 / count), radius_mm));
         }
@@ -54,23 +54,23 @@ fn touches(part: &Part, program: &Program, radius_mm: f64) -> Vec<Touch> {
 }
 
 /// Projects the centre of the ball onto the nominal surface.
-fn touch(part: &Part, centre: [f64; 3], radius_mm: f64) -> Option<Touch> {
-    let (at_mm, over_mm) = foot(part.shape.as_ref(), centre, [centre[0], centre[1]])?;
+fn touch(part: &Part, centre: [f64; 3], radius_mm: f64) -> Option<BallSample> {
+    let (at_mm, over_mm) = project_onto(part.shape.as_ref(), centre, [centre[0], centre[1]])?;
     let height_mm = over_mm - radius_mm;
-    (height_mm.abs() < NEAR_MM).then_some(Touch { at_mm, height_mm })
+    (height_mm.abs() < NEAR_MM).then_some(BallSample { at_mm, height_mm })
 }
 
 /// Touches, indexed by their place.
-struct Cells {
+struct SampleIndex {
     reach_mm: f64,
-    of: std::collections::HashMap<[i64; 2], Vec<Touch>>,
+    samples: std::collections::HashMap<[i64; 2], Vec<BallSample>>,
 }
 
-impl Cells {
-    fn of(touches: Vec<Touch>, reach_mm: f64) -> Self {
-        let mut cells = Self { reach_mm, of: Default::default() };
+impl SampleIndex {
+    fn new(touches: Vec<BallSample>, reach_mm: f64) -> Self {
+        let mut cells = Self { reach_mm, samples: Default::default() };
         for touch in touches {
-            cells.of.entry(cells.cell(touch.at_mm)).or_default().push(touch);
+            cells.samples.entry(cells.cell(touch.at_mm)).or_default().push(touch);
         }
         cells
     }
@@ -86,7 +86,7 @@ impl Cells {
         // Normal equations of h = c0 + c1 u + c2 v.
         let (mut m, mut b) = ([[0.0; 3]; 3], [0.0; 3]);
         let around = (i - 1..=i + 1).flat_map(|i| (j - 1..=j + 1).map(move |j| [i, j]));
-        for touch in around.filter_map(|cell| self.of.get(&cell)).flatten() {
+        for touch in around.filter_map(|cell| self.samples.get(&cell)).flatten() {
             let [u, v] = [0, 1].map(|k| (touch.at_mm[k] - at_mm[k]) / self.reach_mm);
             let weight = (1.0 - u * u - v * v).max(0.0).powi(2);
             let row = [1.0, u, v];
@@ -98,12 +98,12 @@ impl Cells {
         // Touches along one line do not determine the slope across it; this small regularization keeps the plane level.
         m[1][1] += 1e-6 * m[0][0];
         m[2][2] += 1e-6 * m[0][0];
-        first_of(m, b)
+        solve_first(m, b)
     }
 }
 
 /// Returns the first unknown of three equations by Cramer's rule; NaN if the system is singular.
-fn first_of(m: [[f64; 3]; 3], b: [f64; 3]) -> f64 {
+fn solve_first(m: [[f64; 3]; 3], b: [f64; 3]) -> f64 {
     let of = |c: [f64; 3]| {
         c[0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (c[1] * m[2][2] - m[1][2] * c[2])
             + m[0][2] * (c[1] * m[2][1] - m[1][1] * c[2])
@@ -114,7 +114,7 @@ fn first_of(m: [[f64; 3]; 3], b: [f64; 3]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::program::Stop;
+    use crate::program::Waypoint;
     use crate::spec::WorldSpec;
 
     /// Returns a part of the default world, with a raster of ball centres over it that leaves a given height over x and
@@ -131,7 +131,7 @@ mod tests {
                 let (point, normal) = (part.shape.point(x, y), part.shape.normal(x, y));
                 let at_mm = std::array::from_fn(|k| point[k] + (10.0 + left_mm(x, y)) * normal[k]);
                 let feed_mm_min = (i > 0).then_some(600.0);
-                program.stops.push(Stop { at_mm, turn_deg: None, feed_mm_min, minutes: None, turn: None });
+                program.waypoints.push(Waypoint { at_mm, rotary_deg: None, feed_mm_min, minutes: None, arc: None });
             }
         }
         let heights = heights_mm(&part, &program, 10.0, apart_mm);

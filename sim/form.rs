@@ -66,7 +66,7 @@ impl FormError {
     /// From node to node, the phase of a wave advances by the same angle, so each value is a rotation of the one
     /// before: no cosine is computed within a row. Rounding errors accumulate to about 1e-14 of the amplitude over a
     /// row of hundreds of nodes.
-    pub fn add_to_net(&self, first_mm: [f64; 2], step_mm: [f64; 2], columns: usize, values_mm: &mut [f64]) {
+    pub fn add_to_grid(&self, first_mm: [f64; 2], step_mm: [f64; 2], columns: usize, values_mm: &mut [f64]) {
         let turns: Vec<_> = self.waves.iter().map(|[kx, ..]| (kx * step_mm[0]).sin_cos()).collect();
         for (j, row) in values_mm.chunks_mut(columns).enumerate() {
             let y = first_mm[1] + j as f64 * step_mm[1];
@@ -109,7 +109,7 @@ mod tests {
     fn a_net_holds_what_the_places_do() {
         let form = FormError::with_rms(&mut crate::rng(3), 8.0, 0.5);
         let mut values = vec![1.0; 300 * 7];
-        form.add_to_net([-40.0, 3.0], [0.5, 2.5], 300, &mut values);
+        form.add_to_grid([-40.0, 3.0], [0.5, 2.5], 300, &mut values);
         for (k, value) in values.iter().enumerate() {
             let (x, y) = (-40.0 + 0.5 * (k % 300) as f64, 3.0 + 2.5 * (k / 300) as f64);
             assert!((value - 1.0 - form.height(x, y)).abs() < 1e-12, "({x}, {y})");

@@ -10,12 +10,12 @@ use std::time::Duration;
 use rand::RngExt;
 
 use crate::Rng;
-use crate::body::{Body, Kind, Payloads, Progress};
-use crate::command::{Answer, Command, Frame, Mode, State, interlock};
+use crate::body::{Kind, Payloads, Physics, Progress};
+use crate::command::{Answer, Command, CommandFrame, Mode, State, interlock};
 use crate::options::MachineOptions;
-use crate::seen::{Listening, Log, What};
+use crate::seen::{BeatMonitor, EventLog, HandshakeEvent};
 use crate::transfer::{Arrived, Origin, Outbox, Slot, slot_of};
-use crate::words::{Image, WordOrder};
+use crate::words::{RegisterBlock, WordOrder};
 
 /// Faults of docs/modbus.md that the handshake itself raises.
 const FAULT_STOP_CIRCUIT: u16 = 1;
@@ -31,7 +31,7 @@ const STEP_S: f64 = 0.1;
 
 /// Prepared job.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-struct Work {
+struct JobKey {
     job: u32,
     cycle: u16,
     digest: u32,
@@ -39,8 +39,8 @@ struct Work {
 
 /// Machine's side of the handshake.
 pub(crate) struct Handshake {
-    pub(crate) body: Box<dyn Body>,
-    pub(crate) log: Log,
+    pub(crate) body: Box<dyn Physics>,
+    pub(crate) log: EventLog,
     pub(crate) now: Duration,
     pub(crate) speed: f64,
     pub(crate) slots: [Option<Slot>; 3],
@@ -56,7 +56,7 @@ pub(crate) struct Handshake {
     acknowledged: u32,
     answer: Answer,
     fault: u16,
-    work: Work,
+    job: JobKey,
     token: u32,
     token_left: Duration,
     /// True if a START began a job that has not ended.
@@ -77,16 +77,16 @@ pub(crate) struct Handshake {
     epoch: u32,
     silent: Duration,
     /// Beats of the owner during the running job.
-    listening: Listening,
+    beat_monitor: BeatMonitor,
     acting_left: Duration,
 }
 
 impl Handshake {
-    pub(crate) fn new(body: Box<dyn Body>, boot_id: u32, options: &MachineOptions) -> Self {
+    pub(crate) fn new(body: Box<dyn Physics>, boot_id: u32, options: &MachineOptions) -> Self {
         let silence_ms = if options.lost_after_ms == 0 { 3000 } else { options.lost_after_ms };
         Self {
             body,
-            log: Log::default(),
+            log: EventLog::default(),
             now: Duration::ZERO,
             speed: options.speed,
             slots: [None, None, None],
@@ -102,7 +102,7 @@ impl Handshake {
             acknowledged: 0,
             answer: Answer::None,
             fault: 0,
-            work: Work::default(),
+            job: JobKey::default(),
             token: 0,
             token_left: Duration::ZERO,
             running: false,
@@ -119,25 +119,25 @@ impl Handshake {
             owner: 0,
             epoch: 0,
             silent: Duration::ZERO,
-            listening: Listening::default(),
+            beat_monitor: BeatMonitor::default(),
             acting_left: Duration::ZERO,
         }
     }
 
     /// Reads the command block after its last register was written.
-    pub(crate) fn look(&mut self, words: &[u16; 20]) {
-        let Some(frame) = Frame::read(self.order, words) else { return self.note(What::Broken) };
-        let (sequence, command) = (frame.sequence, Command::of(frame.command));
+    pub(crate) fn read_command(&mut self, words: &[u16; 20]) {
+        let Some(frame) = CommandFrame::read(self.order, words) else { return self.note(HandshakeEvent::Broken) };
+        let (sequence, command) = (frame.sequence, Command::from_number(frame.command));
         if sequence == self.acknowledged {
-            return self.note(What::Repeated { sequence });
+            return self.note(HandshakeEvent::Repeated { sequence });
         }
         if sequence < self.acknowledged && !matches!(command, Some(Command::Claim | Command::Abort)) {
-            return self.note(What::Old { sequence });
+            return self.note(HandshakeEvent::Old { sequence });
         }
         let answer = command.map_or(Answer::Unknown, |command| self.judge(command, &frame));
         self.acknowledged = sequence;
         self.answer = answer;
-        self.note(What::Commanded { frame, answer, state: self.state });
+        self.note(HandshakeEvent::Commanded { frame, answer, state: self.state });
         if let (Some(command), Answer::Accepted) = (command, answer) {
             self.act(command, &frame);
         }
@@ -150,7 +150,7 @@ impl Handshake {
 
     /// Handles a new beat of the owner.
     pub(crate) fn beat(&mut self) {
-        self.listening.hear(self.now);
+        self.beat_monitor.record(self.now);
         self.hear();
     }
 
@@ -159,7 +159,7 @@ impl Handshake {
         self.silent = Duration::ZERO;
     }
 
-    fn judge(&mut self, command: Command, frame: &Frame) -> Answer {
+    fn judge(&mut self, command: Command, frame: &CommandFrame) -> Answer {
         match command {
             Command::Claim => return self.judge_claim(frame),
             Command::Abort => return Answer::Accepted,
@@ -184,13 +184,13 @@ impl Handshake {
         }
     }
 
-    fn judge_claim(&self, frame: &Frame) -> Answer {
-        let free = self.owner == 0 || self.is_deserted();
+    fn judge_claim(&self, frame: &CommandFrame) -> Answer {
+        let free = self.owner == 0 || self.is_client_lost();
         let mine = frame.owner == self.owner && frame.epoch >= self.epoch;
         if frame.owner != 0 && (free || mine) { Answer::Accepted } else { Answer::NotOwner }
     }
 
-    fn judge_prepare(&mut self, frame: &Frame) -> Answer {
+    fn judge_prepare(&mut self, frame: &CommandFrame) -> Answer {
         if !self.is_safe(interlock::ALL) {
             return Answer::Interlock;
         }
@@ -214,13 +214,13 @@ impl Handshake {
         }
     }
 
-    fn judge_start(&self, frame: &Frame) -> Answer {
-        let asked = Work { job: frame.job, cycle: frame.cycle, digest: frame.digest };
+    fn judge_start(&self, frame: &CommandFrame) -> Answer {
+        let asked = JobKey { job: frame.job, cycle: frame.cycle, digest: frame.digest };
         if !self.is_safe(interlock::ALL) {
             Answer::Interlock
         } else if self.token == 0 || frame.token != self.token {
             Answer::Token
-        } else if asked != self.work || (self.digest() != Some(frame.digest) && !self.trusting) {
+        } else if asked != self.job || (self.digest() != Some(frame.digest) && !self.trusting) {
             Answer::Different
         } else if self.begun.contains(&(frame.job, frame.cycle)) && !self.trusting {
             Answer::Begun
@@ -243,14 +243,14 @@ impl Handshake {
     }
 
     /// Carries out an accepted command; its number and answer are latched already.
-    fn act(&mut self, command: Command, frame: &Frame) {
+    fn act(&mut self, command: Command, frame: &CommandFrame) {
         match command {
             Command::Claim => {
                 (self.owner, self.epoch, self.token) = (frame.owner, frame.epoch, 0);
                 self.hear();
             }
             Command::Prepare => {
-                self.work = Work { job: frame.job, cycle: frame.cycle, digest: frame.digest };
+                self.job = JobKey { job: frame.job, cycle: frame.cycle, digest: frame.digest };
                 self.token = self.rng.random_range(1..=u32::MAX);
                 self.token_left = TOKEN_LIFE;
                 self.enter(State::Prepared);
@@ -274,15 +274,15 @@ impl Handshake {
         }
     }
 
-    fn begin(&mut self, frame: &Frame) {
+    fn begin(&mut self, frame: &CommandFrame) {
         let (job, cycle) = (frame.job, frame.cycle);
         self.token = 0;
         self.begun_by = frame.sequence;
         self.last_begun = (job, cycle);
         self.begun.insert((job, cycle));
         self.running = true;
-        self.listening = Listening::from(self.now);
-        self.note(What::Began { start: frame.sequence, job, cycle });
+        self.beat_monitor = BeatMonitor::new(self.now);
+        self.note(HandshakeEvent::Began { start: frame.sequence, job, cycle });
         self.enter(State::Execute);
         self.body.begin();
     }
@@ -312,18 +312,18 @@ impl Handshake {
     fn show(&mut self, fault: u16) {
         self.fault = fault;
         if fault != 0 {
-            self.note(What::Fault { fault });
+            self.note(HandshakeEvent::Fault { fault });
         }
     }
 
     fn enter(&mut self, to: State) {
         if to == State::Idle {
-            (self.work, self.token, self.fault) = (Work::default(), 0, 0);
+            (self.job, self.token, self.fault) = (JobKey::default(), 0, 0);
             self.outbox = None;
         }
         let from = std::mem::replace(&mut self.state, to);
         if from != to {
-            self.note(What::Changed { from, to });
+            self.note(HandshakeEvent::Changed { from, to });
         }
     }
 
@@ -333,9 +333,13 @@ impl Handshake {
             return true;
         }
         (self.done, self.result) = (self.begun_by, result);
-        self.note(What::Ended { start: self.begun_by, result, beats: self.listening.until(self.now) });
+        self.note(HandshakeEvent::Ended {
+            start: self.begun_by,
+            result,
+            beats: self.beat_monitor.statistics(self.now),
+        });
         let origin = self.origin();
-        self.outbox = Outbox::new(self.order, self.body.outcome(result), origin);
+        self.outbox = Outbox::new(self.order, self.body.end_job(result), origin);
         self.outbox.is_some()
     }
 
@@ -343,12 +347,12 @@ impl Handshake {
     fn origin(&self) -> Origin {
         let slot = self.slots[if self.body.kind() == Kind::Cmm { 0 } else { 1 }].as_ref();
         let identity = slot.map_or([0; 32], |slot| slot.payload.identity);
-        Origin { job: self.work.job, cycle: self.work.cycle, done: self.done, identity }
+        Origin { job: self.job.job, cycle: self.job.cycle, done: self.done, identity }
     }
 
     /// Returns true if full pages of a result are available while its job still runs.
     pub(crate) fn gives_ahead(&self) -> bool {
-        self.gives_ahead && self.body.tells_so_far()
+        self.gives_ahead && self.body.has_partial_result()
     }
 
     /// Returns the present outbox, if it has content.
@@ -356,7 +360,7 @@ impl Handshake {
         match self.state {
             State::Complete => self.outbox.as_ref().map(Cow::Borrowed),
             State::Execute | State::Holding | State::Held | State::Stopping if self.running && self.gives_ahead() => {
-                Outbox::so_far(self.order, self.body.so_far()?, self.origin()).map(Cow::Owned)
+                Outbox::partial(self.order, self.body.partial_result()?, self.origin()).map(Cow::Owned)
             }
             _ => None,
         }
@@ -372,7 +376,7 @@ impl Handshake {
     }
 
     /// Lets real time pass, at most a few hundredths of a second.
-    pub(crate) fn pass(&mut self, elapsed: Duration) {
+    pub(crate) fn advance_time(&mut self, elapsed: Duration) {
         self.now += elapsed;
         self.silent = self.silent.saturating_add(elapsed);
         match self.state {
@@ -419,7 +423,7 @@ impl Handshake {
                 _ => FAULT_STOP_CIRCUIT,
             });
         }
-        if self.is_deserted() {
+        if self.is_client_lost() {
             return self.hold(FAULT_SILENT);
         }
         if !self.running {
@@ -439,7 +443,7 @@ impl Handshake {
         }
     }
 
-    fn is_deserted(&self) -> bool {
+    fn is_client_lost(&self) -> bool {
         self.silent > self.silence_limit
     }
 
@@ -481,7 +485,7 @@ impl Handshake {
     /// Starts an uncommanded motion, or returns the machine to its state before.
     pub(crate) fn stray(&mut self, strays: bool) {
         if strays && self.state == State::Idle {
-            self.note(What::Strayed);
+            self.note(HandshakeEvent::Strayed);
             self.progress = Progress { done: 0, total: u32::MAX, ..Progress::default() };
             self.silent = Duration::ZERO;
             self.enter(State::Execute);
@@ -496,7 +500,7 @@ impl Handshake {
     }
 
     /// Notes that a client has read what is in force.
-    pub(crate) fn looked_at(&mut self) {
+    pub(crate) fn slots_were_read(&mut self) {
         if !std::mem::take(&mut self.spoils_soon) {
             return;
         }
@@ -504,7 +508,7 @@ impl Handshake {
             let Some(slot) = &mut self.slots[kind - 1] else { continue };
             slot.payload.identity[0] ^= 1;
             let identity = slot.payload.identity;
-            self.note(What::Taken { kind: kind as u16, identity });
+            self.note(HandshakeEvent::Taken { kind: kind as u16, identity });
         }
     }
 
@@ -512,7 +516,7 @@ impl Handshake {
     /// fault.
     pub(crate) fn reboot(&mut self) {
         let cut_off = self.lose_memory();
-        self.note(What::Rebooted { boot_id: self.boot_id });
+        self.note(HandshakeEvent::Rebooted { boot_id: self.boot_id });
         self.enter(State::Idle);
         if cut_off {
             self.show(FAULT_OTHER);
@@ -527,7 +531,7 @@ impl Handshake {
         if cut_off {
             self.body.retract();
             // The physics ends its job; its result is lost with the application's memory.
-            let _ = self.body.outcome(4);
+            let _ = self.body.end_job(4);
         }
         self.boot_id = loop {
             let id = self.rng.random_range(1..=u32::MAX);
@@ -548,30 +552,30 @@ impl Handshake {
     pub(crate) fn forget(&mut self) {
         let boot_id = self.boot_id;
         self.lose_memory();
-        self.note(What::Forgot);
+        self.note(HandshakeEvent::Forgot);
         (self.boot_id, self.last_begun) = (boot_id, (0, 0));
         self.begun.clear();
         self.show(0);
         self.enter(State::Idle);
     }
 
-    pub(crate) fn note(&mut self, what: What) {
+    pub(crate) fn note(&mut self, what: HandshakeEvent) {
         self.log.push(self.now, what);
     }
 
     /// Puts a payload into force; otherwise returns the answer that refuses it.
-    pub(crate) fn take(&mut self, arrived: Arrived) -> Result<(), u16> {
+    pub(crate) fn put_in_force(&mut self, arrived: Arrived) -> Result<(), u16> {
         let (kind, identity) = (arrived.kind, arrived.identity);
         let slot = Slot::new(self.order, arrived);
         if let Err(refusal) = self.body.check(kind, &slot.payload) {
-            self.note(What::Refused { kind, reason: refusal.to_string() });
+            self.note(HandshakeEvent::Refused { kind, reason: refusal.to_string() });
             return Err(refusal.answer);
         }
         if let Some(index) = slot_of(self.body.kind(), kind) {
             self.slots[index] = Some(slot);
         }
         self.spoils_soon |= std::mem::take(&mut self.spoils);
-        self.note(What::Taken { kind, identity });
+        self.note(HandshakeEvent::Taken { kind, identity });
         Ok(())
     }
 
@@ -583,16 +587,16 @@ impl Handshake {
     /// Returns the status block, without its snapshot number and the beats.
     pub(crate) fn image(&self) -> Vec<u16> {
         let temperature = (self.body.temperature_c() * 100.0).round().clamp(-32768.0, 32767.0) as i16;
-        Image::new(self.order, 48)
+        RegisterBlock::new(self.order, 48)
             .u16(1, self.state as u16)
             .u16(2, self.mode as u16)
             .u16(3, self.interlocks())
             .u32(4, self.acknowledged)
             .u16(6, self.answer as u16)
             .u16(7, self.fault)
-            .u32(8, self.work.job)
-            .u16(10, self.work.cycle)
-            .u32(12, self.work.digest)
+            .u32(8, self.job.job)
+            .u16(10, self.job.cycle)
+            .u32(12, self.job.digest)
             .u32(14, self.token)
             .u32(16, self.done)
             .u16(18, self.result)

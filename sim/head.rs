@@ -10,7 +10,7 @@
 //! program says.
 
 use crate::Vec3;
-use crate::program::{Program, Stop};
+use crate::program::{Program, Waypoint};
 
 /// Rotary head.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -39,14 +39,14 @@ impl Head {
 
     /// Returns the centre of the wheel at a share of the way from a stop to the next; the head turns in proportion to
     /// the way of the slides.
-    pub fn along_mm(&self, from: &Stop, to: &Stop, share: f64) -> Vec3 {
-        let slides = to.on_the_way(from.at_mm, share);
-        let ends = from.turn_deg.or(to.turn_deg).zip(to.turn_deg);
+    pub fn centre_on_move_mm(&self, from: &Waypoint, to: &Waypoint, share: f64) -> Vec3 {
+        let slides = to.position_at(from.at_mm, share);
+        let ends = from.rotary_deg.or(to.rotary_deg).zip(to.rotary_deg);
         ends.map_or(slides, |(a, b)| self.centre_mm(slides, a + share * (b - a)))
     }
 
     /// Returns the reason why this head cannot execute a program.
-    pub(crate) fn refuses(&self, program: &Program) -> Option<String> {
+    pub(crate) fn refusal_reason(&self, program: &Program) -> Option<String> {
         let letter = program.axis?;
         if letter != self.letter {
             return Some(format!("the program turns {letter}, and this machine has {}", self.letter));
@@ -58,7 +58,7 @@ impl Head {
             return Some("the program leads the slides, and this control keeps the wheel's centre".into());
         }
         let [least, most] = self.range_deg;
-        let turns = program.stops.iter().filter_map(|stop| stop.turn_deg);
+        let turns = program.waypoints.iter().filter_map(|stop| stop.rotary_deg);
         let beyond = turns.into_iter().find(|turn| !(least - 1e-6..=most + 1e-6).contains(turn));
         beyond.map(|turn| format!("{letter} {turn} is beyond {least} to {most} degrees"))
     }

@@ -8,7 +8,7 @@ use crate::words::WordOrder;
 /// First address of every block.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
-pub struct Layout {
+pub struct RegisterLayout {
     pub identity: u16,
     pub sync: u16,
     pub beat: u16,
@@ -23,7 +23,7 @@ pub struct Layout {
     pub outbox_page: u16,
 }
 
-impl Default for Layout {
+impl Default for RegisterLayout {
     fn default() -> Self {
         Self {
             identity: 0,
@@ -58,7 +58,7 @@ pub(crate) enum Block {
     OutboxPage,
 }
 
-impl Layout {
+impl RegisterLayout {
     fn blocks(&self) -> [(Block, u16, usize); 12] {
         [
             (Block::Identity, self.identity, 32),
@@ -93,7 +93,7 @@ pub struct MachineOptions {
     /// True if the low byte of each register comes before the high one.
     pub swaps_bytes: bool,
     /// Addresses of the blocks.
-    pub layout: Layout,
+    pub layout: RegisterLayout,
     /// Seconds of the machine's own time in a real second.
     pub speed: f64,
     /// Seed of the tokens and of the next boot ids.
@@ -120,7 +120,7 @@ impl Default for MachineOptions {
         Self {
             word_order: WordOrder::Big,
             swaps_bytes: false,
-            layout: Layout::default(),
+            layout: RegisterLayout::default(),
             speed: 1.0,
             seed: 1,
             lost_after_ms: 0,

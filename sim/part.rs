@@ -231,7 +231,7 @@ pub struct HeightGrid {
 
 impl HeightGrid {
     /// Creates a grid over a rectangle about the origin, with one height at all nodes.
-    pub fn over(half_mm: [f64; 2], height_mm: f64) -> Self {
+    pub fn new(half_mm: [f64; 2], height_mm: f64) -> Self {
         let spacing = NODE_SPACING_MM.max(half_mm[0].max(half_mm[1]) / 200.0);
         let cells = half_mm.map(|half| ((2.0 * half / spacing).ceil() as usize).max(4));
         let step_mm = [0, 1].map(|i| 2.0 * half_mm[i] / cells[i] as f64);
@@ -262,7 +262,7 @@ impl HeightGrid {
 
     /// Adds a random form to values at the nodes, in millimetres.
     pub fn add(&self, form: &FormError, values_mm: &mut [f64]) {
-        form.add_to_net(self.first_mm, self.step_mm, self.columns, values_mm);
+        form.add_to_grid(self.first_mm, self.step_mm, self.columns, values_mm);
     }
 
     /// Returns the area of a cell in square millimetres.
@@ -359,7 +359,7 @@ pub enum Contact {
         /// Centre of the ball in the model frame, in mm.
         centre_mm: Vec3,
         /// Projection of the contact onto the plane (x, y), in mm.
-        foot_mm: [f64; 2],
+        contact_mm: [f64; 2],
     },
     /// The ball was in the material already where the search begins.
     Unexpected,
@@ -404,7 +404,7 @@ pub struct Part {
 impl Part {
     /// Returns the part with its blank: stock and a form error drawn from a seed.
     pub fn blank(spec: &PartSpec, seed: u64) -> Self {
-        let mut height = HeightGrid::over(spec.aperture.half_mm(), spec.stock_um * 1e-3);
+        let mut height = HeightGrid::new(spec.aperture.half_mm(), spec.stock_um * 1e-3);
         let [half_x, half_y] = spec.aperture.half_mm();
         let form = if spec.form_error_um > 0.0 {
             let (length, pv) = (spec.form_error_correlation_mm, spec.form_error_um * 1e-3);
@@ -420,7 +420,7 @@ impl Part {
 
     /// Returns the deviation of the real surface at (x, y), along the nominal normal, in mm.
     pub fn deviation_mm(&self, x: f64, y: f64) -> f64 {
-        self.proud(x, y, self.nearest_track(y)).0
+        self.height_and_gradient(x, y, self.nearest_track(y)).0
     }
 
     /// Returns the height of the ridges over the bottom of the grooves at (x, y), in mm.
@@ -433,7 +433,7 @@ impl Part {
     }
 
     /// Returns the height and its gradient, in the groove of a track.
-    fn proud(&self, x: f64, y: f64, track: f64) -> (f64, [f64; 2]) {
+    fn height_and_gradient(&self, x: f64, y: f64, track: f64) -> (f64, [f64; 2]) {
         let (h, slope) = self.height.at(x, y);
         let Some(grooves) = &self.grooves else { return (h, slope) };
         let (over, by) = grooves.at(x, y, track);
@@ -450,7 +450,7 @@ impl Part {
     /// Returns the point and its derivatives by x and y, in the groove of a track continued without end.
     fn tangents(&self, x: f64, y: f64, track: f64) -> (Vec3, Vec3, Vec3) {
         let ([p, q], [zxx, zxy, zyy]) = (self.shape.gradient(x, y), self.shape.hessian(x, y));
-        let (h, [hx, hy]) = self.proud(x, y, track);
+        let (h, [hx, hy]) = self.height_and_gradient(x, y, track);
         let w = 1.0 / (1.0 + p * p + q * q).sqrt();
         let n = [-p * w, -q * w, w];
         // n = N / |N| with N = (-p, -q, 1), so dn = (dN - n (n . dN)) / |N|.
@@ -480,7 +480,7 @@ impl Part {
             None => Contact::Missed,
             Some((_, t)) if t > way.from_mm => unexpected(),
             Some((foot, t)) if t < way.to_mm || !self.aperture.contains(foot[0], foot[1]) => Contact::Missed,
-            Some((foot_mm, t)) => Contact::Touched { centre_mm: way.centre(t), foot_mm },
+            Some((contact_mm, t)) => Contact::Touched { centre_mm: way.centre(t), contact_mm },
         }
     }
 
@@ -639,7 +639,7 @@ pub fn touch_sphere(centre_mm: Vec3, sphere_radius_mm: f64, way: &Approach) -> C
         return Contact::Missed;
     }
     let centre = way.centre(t);
-    Contact::Touched { centre_mm: centre, foot_mm: [centre[0], centre[1]] }
+    Contact::Touched { centre_mm: centre, contact_mm: [centre[0], centre[1]] }
 }
 
 #[cfg(test)]
@@ -716,7 +716,7 @@ mod tests {
     /// Returns a part with the grooves of a wheel.
     fn grooved(wheel_radius_mm: f64, spacing_mm: f64) -> Part {
         let mut part = rough_part();
-        let mut bend = HeightGrid::over(part.aperture.half_mm(), 0.0);
+        let mut bend = HeightGrid::new(part.aperture.half_mm(), 0.0);
         bend.heights_mm = bend.nodes().map(|at| Grooves::bend_at(part.shape.as_ref(), wheel_radius_mm, at)).collect();
         part.grooves = Some(Grooves { first_mm: -32.6, spacing_mm, wheel_radius_mm, bend });
         part
@@ -747,7 +747,7 @@ mod tests {
                 let n = part.shape.normal(x, y);
                 let tilt = [0.0, 0.1, -0.07][k as usize % 3];
                 let way = way(&part, x, y, [n[0] + tilt, n[1] - 0.5 * tilt, n[2]]);
-                let Contact::Touched { centre_mm: c, foot_mm } = part.touch(&way) else {
+                let Contact::Touched { centre_mm: c, contact_mm } = part.touch(&way) else {
                     panic!("no touch at {x} {y}")
                 };
                 // Search of the neighbourhood: no point is nearer than the radius, and the contact is at the radius.
@@ -755,13 +755,17 @@ mod tests {
                     let r = part.surface(x, y).0;
                     (0..3).map(|i| (r[i] - c[i]).powi(2)).sum::<f64>().sqrt()
                 };
-                assert!((distance(foot_mm) - 1.5).abs() < 1e-9, "{wheel_radius_mm} at {x} {y}: {}", distance(foot_mm));
+                assert!(
+                    (distance(contact_mm) - 1.5).abs() < 1e-9,
+                    "{wheel_radius_mm} at {x} {y}: {}",
+                    distance(contact_mm)
+                );
                 let around = (0..200 * 40).map(|i| (f64::from(i % 200) - 100.0, f64::from(i / 200) - 20.0));
-                let places = around.map(|(i, j)| [foot_mm[0] + 0.01 * j, foot_mm[1] + 0.004 * i]);
+                let places = around.map(|(i, j)| [contact_mm[0] + 0.01 * j, contact_mm[1] + 0.004 * i]);
                 let nearest = places.map(distance).fold(f64::INFINITY, f64::min);
                 assert!(nearest > 1.5 - 1e-9, "{wheel_radius_mm} at {x} {y}: cuts {} nm deep", 1e6 * (1.5 - nearest));
                 let grooves = part.grooves.as_ref().unwrap();
-                let beside = (foot_mm[1] - grooves.track_mm(grooves.nearest(foot_mm[1]))).abs();
+                let beside = (contact_mm[1] - grooves.track_mm(grooves.nearest(contact_mm[1]))).abs();
                 if (beside - 0.5 * spacing_mm).abs() < 1e-9 { on_ridges += 1 } else { in_grooves += 1 }
             }
             assert!(if rides { in_grooves == 0 } else { in_grooves > 0 && on_ridges > 0 }, "{on_ridges} {in_grooves}");

@@ -11,11 +11,11 @@ use crate::Vec3;
 use crate::body::Refusal;
 
 /// Maximum number of targets in a plan.
-pub const MOST_TARGETS: u32 = 500_000;
+pub const MAX_TARGETS: u32 = 500_000;
 /// Maximum number of columns, and of rows, in a map.
-pub const MOST_NODES_ALONG: u32 = 4_000;
+pub const MAX_NODES_PER_SIDE: u32 = 4_000;
 /// Maximum number of nodes in a map.
-pub const MOST_NODES: u64 = 4_000_000;
+pub const MAX_NODES: u64 = 4_000_000;
 
 /// Answer of docs/modbus.md: a payload is missing, broken or of another part.
 pub const BROKEN: u16 = 8;
@@ -164,22 +164,22 @@ struct Reader<'a> {
 }
 
 impl Reader<'_> {
-    fn take<const N: usize>(&mut self) -> Result<[u8; N], Refusal> {
+    fn read_bytes<const N: usize>(&mut self) -> Result<[u8; N], Refusal> {
         let (head, rest) = self.rest.split_first_chunk::<N>().ok_or_else(|| broken("the payload ends too early"))?;
         self.rest = rest;
         Ok(*head)
     }
 
     fn u16(&mut self) -> Result<u16, Refusal> {
-        self.take().map(u16::from_be_bytes)
+        self.read_bytes().map(u16::from_be_bytes)
     }
 
     fn u32(&mut self) -> Result<u32, Refusal> {
-        self.take().map(u32::from_be_bytes)
+        self.read_bytes().map(u32::from_be_bytes)
     }
 
     fn f64(&mut self, name: &str) -> Result<f64, Refusal> {
-        let value = f64::from_be_bytes(self.take()?);
+        let value = f64::from_be_bytes(self.read_bytes()?);
         if value.is_finite() { Ok(value) } else { Err(broken(format!("{name} is not finite"))) }
     }
 
@@ -199,7 +199,11 @@ impl Reader<'_> {
     }
 
     fn zeros<const N: usize>(&mut self, name: &str) -> Result<(), Refusal> {
-        if self.take::<N>()? == [0; N] { Ok(()) } else { Err(broken(format!("reserved bytes after {name} are not 0"))) }
+        if self.read_bytes::<N>()? == [0; N] {
+            Ok(())
+        } else {
+            Err(broken(format!("reserved bytes after {name} are not 0")))
+        }
     }
 }
 
@@ -247,8 +251,8 @@ impl Plan {
         reader.zeros::<2>("format")?;
         let count = reader.u32()?;
         exact(bytes, 64, count.into(), 56)?;
-        if !(1..=MOST_TARGETS).contains(&count) {
-            return Err(outside("number of targets", count.into(), &format!("1 to {MOST_TARGETS}")));
+        if !(1..=MAX_TARGETS).contains(&count) {
+            return Err(outside("number of targets", count.into(), &format!("1 to {MAX_TARGETS}")));
         }
         let [probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm] =
             reader.vector("header of the plan")?;
@@ -304,8 +308,8 @@ impl Map {
         let (columns, rows) = (reader.u32()?, reader.u32()?);
         reader.zeros::<4>("rows")?;
         let nodes = u64::from(columns) * u64::from(rows);
-        if columns > MOST_NODES_ALONG || rows > MOST_NODES_ALONG || nodes > MOST_NODES {
-            return Err(outside("number of nodes", nodes as f64, &format!("up to {MOST_NODES}")));
+        if columns > MAX_NODES_PER_SIDE || rows > MAX_NODES_PER_SIDE || nodes > MAX_NODES {
+            return Err(outside("number of nodes", nodes as f64, &format!("up to {MAX_NODES}")));
         }
         if columns < 2 || rows < 2 {
             return Err(broken(format!("a net of {columns} by {rows} nodes spans no area")));
@@ -315,14 +319,14 @@ impl Map {
         let spacing_mm = reader.vector::<2>("spacing")?;
         let largest_mm = reader.f64("largest value")?;
         reader.zeros::<8>("largest value")?;
-        let nominal = reader.take()?;
+        let nominal = reader.read_bytes()?;
         if !spacing_mm.iter().all(|s| (1e-6..=1e6).contains(s)) {
             return Err(broken(format!("spacing is {spacing_mm:?} mm")));
         }
         let values_mm = (0..nodes).map(|_| reader.f64("a node of the map")).collect::<Result<Vec<_>, _>>()?;
         let map = Self { columns, rows, first_mm, spacing_mm, nominal, values_mm };
-        if (map.largest_mm() - largest_mm).abs() > 1e-9 {
-            return Err(broken(format!("largest value is {} mm, the header says {largest_mm}", map.largest_mm())));
+        if (map.max_abs_mm() - largest_mm).abs() > 1e-9 {
+            return Err(broken(format!("largest value is {} mm, the header says {largest_mm}", map.max_abs_mm())));
         }
         Ok(map)
     }
@@ -335,7 +339,7 @@ impl Map {
         bytes.extend([0; 4]);
         push(&mut bytes, &self.first_mm);
         push(&mut bytes, &self.spacing_mm);
-        push(&mut bytes, &[self.largest_mm()]);
+        push(&mut bytes, &[self.max_abs_mm()]);
         bytes.extend([0; 8]);
         bytes.extend(self.nominal);
         push(&mut bytes, &self.values_mm);
@@ -343,12 +347,12 @@ impl Map {
     }
 
     /// Returns the largest absolute value in millimetres.
-    pub fn largest_mm(&self) -> f64 {
+    pub fn max_abs_mm(&self) -> f64 {
         self.values_mm.iter().fold(0.0, |most, value| value.abs().max(most))
     }
 
     /// Returns the displacement at (x, y) in mm: bilinear inside the grid; outside, the value at the nearest edge.
-    pub fn at(&self, x: f64, y: f64) -> f64 {
+    pub fn displacement_at(&self, x: f64, y: f64) -> f64 {
         let along = |t: f64, axis: usize, nodes: u32| {
             let place = ((t - self.first_mm[axis]) / self.spacing_mm[axis]).clamp(0.0, f64::from(nodes - 1));
             let cell = (place as usize).min(nodes as usize - 2);
@@ -376,7 +380,7 @@ impl Pass {
             reader.vector("header of the pass")?;
         let extent_mm = reader.vector::<4>("extent of the part")?;
         reader.zeros::<16>("extent")?;
-        let nominal = reader.take()?;
+        let nominal = reader.read_bytes()?;
         within("spark-out passes", spark_out.into(), 0.0, 20.0)?;
         within("wheel radius in mm", wheel_radius_mm, 0.5, 1000.0)?;
         within("feed in mm/min", feed_mm_min, 1.0, 50_000.0)?;
@@ -458,7 +462,7 @@ fn point(reader: &mut Reader, scale_mm: Option<f64>) -> Result<PointRecord, Refu
         Some(scale) => {
             let mut position = [0.0; 3];
             for c in &mut position {
-                *c = scale * f64::from(i32::from_be_bytes(reader.take()?));
+                *c = scale * f64::from(i32::from_be_bytes(reader.read_bytes()?));
             }
             position
         }

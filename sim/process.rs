@@ -24,7 +24,7 @@
 //! **Depth of cut.** Roughing strokes first remove the material that is more than the depth of cut above cmd. Each
 //! removes at most the depth of cut, with ten times the feed and a wheel of its own (no wear, no growth). They leave at
 //! most the depth of cut for the finishing stroke, so a pass always ends with one finishing stroke. More than
-//! [`MOST_STROKES`] are refused.
+//! [`MAX_STROKES`] are refused.
 //!
 //! **Time.** Tracks run along x, at the track spacing in y, alternately forth and back, with 1.5 mm of overtravel on
 //! every side. A node is ground in the middle of its track's strip. `advance` grinds the nodes whose time has come, so
@@ -34,7 +34,7 @@
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
-use crate::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
+use crate::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
 use crate::follow;
 use crate::form::FormError;
 use crate::head::Head;
@@ -42,10 +42,10 @@ use crate::part::{Grooves, HeightGrid, Part};
 use crate::payload::{BROKEN, INTERLOCK, Map, Pass, PassRecord, outside};
 use crate::program::{Control, Program};
 use crate::spec::{GrinderSpec, Mirrored, Misreported, WorldSpec};
-use crate::truth::{GrindEntry, Source, State, locked, nothing_done, stream};
+use crate::truth::{GrindEntry, Source, WorldState, empty_result, locked, stream};
 
 /// Maximum number of strokes of a pass, roughing and finishing together.
-pub const MOST_STROKES: u32 = 400;
+pub const MAX_STROKES: u32 = 400;
 /// Overtravel of the wheel beyond the part on every side, in mm.
 pub const OVERTRAVEL_MM: f64 = 1.5;
 /// Ratio of the feed of a roughing stroke to that of a finishing stroke.
@@ -145,7 +145,7 @@ impl Run {
     }
 
     /// Grinds every node whose time has come.
-    fn grind(&mut self, state: &mut State) {
+    fn grind(&mut self, state: &mut WorldState) {
         while let Some(stroke) = self.strokes.get(self.stroke).copied() {
             while let Some(&(place, node)) = self.order.get(self.next) {
                 let moment = stroke.begin_s + place / stroke.feed_mm_s;
@@ -159,7 +159,7 @@ impl Run {
         }
     }
 
-    fn cut(&mut self, state: &mut State, stroke: Stroke, moment: f64, node: usize) {
+    fn cut(&mut self, state: &mut WorldState, stroke: Stroke, moment: f64, node: usize) {
         let spec = &state.spec.grinder;
         let drift_mm = stroke.above_mm.unwrap_or_else(|| {
             let strokes = (moment - self.finishing_s) * stroke.feed_mm_s / self.stroke_mm;
@@ -180,7 +180,7 @@ impl Run {
         self.strokes.iter().map(|s| ((time - s.begin_s).max(0.0) * s.feed_mm_s).min(self.stroke_mm)).sum()
     }
 
-    fn record(&self, state: &State, result: u16) -> PassRecord {
+    fn record(&self, state: &WorldState, result: u16) -> PassRecord {
         let part = &state.part;
         let (mut volume_mm3, mut depth_mm) = (0.0, 0.0f64);
         for (k, [x, y]) in part.height.nodes().enumerate().filter(|(_, [x, y])| part.aperture.contains(*x, *y)) {
@@ -209,7 +209,7 @@ impl Run {
 
 /// Moves the wheel over a node where a stiff machine would leave `cmd_mm`, and returns true if it cut. `bend` is the
 /// curvature of the groove that it leaves, if any.
-pub(crate) fn cut(state: &mut State, node: usize, cmd_mm: f64, bend: Option<f64>) -> bool {
+pub(crate) fn cut(state: &mut WorldState, node: usize, cmd_mm: f64, bend: Option<f64>) -> bool {
     let h = &mut state.part.height.heights_mm[node];
     if state.spec.faults.no_part || *h <= cmd_mm {
         return false;
@@ -256,7 +256,7 @@ fn grown([x0, x1, y0, y1]: [f64; 4]) -> [f64; 4] {
 }
 
 /// Returns the height that the machine steers to at every node, without wear and growth, in mm.
-fn fixed_mm(state: &State, map: &Map, pass: &Pass, program: Option<&Program>) -> Vec<f64> {
+fn fixed_mm(state: &WorldState, map: &Map, pass: &Pass, program: Option<&Program>) -> Vec<f64> {
     let (spec, part) = (&state.spec.grinder, &state.part);
     let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun + 1);
     let fresh = smooth(rng, spec.repeatability_correlation_mm, spec.repeatability_um);
@@ -285,21 +285,21 @@ fn fixed_mm(state: &State, map: &Map, pass: &Pass, program: Option<&Program>) ->
 }
 
 /// Returns the true radius of the wheel in a pass, in mm.
-fn true_radius_mm(state: &State, pass: &Pass) -> f64 {
+fn true_radius_mm(state: &WorldState, pass: &Pass) -> f64 {
     state.true_wheel_radius_mm.unwrap_or(pass.wheel_radius_mm + 1e-3 * state.spec.grinder.wheel_radius_error_um)
 }
 
 /// Returns the grooves that the wheel leaves over the whole part.
-fn grooves(state: &State, pass: &Pass) -> Grooves {
+fn grooves(state: &WorldState, pass: &Pass) -> Grooves {
     let wheel_radius_mm = true_radius_mm(state, pass);
     let part = &state.part;
-    let mut bend = HeightGrid::over(part.aperture.half_mm(), 0.0);
+    let mut bend = HeightGrid::new(part.aperture.half_mm(), 0.0);
     bend.heights_mm = bend.nodes().map(|at| Grooves::bend_at(part.shape.as_ref(), wheel_radius_mm, at)).collect();
     Grooves { first_mm: grown(pass.extent_mm)[2], spacing_mm: pass.track_spacing_mm, wheel_radius_mm, bend }
 }
 
 /// Returns the value that this machine, with its faults, uses for the map at (x, y).
-fn displaced(state: &State, map: &Map, x: f64, y: f64) -> f64 {
+fn displaced(state: &WorldState, map: &Map, x: f64, y: f64) -> f64 {
     let faults = &state.spec.faults;
     let (x, y) = match faults.map_mirrored {
         Mirrored::None => (x, y),
@@ -309,7 +309,7 @@ fn displaced(state: &State, map: &Map, x: f64, y: f64) -> f64 {
         Mirrored::QuarterTurn => (-y, x),
     };
     let times = if faults.map_doubled { 2.0 } else { 1.0 };
-    let u = if faults.map_ignored { 0.0 } else { times * map.at(x, y) };
+    let u = if faults.map_ignored { 0.0 } else { times * map.displacement_at(x, y) };
     if faults.map_sign_flipped { -u } else { u }
 }
 
@@ -326,7 +326,7 @@ pub struct Programs {
 
 impl Programs {
     /// Finds and reads the program that names a map.
-    fn of_map(&self, identity: &[u8; 32]) -> Result<Program, String> {
+    fn read_for_map(&self, identity: &[u8; 32]) -> Result<Program, String> {
         let map: String = identity.iter().map(|byte| format!("{byte:02x}")).collect();
         let files = std::fs::read_dir(&self.folder).map_err(|error| format!("{}: {error}", self.folder.display()))?;
         let is_of_map = |text: &String| {
@@ -337,20 +337,20 @@ impl Programs {
         let texts = files.flatten().filter_map(|file| std::fs::read_to_string(file.path()).ok());
         let text = texts.filter(is_of_map).max_by_key(String::len);
         let text = text.ok_or_else(|| format!("{} holds no program of the map {map}", self.folder.display()))?;
-        self.control.read(&text)?.on(self.head)
+        self.control.read(&text)?.with_head(self.head)
     }
 }
 
 /// Grinder of a world.
 pub struct Grinder {
-    world: Arc<Mutex<State>>,
+    world: Arc<Mutex<WorldState>>,
     programs: Option<Programs>,
     ready: Option<Run>,
     running: Option<Run>,
 }
 
 impl Grinder {
-    pub(crate) fn new(world: Arc<Mutex<State>>) -> Self {
+    pub(crate) fn new(world: Arc<Mutex<WorldState>>) -> Self {
         Self { world, programs: None, ready: None, running: None }
     }
 
@@ -362,7 +362,7 @@ impl Grinder {
     }
 
     /// Refuses a pass beyond the reach or the limits of this machine.
-    fn limits(state: &State, pass: &Pass) -> Result<(), Refusal> {
+    fn check_pass(state: &WorldState, pass: &Pass) -> Result<(), Refusal> {
         let spec = &state.spec.grinder;
         if pass.feed_mm_min > spec.feed_most_mm_min {
             return Err(outside("feed in mm/min", pass.feed_mm_min, &format!("up to {}", spec.feed_most_mm_min)));
@@ -381,17 +381,17 @@ impl Grinder {
         Ok(())
     }
 
-    fn map_limits(state: &State, map: &Map) -> Result<(), Refusal> {
+    fn check_map(state: &WorldState, map: &Map) -> Result<(), Refusal> {
         let most = state.spec.grinder.map_most_um;
-        if map.largest_mm() * 1e3 > most {
-            return Err(outside("largest value of the map in um", map.largest_mm() * 1e3, &format!("up to {most}")));
+        if map.max_abs_mm() * 1e3 > most {
+            return Err(outside("largest value of the map in um", map.max_abs_mm() * 1e3, &format!("up to {most}")));
         }
         Ok(())
     }
 
-    fn of_another_part(state: &State, nominal: &[u8; 32], job: Option<u32>) -> Result<(), Refusal> {
+    fn check_part_identity(state: &WorldState, nominal: &[u8; 32], job: Option<u32>) -> Result<(), Refusal> {
         let same_part = !state.spec.part.fresh_per_job || (job.is_some() && state.job == job);
-        let other = match state.held {
+        let other = match state.part_identity {
             Some(held) => same_part && held != *nominal,
             None => false,
         };
@@ -421,7 +421,7 @@ fn strokes(roughing: u32, pass: &Pass, stroke_mm: f64) -> (Vec<Stroke>, f64) {
 
 /// Prepares a pass for the part in its present state.
 fn run(
-    state: &State,
+    state: &WorldState,
     (job, cycle): (u32, u16),
     map_payload: &Payload,
     map: &Map,
@@ -435,8 +435,8 @@ fn run(
     let within = |&(_, node): &(f64, u32)| state.part.height.heights_mm[node as usize] - fixed_mm[node as usize];
     let proud_mm = order.iter().map(within).fold(0.0, f64::max);
     let needed = (proud_mm / pass.depth_of_cut_mm).ceil().max(1.0);
-    if needed + f64::from(pass.spark_out) > f64::from(MOST_STROKES) {
-        let limit = format!("up to {MOST_STROKES}; the part stands {proud_mm:.4} mm proud");
+    if needed + f64::from(pass.spark_out) > f64::from(MAX_STROKES) {
+        let limit = format!("up to {MAX_STROKES}; the part stands {proud_mm:.4} mm proud");
         return Err(outside("number of strokes", needed + f64::from(pass.spark_out), &limit));
     }
     let (strokes, total_s) = strokes(needed as u32 - 1, &pass, stroke_mm);
@@ -445,7 +445,7 @@ fn run(
         job,
         cycle,
         map_identity: map_payload.identity,
-        map_largest_mm: map.largest_mm(),
+        map_largest_mm: map.max_abs_mm(),
         pass,
         order,
         fixed_mm,
@@ -471,7 +471,7 @@ fn progress(run: &Run) -> Progress {
     Progress { done, total: 1000, finished, fault: 0 }
 }
 
-impl Body for Grinder {
+impl Physics for Grinder {
     fn kind(&self) -> Kind {
         Kind::Grinder
     }
@@ -485,13 +485,13 @@ impl Body for Grinder {
         match kind {
             2 => {
                 let map = Map::decode(&payload.bytes)?;
-                Self::map_limits(&state, &map)?;
-                Self::of_another_part(&state, &map.nominal, None)
+                Self::check_map(&state, &map)?;
+                Self::check_part_identity(&state, &map.nominal, None)
             }
             3 => {
                 let pass = Pass::decode(&payload.bytes)?;
-                Self::limits(&state, &pass)?;
-                Self::of_another_part(&state, &pass.nominal, None)
+                Self::check_pass(&state, &pass)?;
+                Self::check_part_identity(&state, &pass.nominal, None)
             }
             other => {
                 Err(Refusal { answer: BROKEN, reason: format!("a grinder has no use for a payload of kind {other}") })
@@ -509,10 +509,10 @@ impl Body for Grinder {
         if map.nominal != pass.nominal {
             return Err(Refusal { answer: BROKEN, reason: "map and pass are for different parts".to_owned() });
         }
-        Self::map_limits(&state, &map)?;
-        Self::limits(&state, &pass)?;
-        Self::of_another_part(&state, &pass.nominal, Some(job))?;
-        if state.taken_by_other(Kind::Grinder) {
+        Self::check_map(&state, &map)?;
+        Self::check_pass(&state, &pass)?;
+        Self::check_part_identity(&state, &pass.nominal, Some(job))?;
+        if state.is_held_by_other(Kind::Grinder) {
             return Err(Refusal { answer: INTERLOCK, reason: "the part is on the measuring machine".to_owned() });
         }
         state.blank_for(job);
@@ -520,7 +520,7 @@ impl Body for Grinder {
             None => None,
             Some(programs) => {
                 let refused = |reason| Refusal { answer: BROKEN, reason };
-                Some(programs.of_map(&map_payload.identity).map_err(refused)?)
+                Some(programs.read_for_map(&map_payload.identity).map_err(refused)?)
             }
         };
         let run = run(&state, (job, cycle), map_payload, &map, (pass, program.as_ref()))?;
@@ -532,10 +532,10 @@ impl Body for Grinder {
     fn begin(&mut self) {
         let Some(mut run) = self.ready.take() else { return };
         let mut state = locked(&self.world);
-        if !state.take(Kind::Grinder) {
+        if !state.claim_part(Kind::Grinder) {
             return;
         }
-        state.held = Some(run.pass.nominal);
+        state.part_identity = Some(run.pass.nominal);
         state.passes_begun += 1;
         state.passes_of_blank += 1;
         let error_mm = 1e-3 * state.spec.grinder.wheel_radius_error_um;
@@ -548,7 +548,7 @@ impl Body for Grinder {
             job: run.job,
             cycle: run.cycle,
             level_mm: run.pass.level_mm,
-            map_largest_mm: run.map_largest_mm,
+            map_max_abs_mm: run.map_largest_mm,
             map: run.map_identity,
             roughing_strokes: run.roughing(),
             result: 0,
@@ -558,7 +558,7 @@ impl Body for Grinder {
         run.before_mm = state.part.height.heights_mm.clone();
         state.part.grooves = run.grooves.as_ref().map(|cut| {
             let before = state.part.grooves.take().map(|grooves| grooves.bend);
-            let bend = before.unwrap_or_else(|| HeightGrid::over(state.part.aperture.half_mm(), 0.0));
+            let bend = before.unwrap_or_else(|| HeightGrid::new(state.part.aperture.half_mm(), 0.0));
             Grooves { bend, ..cut.clone() }
         });
         self.running = Some(run);
@@ -576,19 +576,19 @@ impl Body for Grinder {
         state.engaged = Some(Kind::Grinder);
         run.grind(&mut state);
         if run.finished() {
-            state.clear(Kind::Grinder);
+            state.disengage(Kind::Grinder);
         }
         progress(run)
     }
 
     fn retract(&mut self) {
-        locked(&self.world).clear(Kind::Grinder);
+        locked(&self.world).disengage(Kind::Grinder);
     }
 
-    fn outcome(&mut self, result: u16) -> Outcome {
+    fn end_job(&mut self, result: u16) -> ResultData {
         let mut state = locked(&self.world);
         self.ready = None;
-        let Some(run) = self.running.take() else { return nothing_done(state.spec.cmm.part_temperature_c) };
+        let Some(run) = self.running.take() else { return empty_result(state.spec.cmm.part_temperature_c) };
         let record = run.record(&state, result);
         let duration_s = run.elapsed_s.min(run.total_s);
         let misreported = state.spec.faults.misreported;
@@ -599,7 +599,7 @@ impl Body for Grinder {
             (entry.result, entry.volume_mm3) = (result, record.volume_mm3);
         }
         state.release(Kind::Grinder);
-        Outcome {
+        ResultData {
             kind: 5,
             format: 1,
             bytes: misreporting(record, misreported).encode(),

@@ -33,7 +33,7 @@ const INCREMENT_MM: f64 = 1e-4;
 /// Arc, the same for every control: about a centre in a plane of two axes, while the third axis moves in proportion to
 /// the angle.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Turn {
+pub struct CircularArc {
     /// The two axes of the plane, and the axis normal to it.
     axes: [usize; 3],
     centre_mm: [f64; 2],
@@ -41,7 +41,7 @@ pub struct Turn {
     sweep_rad: f64,
 }
 
-impl Turn {
+impl CircularArc {
     /// Computes the arc from one place to another.
     ///
     /// # Errors
@@ -69,7 +69,7 @@ impl Turn {
     }
 
     /// Returns the place at a share of the arc that begins at `from`.
-    fn at(&self, from: [f64; 3], to: [f64; 3], share: f64) -> [f64; 3] {
+    fn position_at(&self, from: [f64; 3], to: [f64; 3], share: f64) -> [f64; 3] {
         let [a, b, c] = self.axes;
         let (u, v) = (from[a] - self.centre_mm[0], from[b] - self.centre_mm[1]);
         let (sine, cosine) = (share * self.sweep_rad).sin_cos();
@@ -93,32 +93,32 @@ impl Turn {
 
 /// End of a move.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Stop {
+pub struct Waypoint {
     /// Position in mm; NaN along an axis that has not been programmed yet.
     pub at_mm: [f64; 3],
     /// Angle in degrees, on the scale of the rotary axis; `None` if none has been programmed yet.
-    pub turn_deg: Option<f64>,
+    pub rotary_deg: Option<f64>,
     /// Feed in mm/min; `None` for a rapid move. For a move with a programmed time, the speed of the slides.
     pub feed_mm_min: Option<f64>,
     /// Time of the move in minutes, if it is programmed.
     pub minutes: Option<f64>,
     /// Arc of the move; `None` for a straight move.
-    pub turn: Option<Turn>,
+    pub arc: Option<CircularArc>,
 }
 
-impl Stop {
+impl Waypoint {
     /// Returns the place at a share of the way from the previous stop.
-    pub fn on_the_way(&self, from_mm: [f64; 3], share: f64) -> [f64; 3] {
-        match &self.turn {
-            Some(turn) => turn.at(from_mm, self.at_mm, share),
+    pub fn position_at(&self, from_mm: [f64; 3], share: f64) -> [f64; 3] {
+        match &self.arc {
+            Some(turn) => turn.position_at(from_mm, self.at_mm, share),
             None => std::array::from_fn(|k| from_mm[k] + share * (self.at_mm[k] - from_mm[k])),
         }
     }
 
     /// Returns the length of that way, in mm.
-    pub fn way_mm(&self, from_mm: [f64; 3]) -> f64 {
+    pub fn length_mm(&self, from_mm: [f64; 3]) -> f64 {
         let along = |k: usize| self.at_mm[k] - from_mm[k];
-        match &self.turn {
+        match &self.arc {
             Some(turn) => (turn.radius_mm(from_mm) * turn.sweep_rad).hypot(along(turn.axes[2])),
             None => (0..3).map(|k| along(k).powi(2)).sum::<f64>().sqrt(),
         }
@@ -126,8 +126,8 @@ impl Stop {
 
     /// Returns the ends of straight moves whose distance from the way is at most `within_mm`.
     pub fn in_chords(&self, from_mm: [f64; 3], within_mm: f64) -> Vec<[f64; 3]> {
-        let count = self.turn.as_ref().map_or(1, |turn| turn.chords(from_mm, within_mm));
-        let inner = (1..count).map(|k| self.on_the_way(from_mm, k as f64 / count as f64));
+        let count = self.arc.as_ref().map_or(1, |turn| turn.chords(from_mm, within_mm));
+        let inner = (1..count).map(|k| self.position_at(from_mm, k as f64 / count as f64));
         inner.chain([self.at_mm]).collect()
     }
 }
@@ -136,7 +136,7 @@ impl Stop {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Program {
     /// Ends of the moves, in order.
-    pub stops: Vec<Stop>,
+    pub waypoints: Vec<Waypoint>,
     /// Rotary axis that the program turns.
     pub axis: Option<char>,
     /// True if the program makes the control keep the wheel's centre while the head turns.
@@ -156,10 +156,10 @@ impl Program {
     ///
     /// # Errors
     /// The machine cannot execute the program.
-    pub fn on(mut self, head: Option<Head>) -> Result<Self, String> {
+    pub fn with_head(mut self, head: Option<Head>) -> Result<Self, String> {
         let why = match (self.axis, head) {
             (Some(letter), None) => Some(format!("the program turns {letter}, and this machine has no rotary axis")),
-            (_, Some(head)) => head.refuses(&self),
+            (_, Some(head)) => head.refusal_reason(&self),
             (None, None) => None,
         };
         self.head = head;
@@ -167,21 +167,21 @@ impl Program {
     }
 
     /// Returns the position of the wheel's centre at a share of the way from a stop to the next.
-    pub fn centre_mm(&self, from: &Stop, to: &Stop, share: f64) -> [f64; 3] {
+    pub fn centre_mm(&self, from: &Waypoint, to: &Waypoint, share: f64) -> [f64; 3] {
         match &self.head {
-            Some(head) => head.along_mm(from, to, share),
-            None => to.on_the_way(from.at_mm, share),
+            Some(head) => head.centre_on_move_mm(from, to, share),
+            None => to.position_at(from.at_mm, share),
         }
     }
 
     /// Returns the length of that way, in mm; if a head turns, the distance of its ends.
-    pub fn way_mm(&self, from: &Stop, to: &Stop) -> f64 {
+    pub fn length_mm(&self, from: &Waypoint, to: &Waypoint) -> f64 {
         match self.axis {
             Some(_) => {
                 let [a, b] = [0.0, 1.0].map(|share| self.centre_mm(from, to, share));
                 (0..3).map(|k| (b[k] - a[k]).powi(2)).sum::<f64>().sqrt()
             }
-            None => to.way_mm(from.at_mm),
+            None => to.length_mm(from.at_mm),
         }
     }
 }
@@ -225,7 +225,7 @@ struct Reader {
     /// For LinuxCNC: true if centres are relative to the beginning of an arc, false if they are absolute, `None` before
     /// the program sets it.
     from_start: Option<bool>,
-    turn_deg: Option<f64>,
+    rotary_deg: Option<f64>,
     /// Feed of the last block that gave one. With inverse-time feeds, in 1/min and valid for its own block only.
     feed: Option<f64>,
     by_time: bool,
@@ -302,7 +302,7 @@ impl Reader {
         let mut to: BTreeMap<char, f64> = BTreeMap::new();
         let (mut smooth, mut level, mut length, kept) = (None, None, false, self.keeps_centre);
         for word in words(line)? {
-            let Word { name, number, has_point } = word;
+            let ProgramWord { name, number, has_point } = word;
             let whole = format!("{name}{}", number.map_or(String::new(), |n| n.to_string()));
             match (self.control, name.as_str(), number) {
                 (Control::Linuxcnc | Control::Sinumerik | Control::Fanuc, "N", Some(_)) => {}
@@ -415,12 +415,12 @@ impl Reader {
             return Err("it feeds from a place that it did not tell".into());
         }
         let turn = match self.motion {
-            Some(motion @ (2 | 3)) => Some(self.turn([before, at_mm], to, motion == 2)?),
+            Some(motion @ (2 | 3)) => Some(self.read_arc([before, at_mm], to, motion == 2)?),
             _ if to.keys().any(|letter| "IJK".contains(*letter)) => return Err("a centre stands with no arc".into()),
             _ => None,
         };
         self.at_mm = Some(at_mm);
-        self.program.stops.push(Stop { at_mm, turn_deg: self.turn_deg, feed_mm_min, minutes, turn });
+        self.program.waypoints.push(Waypoint { at_mm, rotary_deg: self.rotary_deg, feed_mm_min, minutes, arc: turn });
         Ok(())
     }
 
@@ -439,12 +439,17 @@ impl Reader {
         if self.control == Control::Sinumerik && self.keeps_centre && !self.in_proportion {
             return Err("it does not say how it turns between points".into());
         }
-        self.turn_deg = Some(to_deg);
+        self.rotary_deg = Some(to_deg);
         Ok(())
     }
 
     /// Computes the arc of a block. Its centre, and both of its ends, must be given along the axes of the plane.
-    fn turn(&self, ends: [[f64; 3]; 2], told: &BTreeMap<char, f64>, clockwise: bool) -> Result<Turn, String> {
+    fn read_arc(
+        &self,
+        ends: [[f64; 3]; 2],
+        told: &BTreeMap<char, f64>,
+        clockwise: bool,
+    ) -> Result<CircularArc, String> {
         let axes = self.plane.ok_or("the plane of its arc was not told")?;
         let [a, b, c] = axes;
         let letter = |of: &str, k: usize| of.chars().nth(k).unwrap_or('?');
@@ -470,7 +475,7 @@ impl Reader {
             let told = of.get(&letter(letters, axis)).ok_or("the centre of its arc is not told")?;
             centre_mm[k] = if from_start { ends[0][axis] + told } else { *told };
         }
-        Turn::new(axes, ends, centre_mm, clockwise, takes_mm)
+        CircularArc::new(axes, ends, centre_mm, clockwise, takes_mm)
     }
 
     /// Reads a line of Klartext, with its number.
@@ -516,7 +521,7 @@ impl Reader {
             }
             _ => match rest.split_once(' ') {
                 Some(("L", rest)) => self.straight(rest, Some(1)),
-                Some(("CC", rest)) => self.told_centre(rest),
+                Some(("CC", rest)) => self.read_centre(rest),
                 Some(("C", rest)) => self.straight(rest, None),
                 _ => Err("it is no line of a pass".into()),
             },
@@ -524,7 +529,7 @@ impl Reader {
     }
 
     /// Reads the arguments of a CC: two axes, which are the plane of the circles about it.
-    fn told_centre(&mut self, rest: &str) -> Result<(), String> {
+    fn read_centre(&mut self, rest: &str) -> Result<(), String> {
         self.centre.clear();
         for word in rest.split_whitespace() {
             let (axis, value) = word.split_at(1);
@@ -566,13 +571,13 @@ impl Reader {
 }
 
 /// Word: letters, and a number after them or after an equals sign.
-struct Word {
+struct ProgramWord {
     name: String,
     number: Option<f64>,
     has_point: bool,
 }
 
-fn words(line: &str) -> Result<Vec<Word>, String> {
+fn words(line: &str) -> Result<Vec<ProgramWord>, String> {
     let mut found = Vec::new();
     let mut rest = line.trim_start();
     while !rest.is_empty() {
@@ -586,7 +591,7 @@ fn words(line: &str) -> Result<Vec<Word>, String> {
         let (digits, next) = after.split_at(end);
         let number = (!digits.is_empty()).then(|| digits.parse::<f64>()).transpose();
         let number = number.map_err(|_| format!("{name}{digits} has no number"))?;
-        found.push(Word { name: name.to_owned(), number, has_point: digits.contains('.') });
+        found.push(ProgramWord { name: name.to_owned(), number, has_point: digits.contains('.') });
         rest = next.trim_start();
     }
     Ok(found)
@@ -597,7 +602,7 @@ mod tests {
     use super::*;
 
     fn ends(control: Control, text: &str) -> Result<Vec<[f64; 3]>, String> {
-        let feeds = |program: Program| program.stops.into_iter().filter(|stop| stop.feed_mm_min.is_some());
+        let feeds = |program: Program| program.waypoints.into_iter().filter(|stop| stop.feed_mm_min.is_some());
         control.read(text).map(|program| feeds(program).map(|stop| stop.at_mm).collect())
     }
 
@@ -631,11 +636,11 @@ mod tests {
             Head { letter: 'B', left_handed: false, range_deg: [-60.0, 60.0], pivot_mm: Some([0.0, 0.0, 180.0]) };
         for (control, text) in ARCS {
             let plain = control.read(text).unwrap();
-            let beside = plain.clone().on(Some(head)).unwrap();
-            for pair in plain.stops.windows(2).filter(|pair| pair[1].turn.is_some()) {
+            let beside = plain.clone().with_head(Some(head)).unwrap();
+            for pair in plain.waypoints.windows(2).filter(|pair| pair[1].arc.is_some()) {
                 let half_way = |program: &Program| program.centre_mm(&pair[0], &pair[1], 0.5);
                 assert_eq!(half_way(&beside), half_way(&plain), "{control:?}");
-                assert_eq!(beside.way_mm(&pair[0], &pair[1]), plain.way_mm(&pair[0], &pair[1]), "{control:?}");
+                assert_eq!(beside.length_mm(&pair[0], &pair[1]), plain.length_mm(&pair[0], &pair[1]), "{control:?}");
             }
         }
     }
@@ -663,13 +668,13 @@ mod tests {
         for (control, text) in ARCS {
             let program = control.read(text).unwrap_or_else(|why| panic!("{control:?}: {why}"));
             let rises = if control == Control::Heidenhain { 0.0 } else { 0.5 };
-            let [from, arc, line] = program.stops[..] else { panic!("{control:?}: {program:?}") };
+            let [from, arc, line] = program.waypoints[..] else { panic!("{control:?}: {program:?}") };
             assert_eq!((from.at_mm, arc.at_mm), ([3.0, 1.0, 9.0], [3.0, 1.0 + rises, 5.0]));
-            assert!(line.turn.is_none() && line.at_mm == [0.0, 1.0 + rises, 5.0]);
+            assert!(line.arc.is_none() && line.at_mm == [0.0, 1.0 + rises, 5.0]);
             let off = |at: [f64; 3], of: [f64; 3]| (0..3).all(|k| (at[k] - of[k]).abs() < 1e-12);
-            assert!(off(arc.on_the_way(from.at_mm, 0.5), [5.0, 1.0 + 0.5 * rises, 7.0]), "{control:?}");
-            assert!(off(arc.on_the_way(from.at_mm, 1.0), arc.at_mm), "{control:?}");
-            assert!((arc.way_mm(from.at_mm) - (2.0 * std::f64::consts::PI).hypot(rises)).abs() < 1e-12);
+            assert!(off(arc.position_at(from.at_mm, 0.5), [5.0, 1.0 + 0.5 * rises, 7.0]), "{control:?}");
+            assert!(off(arc.position_at(from.at_mm, 1.0), arc.at_mm), "{control:?}");
+            assert!((arc.length_mm(from.at_mm) - (2.0 * std::f64::consts::PI).hypot(rises)).abs() < 1e-12);
             let chords = arc.in_chords(from.at_mm, 1e-4);
             let sagging = |pair: &[[f64; 3]]| {
                 let middle: [f64; 2] = [0, 2].map(|k| 0.5 * (pair[0][k] + pair[1][k]));
@@ -678,8 +683,8 @@ mod tests {
             assert!(chords.windows(2).map(sagging).all(|sag| sag > 0.5e-4 && sag < 1.001e-4));
             // The other way round passes through the smaller x.
             let round = text.replace("G3 ", "G2 ").replace("G03 ", "G02 ").replace("DR+", "DR-");
-            let round = control.read(&round).unwrap().stops[1];
-            assert!(off(round.on_the_way(from.at_mm, 0.5), [1.0, 1.0 + 0.5 * rises, 7.0]), "{control:?}");
+            let round = control.read(&round).unwrap().waypoints[1];
+            assert!(off(round.position_at(from.at_mm, 0.5), [1.0, 1.0 + 0.5 * rises, 7.0]), "{control:?}");
         }
     }
 

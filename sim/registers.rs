@@ -1,17 +1,17 @@
 //! Machine as a Modbus client sees it: blocks of registers to read and to write, and time that passes.
 //!
-//! [`Machine`] is the whole simulated machine without its wire. Every answer depends only on what was read, written and
-//! ticked, so a test simulates hours in a moment and is repeatable. Real time enters only through [`Machine::tick`].
+//! [`SimulatedMachine`] is the whole simulated machine without its wire. Every answer depends only on what was read, written and
+//! ticked, so a test simulates hours in a moment and is repeatable. Real time enters only through [`SimulatedMachine::tick`].
 
 use std::time::Duration;
 
-use crate::body::{Body, Kind};
+use crate::body::{Kind, Physics};
 use crate::command::{Mode, State};
 use crate::handshake::Handshake;
-use crate::options::{Block, Layout, MachineOptions};
-use crate::seen::{Seen, What, Witness};
+use crate::options::{Block, MachineOptions, RegisterLayout};
+use crate::seen::{HandshakeEvent, LogEntry, Observer};
 use crate::transfer::{Inbox, page_image, slots_image};
-use crate::words::{Image, WordOrder};
+use crate::words::{RegisterBlock, WordOrder};
 
 /// Modbus exception code of a refused request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -34,7 +34,7 @@ const SLICE: Duration = Duration::from_millis(20);
 const BEAT: Duration = Duration::from_millis(100);
 
 /// Simulated machine: registers, handshake and physics.
-pub struct Machine {
+pub struct SimulatedMachine {
     handshake: Handshake,
     options: MachineOptions,
     inbox: Inbox,
@@ -57,9 +57,9 @@ pub struct Machine {
     unseen: bool,
 }
 
-impl Machine {
+impl SimulatedMachine {
     /// Switches a machine on. `boot_id` should differ at every start of the program; 0 is replaced by 1.
-    pub fn new(body: Box<dyn Body>, boot_id: u32, options: MachineOptions) -> Self {
+    pub fn new(body: Box<dyn Physics>, boot_id: u32, options: MachineOptions) -> Self {
         let mut machine = Self {
             handshake: Handshake::new(body, boot_id, &options),
             options,
@@ -99,11 +99,11 @@ impl Machine {
             let end = length.min(offset + count - registers.len());
             registers.extend(&self.image(block)[offset..end]);
         }
-        Ok(self.on_the_line(registers))
+        Ok(self.to_line_order(registers))
     }
 
     /// Swaps the bytes of registers between the machine's order and the order on the line.
-    fn on_the_line(&self, mut registers: Vec<u16>) -> Vec<u16> {
+    fn to_line_order(&self, mut registers: Vec<u16>) -> Vec<u16> {
         if self.options.swaps_bytes {
             registers.iter_mut().for_each(|register| *register = register.swap_bytes());
         }
@@ -118,7 +118,7 @@ impl Machine {
         if !(1..=123).contains(&values.len()) {
             return Err(Exception::Value);
         }
-        let values = &self.on_the_line(values.to_vec())[..];
+        let values = &self.to_line_order(values.to_vec())[..];
         let (block, offset, length) = self.options.layout.find(address.into()).ok_or(Exception::Address)?;
         let writable = if block == Block::Sync { 2 } else { length };
         if offset + values.len() > writable {
@@ -153,7 +153,7 @@ impl Machine {
                 continue;
             }
             if std::mem::take(&mut self.unseen) {
-                self.handshake.look(&self.command);
+                self.handshake.read_command(&self.command);
             }
             self.beat_echo = self.beat;
             self.beat_due = self.beat_due.saturating_sub(slice);
@@ -161,7 +161,7 @@ impl Machine {
                 self.machine_beat = self.machine_beat.wrapping_add(1);
                 self.beat_due = BEAT;
             }
-            self.handshake.pass(slice);
+            self.handshake.advance_time(slice);
         }
         self.publish();
     }
@@ -185,7 +185,7 @@ impl Machine {
         if self.frozen {
             self.unseen = true;
         } else {
-            self.handshake.look(&self.command);
+            self.handshake.read_command(&self.command);
         }
     }
 
@@ -214,7 +214,7 @@ impl Machine {
         self.inbox_page = [0; 120];
         self.inbox_page[..values.len()].copy_from_slice(values);
         if let Some(arrived) = arrived
-            && let Err(answer) = self.handshake.take(arrived)
+            && let Err(answer) = self.handshake.put_in_force(arrived)
         {
             self.inbox.refuse(answer);
         }
@@ -231,7 +231,7 @@ impl Machine {
             Block::Status => self.status_image(),
             Block::InForce => {
                 let image = slots_image(order, &self.handshake.slots);
-                self.handshake.looked_at();
+                self.handshake.slots_were_read();
                 image
             }
             Block::InboxHeader => self.inbox_header.to_vec(),
@@ -249,7 +249,7 @@ impl Machine {
 
     fn identity_image(&self) -> Vec<u16> {
         let name: Vec<u8> = self.handshake.body.name().bytes().filter(u8::is_ascii).take(32).collect();
-        Image::new(self.options.word_order, 32)
+        RegisterBlock::new(self.options.word_order, 32)
             .u16(0, 0x5247)
             .u16(1, 0x4431)
             .u16(2, self.options.version)
@@ -307,7 +307,7 @@ impl Machine {
     }
 
     /// Returns the addresses of its blocks.
-    pub fn layout(&self) -> &Layout {
+    pub fn layout(&self) -> &RegisterLayout {
         &self.options.layout
     }
 
@@ -317,13 +317,13 @@ impl Machine {
     }
 
     /// Returns the newest events, the oldest of them first.
-    pub fn log(&self) -> &[Seen] {
-        self.handshake.log.all()
+    pub fn log(&self) -> &[LogEntry] {
+        self.handshake.log.entries()
     }
 
     /// Sets an observer of all events from now on.
-    pub fn witness(&mut self, witness: Witness) {
-        self.handshake.log.witness(witness);
+    pub fn set_observer(&mut self, witness: Observer) {
+        self.handshake.log.set_observer(witness);
     }
 
     /// Returns the number of older events that are no longer in the log.
@@ -333,15 +333,15 @@ impl Machine {
 
     /// Returns every START that moved the machine, as sequence number, job and cycle.
     pub fn began(&self) -> Vec<(u32, u32, u16)> {
-        let began = |seen: &Seen| match seen.what {
-            What::Began { start, job, cycle } => Some((start, job, cycle)),
+        let began = |seen: &LogEntry| match seen.what {
+            HandshakeEvent::Began { start, job, cycle } => Some((start, job, cycle)),
             _ => None,
         };
         self.log().iter().filter_map(began).collect()
     }
 
     /// Returns the physics, for a test that changes it without the handshake.
-    pub fn body_mut(&mut self) -> &mut dyn Body {
+    pub fn body_mut(&mut self) -> &mut dyn Physics {
         &mut *self.handshake.body
     }
 

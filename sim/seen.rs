@@ -5,27 +5,27 @@ use std::time::Duration;
 
 use serde::{Serialize, Serializer};
 
-use crate::command::{Answer, Frame, State};
+use crate::command::{Answer, CommandFrame, State};
 
 /// Event with its time.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Seen {
+pub struct LogEntry {
     /// Real time since the machine was made, as the sum of its ticks.
     #[serde(rename = "at_s", serialize_with = "seconds")]
     pub at: Duration,
     /// Kind of the event.
     #[serde(flatten)]
-    pub what: What,
+    pub what: HandshakeEvent,
 }
 
 /// Kind of an event.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "what", rename_all = "snake_case")]
-pub enum What {
+pub enum HandshakeEvent {
     /// A command was carried out, or refused with an answer.
     Commanded {
         /// Frame as it was read.
-        frame: Frame,
+        frame: CommandFrame,
         /// Answer of the machine.
         answer: Answer,
         /// State of the machine at that time.
@@ -67,7 +67,7 @@ pub enum What {
         result: u16,
         /// Beats of the client during the job.
         #[serde(flatten)]
-        beats: Beats,
+        beats: BeatStatistics,
     },
     /// A payload came into force.
     Taken {
@@ -102,7 +102,7 @@ pub enum What {
 
 /// Statistics of the owner's beats during a job, from its START to its end.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct Beats {
+pub struct BeatStatistics {
     /// Number of beats.
     #[serde(rename = "beats")]
     pub heard: u32,
@@ -116,53 +116,53 @@ pub struct Beats {
 
 /// Collector of the owner's beats during a job.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Listening {
+pub(crate) struct BeatMonitor {
     began: Duration,
     first: Option<Duration>,
     last: Option<Duration>,
-    heard: u32,
-    longest: Duration,
+    count: u32,
+    max_silence: Duration,
 }
 
-impl Listening {
-    pub(crate) fn from(began: Duration) -> Self {
+impl BeatMonitor {
+    pub(crate) fn new(began: Duration) -> Self {
         Self { began, ..Self::default() }
     }
 
     /// Records a beat at a time.
-    pub(crate) fn hear(&mut self, now: Duration) {
-        self.longest = self.silence_at(now);
+    pub(crate) fn record(&mut self, now: Duration) {
+        self.max_silence = self.silence_at(now);
         self.first = self.first.or(Some(now));
         self.last = Some(now);
-        self.heard = self.heard.saturating_add(1);
+        self.count = self.count.saturating_add(1);
     }
 
     /// Returns the statistics until now.
-    pub(crate) fn until(&self, now: Duration) -> Beats {
+    pub(crate) fn statistics(&self, now: Duration) -> BeatStatistics {
         let between = self.last.zip(self.first).map_or(Duration::ZERO, |(last, first)| last - first);
-        let mean = between.checked_div(self.heard.saturating_sub(1)).unwrap_or_default();
-        Beats { heard: self.heard, mean, longest_silence: self.silence_at(now) }
+        let mean = between.checked_div(self.count.saturating_sub(1)).unwrap_or_default();
+        BeatStatistics { heard: self.count, mean, longest_silence: self.silence_at(now) }
     }
 
     fn silence_at(&self, now: Duration) -> Duration {
-        self.longest.max(now.saturating_sub(self.last.unwrap_or(self.began)))
+        self.max_silence.max(now.saturating_sub(self.last.unwrap_or(self.began)))
     }
 }
 
 /// Newest events; the older half is dropped when the log is full.
 #[derive(Default)]
-pub(crate) struct Log {
-    seen: Vec<Seen>,
+pub(crate) struct EventLog {
+    entries: Vec<LogEntry>,
     forgotten: u64,
-    witness: Option<Witness>,
+    observer: Option<Observer>,
 }
 
 /// Observer that receives each event when it happens.
-pub type Witness = Box<dyn FnMut(&Seen) + Send>;
+pub type Observer = Box<dyn FnMut(&LogEntry) + Send>;
 
-impl fmt::Debug for Log {
+impl fmt::Debug for EventLog {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Log").field("seen", &self.seen).field("forgotten", &self.forgotten).finish_non_exhaustive()
+        f.debug_struct("Log").field("seen", &self.entries).field("forgotten", &self.forgotten).finish_non_exhaustive()
     }
 }
 
@@ -174,28 +174,28 @@ fn digits<S: Serializer>(identity: &[u8; 32], to: S) -> Result<S::Ok, S::Error> 
     to.collect_str(&identity.iter().map(|byte| format!("{byte:02x}")).collect::<String>())
 }
 
-impl Log {
+impl EventLog {
     const CAPACITY: usize = 1 << 16;
 
-    pub(crate) fn push(&mut self, at: Duration, what: What) {
-        if self.seen.len() == Self::CAPACITY {
-            self.seen.drain(..Self::CAPACITY / 2);
+    pub(crate) fn push(&mut self, at: Duration, what: HandshakeEvent) {
+        if self.entries.len() == Self::CAPACITY {
+            self.entries.drain(..Self::CAPACITY / 2);
             self.forgotten += Self::CAPACITY as u64 / 2;
         }
-        let seen = Seen { at, what };
-        if let Some(witness) = &mut self.witness {
+        let seen = LogEntry { at, what };
+        if let Some(witness) = &mut self.observer {
             witness(&seen);
         }
-        self.seen.push(seen);
+        self.entries.push(seen);
     }
 
     /// Sets an observer of all events from now on.
-    pub(crate) fn witness(&mut self, witness: Witness) {
-        self.witness = Some(witness);
+    pub(crate) fn set_observer(&mut self, witness: Observer) {
+        self.observer = Some(witness);
     }
 
-    pub(crate) fn all(&self) -> &[Seen] {
-        &self.seen
+    pub(crate) fn entries(&self) -> &[LogEntry] {
+        &self.entries
     }
 
     pub(crate) fn forgotten(&self) -> u64 {

@@ -289,7 +289,7 @@ impl<S: Shape> Shape for ThroughOrigin<S> {
 /// along the normal; `None` if the iteration does not converge.
 ///
 /// Solves (c - S) . S_x = 0 and (c - S) . S_y = 0 by Newton's method.
-pub(crate) fn foot(shape: &dyn Shape, centre: Vec3, [mut x, mut y]: [f64; 2]) -> Option<([f64; 2], f64)> {
+pub(crate) fn project_onto(shape: &dyn Shape, centre: Vec3, [mut x, mut y]: [f64; 2]) -> Option<([f64; 2], f64)> {
     for _ in 0..40 {
         let ([p, q], [r, s, t]) = (shape.gradient(x, y), shape.hessian(x, y));
         let off = [centre[0] - x, centre[1] - y, centre[2] - shape.height(x, y)];

@@ -218,7 +218,7 @@ pub struct WorldSpec {
     /// The measuring machine.
     pub cmm: CmmSpec,
     /// What is broken, for tests.
-    pub faults: Faults,
+    pub faults: WorldFaults,
 }
 
 impl Default for WorldSpec {
@@ -229,7 +229,7 @@ impl Default for WorldSpec {
             part: PartSpec::default(),
             grinder: GrinderSpec::default(),
             cmm: CmmSpec::default(),
-            faults: Faults::default(),
+            faults: WorldFaults::default(),
         }
     }
 }
@@ -275,7 +275,7 @@ pub enum Misreported {
 /// What is broken, for tests.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, Serialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Faults {
+pub struct WorldFaults {
     /// The grinder displaces to the wrong side.
     pub map_sign_flipped: bool,
     /// The grinder turns the map over.

@@ -1,7 +1,7 @@
 //! Transfer of payloads to the machine and of results from it, page by page.
 
-use crate::body::{Kind, Outcome, Payload};
-use crate::words::{Image, WordOrder, bytes_of, registers_of, turn_payload};
+use crate::body::{Kind, Payload, ResultData};
+use crate::words::{RegisterBlock, WordOrder, bytes_of, registers_of, turn_payload};
 
 /// Number of data registers of a full page.
 pub const PAGE_REGISTERS: usize = 112;
@@ -16,7 +16,7 @@ pub enum InboxState {
     /// The inbox waits for pages.
     Receiving = 1,
     /// The payload is in force.
-    Taken = 2,
+    InForce = 2,
     /// All pages have arrived, and do not match the header.
     CrcWrong = 3,
     /// The machine cannot use it.
@@ -36,7 +36,7 @@ pub(crate) struct Arrived {
 pub(crate) struct Inbox {
     kind: u16,
     pub(crate) state: InboxState,
-    promised: u32,
+    announced_bytes: u32,
     crc: u32,
     identity: [u8; 32],
     next_page: u32,
@@ -48,8 +48,8 @@ pub(crate) struct Inbox {
 impl Inbox {
     /// Accepts a header; returns false if its content is not acceptable.
     pub(crate) fn header(&mut self, order: WordOrder, words: &[u16], of: Kind, limit_bytes: u32) -> bool {
-        let (kind, promised) = (words[0], order.to_u32([words[2], words[3]]));
-        if slot_of(of, kind).is_none() || promised == 0 || promised > limit_bytes {
+        let (kind, announced_bytes) = (words[0], order.to_u32([words[2], words[3]]));
+        if slot_of(of, kind).is_none() || announced_bytes == 0 || announced_bytes > limit_bytes {
             return false;
         }
         let mut identity = [0; 32];
@@ -57,7 +57,7 @@ impl Inbox {
         *self = Self {
             kind,
             state: InboxState::Receiving,
-            promised,
+            announced_bytes,
             crc: order.to_u32([words[4], words[5]]),
             identity,
             ..Self::default()
@@ -70,7 +70,7 @@ impl Inbox {
         if self.has_page(order, words) {
             return Some(None);
         }
-        let left = (self.promised - self.bytes.len() as u32).min(PAGE_BYTES);
+        let left = (self.announced_bytes - self.bytes.len() as u32).min(PAGE_BYTES);
         let wanted = left.div_ceil(2) as usize;
         let fits = usize::from(words[2]) == wanted && words.len() == 8 + wanted;
         if self.state != InboxState::Receiving || order.to_u32([words[0], words[1]]) != self.next_page || !fits {
@@ -78,7 +78,7 @@ impl Inbox {
         }
         self.bytes.extend(&bytes_of(&words[8..])[..left as usize]);
         self.next_page += 1;
-        Some(if self.bytes.len() as u32 == self.promised { self.close() } else { None })
+        Some(if self.bytes.len() as u32 == self.announced_bytes { self.close() } else { None })
     }
 
     /// Returns true if a page was accepted already.
@@ -92,7 +92,7 @@ impl Inbox {
             self.state = InboxState::CrcWrong;
             return None;
         }
-        self.state = InboxState::Taken;
+        self.state = InboxState::InForce;
         Some(Arrived { kind: self.kind, bytes: self.bytes.clone(), identity: self.identity })
     }
 
@@ -103,7 +103,7 @@ impl Inbox {
     }
 
     pub(crate) fn image(&self, order: WordOrder) -> Vec<u16> {
-        Image::new(order, 12)
+        RegisterBlock::new(order, 12)
             .u16(0, self.kind)
             .u16(1, self.state as u16)
             .u32(2, self.next_page)
@@ -145,7 +145,7 @@ impl Slot {
 }
 
 pub(crate) fn slots_image(order: WordOrder, slots: &[Option<Slot>; 3]) -> Vec<u16> {
-    let mut image = Image::new(order, 72);
+    let mut image = RegisterBlock::new(order, 72);
     for (index, slot) in slots.iter().enumerate() {
         let at = 24 * index;
         image = image.u16(at, index as u16 + 1);
@@ -178,7 +178,7 @@ pub(crate) struct Origin {
 
 impl Outbox {
     /// Packs the present result of a running job: without a CRC, without a `done` number, and only in full pages.
-    pub(crate) fn so_far(order: WordOrder, outcome: Outcome, origin: Origin) -> Option<Self> {
+    pub(crate) fn partial(order: WordOrder, outcome: ResultData, origin: Origin) -> Option<Self> {
         let mut outbox = Self::new(order, outcome, Origin { done: 0, ..origin })?;
         outbox.header[4..6].fill(0);
         let full = outbox.registers.len() / PAGE_REGISTERS * PAGE_REGISTERS;
@@ -187,7 +187,7 @@ impl Outbox {
     }
 
     /// Packs a result; `None` if one of its figures is not a number that may be sent.
-    pub(crate) fn new(order: WordOrder, outcome: Outcome, origin: Origin) -> Option<Self> {
+    pub(crate) fn new(order: WordOrder, outcome: ResultData, origin: Origin) -> Option<Self> {
         let figures = [outcome.probe_radius_mm, outcome.scale_mm, outcome.temperature_c, outcome.duration_s];
         if !figures.iter().all(|figure| figure.is_finite()) {
             return None;
@@ -196,7 +196,7 @@ impl Outbox {
         if order == WordOrder::Little {
             turn_payload(outcome.kind, outcome.format, &mut bytes);
         }
-        let header = Image::new(order, 56)
+        let header = RegisterBlock::new(order, 56)
             .u16(0, outcome.kind)
             .u16(1, outcome.format)
             .u32(2, bytes.len() as u32)
@@ -229,5 +229,5 @@ impl Outbox {
 
 /// Returns the registers of a page of an outbox: number of the page, number of valid registers, and the registers.
 pub(crate) fn page_image(order: WordOrder, page: u32, data: &[u16]) -> Vec<u16> {
-    Image::new(order, 4 + PAGE_REGISTERS).u32(0, page).u16(2, data.len() as u16).words(4, data).done()
+    RegisterBlock::new(order, 4 + PAGE_REGISTERS).u32(0, page).u16(2, data.len() as u16).words(4, data).done()
 }

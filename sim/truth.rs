@@ -8,7 +8,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use rand_distr::{Distribution, StandardNormal};
 
 use crate::Vec3;
-use crate::body::{Kind, Outcome};
+use crate::body::{Kind, ResultData};
 use crate::part::Part;
 use crate::probe::Placement;
 use crate::spec::WorldSpec;
@@ -23,7 +23,7 @@ pub struct GrindEntry {
     /// Commanded height, in mm.
     pub level_mm: f64,
     /// Largest value of the map of the pass, in mm.
-    pub map_largest_mm: f64,
+    pub map_max_abs_mm: f64,
     /// Identity of the map.
     pub map: [u8; 32],
     /// Number of strokes that removed material higher than the depth of cut.
@@ -37,7 +37,7 @@ pub struct GrindEntry {
 /// Pass along a path that an external controller executed: from the first contact of wheel and part until the part was
 /// taken away.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Sweep {
+pub struct ExecutedPass {
     /// Number of strokes over the whole part: 1, plus 1 for every spark-out, if nothing was left out and nothing was
     /// done twice.
     pub strokes: f64,
@@ -71,7 +71,7 @@ pub(crate) fn stream(seed: u64, source: Source, number: u32) -> crate::Rng {
 }
 
 /// State shared by both machines.
-pub(crate) struct State {
+pub(crate) struct WorldState {
     pub spec: WorldSpec,
     pub part: Part,
     /// Systematic error of the grinder at every node, in mm, without the effect of the wheel's radius.
@@ -81,7 +81,7 @@ pub(crate) struct State {
     /// Job of the blank.
     pub job: Option<u32>,
     /// Identity of the part in the grinder.
-    pub held: Option<[u8; 32]>,
+    pub part_identity: Option<[u8; 32]>,
     pub true_wheel_radius_mm: Option<f64>,
     pub passes_begun: u32,
     /// Number of passes over the blank after which it was last damaged.
@@ -99,17 +99,17 @@ pub(crate) struct State {
     /// Number of finishing strokes since the wheel was dressed.
     pub worn_strokes: f64,
     /// Machine whose job has the part.
-    pub busy: Option<Kind>,
+    pub holder: Option<Kind>,
     /// Machine whose wheel or probe is at the part.
     pub engaged: Option<Kind>,
     pub history: Vec<GrindEntry>,
     /// Passes along executed paths, in order.
-    pub sweeps: Vec<Sweep>,
+    pub executed_passes: Vec<ExecutedPass>,
     /// True if part of an executed path was lost, or if the wheel ran into a probe: the state of the part is unknown.
-    pub unknown: bool,
+    pub part_unknown: bool,
 }
 
-impl State {
+impl WorldState {
     /// Creates the initial state; `systematic_mm` returns the systematic error of the grinder at the part's nodes.
     pub fn new(spec: WorldSpec, systematic_mm: impl FnOnce(&WorldSpec, &Part) -> Vec<f64>) -> Self {
         let part = Part::blank(&spec.part, blank_seed(spec.seed, 1));
@@ -121,7 +121,7 @@ impl State {
             systematic_mm,
             blanks: 1,
             job: None,
-            held: None,
+            part_identity: None,
             true_wheel_radius_mm: None,
             passes_begun: 0,
             damaged_after: None,
@@ -132,18 +132,18 @@ impl State {
             placement,
             heat: 0.0,
             worn_strokes: 0.0,
-            busy: None,
+            holder: None,
             engaged: None,
             history: Vec::new(),
-            sweeps: Vec::new(),
-            unknown: false,
+            executed_passes: Vec::new(),
+            part_unknown: false,
         }
     }
 
     pub fn load_blank(&mut self) {
         self.blanks += 1;
         self.part = Part::blank(&self.spec.part, blank_seed(self.spec.seed, self.blanks));
-        (self.held, self.job, self.on_table) = (None, None, false);
+        (self.part_identity, self.job, self.on_table) = (None, None, false);
         (self.passes_of_blank, self.damaged_after) = (0, None);
     }
 
@@ -180,36 +180,36 @@ impl State {
         }
     }
 
-    pub fn taken_by_other(&self, kind: Kind) -> bool {
-        self.busy.is_some_and(|other| other != kind)
+    pub fn is_held_by_other(&self, kind: Kind) -> bool {
+        self.holder.is_some_and(|other| other != kind)
     }
 
     /// Gives the part to a machine, unless the other machine has it.
-    pub fn take(&mut self, kind: Kind) -> bool {
-        if self.taken_by_other(kind) {
+    pub fn claim_part(&mut self, kind: Kind) -> bool {
+        if self.is_held_by_other(kind) {
             return false;
         }
-        (self.busy, self.engaged) = (Some(kind), Some(kind));
+        (self.holder, self.engaged) = (Some(kind), Some(kind));
         true
     }
 
-    pub fn clear(&mut self, kind: Kind) {
+    pub fn disengage(&mut self, kind: Kind) {
         if self.engaged == Some(kind) {
             self.engaged = None;
         }
     }
 
     pub fn release(&mut self, kind: Kind) {
-        self.clear(kind);
-        if self.busy == Some(kind) {
-            self.busy = None;
+        self.disengage(kind);
+        if self.holder == Some(kind) {
+            self.holder = None;
         }
     }
 
     pub fn interlocks(&self, kind: Kind) -> u16 {
         let (guards, supplies) = (1, 1 << 3);
         let clear = if self.engaged == Some(kind) { 0 } else { 1 << 1 };
-        let clamped = if self.taken_by_other(kind) { 0 } else { 1 << 2 };
+        let clamped = if self.is_held_by_other(kind) { 0 } else { 1 << 2 };
         guards | clear | clamped | supplies
     }
 }
@@ -240,13 +240,13 @@ fn blank_seed(seed: u64, number: u32) -> u64 {
 }
 
 /// Locks the state. After a panic elsewhere, the state is still the truth about the part, so poisoning is ignored.
-pub(crate) fn locked(state: &Mutex<State>) -> MutexGuard<'_, State> {
+pub(crate) fn locked(state: &Mutex<WorldState>) -> MutexGuard<'_, WorldState> {
     state.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Returns the outbox of a job that never began.
-pub(crate) fn nothing_done(temperature_c: f64) -> Outcome {
-    Outcome {
+pub(crate) fn empty_result(temperature_c: f64) -> ResultData {
+    ResultData {
         kind: 0,
         format: 1,
         bytes: Vec::new(),

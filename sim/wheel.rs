@@ -9,8 +9,8 @@ use std::sync::{Arc, Mutex};
 
 use crate::Vec3;
 use crate::body::Kind;
-use crate::shape::foot;
-use crate::truth::{State, locked};
+use crate::shape::project_onto;
+use crate::truth::{WorldState, locked};
 
 /// Height over the nominal surface above which there is no material, in mm.
 const AIR_MM: f64 = 1.0;
@@ -26,7 +26,7 @@ struct Track {
 
 impl Track {
     /// Returns the height at a place along the track; beyond its ends, that of the end.
-    fn at(&self, x: f64) -> Option<f64> {
+    fn height_at(&self, x: f64) -> Option<f64> {
         let near = |a: &&[f64; 2], b: &&[f64; 2]| (a[0] - x).abs().total_cmp(&(b[0] - x).abs());
         let below = self.places.iter().filter(|place| place[0] <= x).min_by(near);
         let above = self.places.iter().filter(|place| place[0] > x).min_by(near);
@@ -39,82 +39,82 @@ impl Track {
 
 /// Wheel of a world's grinder.
 pub struct PlainWheel {
-    world: Arc<Mutex<State>>,
+    world: Arc<Mutex<WorldState>>,
     radius_mm: f64,
-    first: Option<Track>,
-    before: Option<Track>,
-    now: Option<Track>,
+    first_track: Option<Track>,
+    previous_track: Option<Track>,
+    current_track: Option<Track>,
 }
 
 impl PlainWheel {
     /// Creates a wheel whose controller assumes this radius.
-    pub(crate) fn new(world: Arc<Mutex<State>>, stated_mm: f64) -> Self {
+    pub(crate) fn new(world: Arc<Mutex<WorldState>>, stated_mm: f64) -> Self {
         let radius_mm = stated_mm + 1e-3 * locked(&world).spec.grinder.wheel_radius_error_um;
-        Self { world, radius_mm, first: None, before: None, now: None }
+        Self { world, radius_mm, first_track: None, previous_track: None, current_track: None }
     }
 
     /// Clamps the part for a program; returns true if it is there.
-    pub fn take(&mut self) -> bool {
+    pub fn claim_part(&mut self) -> bool {
         let mut state = locked(&self.world);
-        (self.first, self.before, self.now) = (None, None, None);
+        (self.first_track, self.previous_track, self.current_track) = (None, None, None);
         state.on_table = false;
-        state.take(Kind::Grinder)
+        state.claim_part(Kind::Grinder)
     }
 
     /// Moves the wheel away from the part, so that the other machine can take the part.
-    pub fn let_go(&mut self) {
+    pub fn release_part(&mut self) {
         locked(&self.world).release(Kind::Grinder);
     }
 
     /// Moves the centre of the wheel to a place of the model frame.
-    pub fn come(&mut self, centre_mm: Vec3) {
+    pub fn move_to(&mut self, centre_mm: Vec3) {
         let world = Arc::clone(&self.world);
         let mut state = locked(&world);
         let near = [centre_mm[0], centre_mm[1]];
-        let Some(([x, y], height_mm)) = foot(state.part.shape.as_ref(), centre_mm, near) else { return };
+        let Some(([x, y], height_mm)) = project_onto(state.part.shape.as_ref(), centre_mm, near) else { return };
         let over_mm = height_mm - self.radius_mm;
         if over_mm > AIR_MM {
             return self.next_track();
         }
-        if self.now.as_ref().is_some_and(|track| (track.y_mm - y).abs() > SAME_TRACK_MM) {
+        if self.current_track.as_ref().is_some_and(|track| (track.y_mm - y).abs() > SAME_TRACK_MM) {
             self.next_track();
         }
-        let track = self.now.get_or_insert_with(|| Track { y_mm: y, places: Vec::new() });
+        let track = self.current_track.get_or_insert_with(|| Track { y_mm: y, places: Vec::new() });
         let last = track.places.last().map_or(x, |place| place[0]);
         track.places.push([x, over_mm]);
-        if let (Some(before), Some(now)) = (&self.before, &self.now) {
+        if let (Some(before), Some(now)) = (&self.previous_track, &self.current_track) {
             let along = [last.min(x), last.max(x)];
             let across = [before.y_mm.min(now.y_mm), before.y_mm.max(now.y_mm)];
             grind(&mut state, (along, across), |[x, y]| {
-                let [from, to] = [before.at(x)?, now.at(x)?];
+                let [from, to] = [before.height_at(x)?, now.height_at(x)?];
                 Some(from + (to - from) * (y - before.y_mm) / (now.y_mm - before.y_mm))
             });
         }
     }
 
     fn next_track(&mut self) {
-        if let Some(track) = self.now.take() {
-            self.first.get_or_insert_with(|| track.clone());
-            self.before = Some(track);
+        if let Some(track) = self.current_track.take() {
+            self.first_track.get_or_insert_with(|| track.clone());
+            self.previous_track = Some(track);
         }
     }
 
     /// Ends a complete sweep: the strips beyond the outermost tracks take the heights of those tracks.
-    pub fn been_all_over(&mut self) {
+    pub fn finish_sweep(&mut self) {
         self.next_track();
         let world = Arc::clone(&self.world);
         let mut state = locked(&world);
-        let (first, last) = (self.first.take(), self.before.take());
+        let (first, last) = (self.first_track.take(), self.previous_track.take());
         let Some((first, last)) = first.zip(last) else { return };
         let (low, high) = if first.y_mm <= last.y_mm { (&first, &last) } else { (&last, &first) };
         let all = [f64::NEG_INFINITY, f64::INFINITY];
-        grind(&mut state, (all, [f64::NEG_INFINITY, low.y_mm]), |[x, _]| low.at(x));
-        grind(&mut state, (all, [high.y_mm, f64::INFINITY]), |[x, _]| high.at(x));
+        grind(&mut state, (all, [f64::NEG_INFINITY, low.y_mm]), |[x, _]| low.height_at(x));
+        grind(&mut state, (all, [high.y_mm, f64::INFINITY]), |[x, _]| high.height_at(x));
     }
 }
 
 /// Grinds the material between these bounds to a height over the nominal surface.
-fn grind(state: &mut State, (along, across): ([f64; 2], [f64; 2]), wanted: impl Fn([f64; 2]) -> Option<f64>) {
+fn grind(state: &mut WorldState, (along, across): ([f64; 2], [f64; 2]), wanted: impl Fn([f64; 2]) -> Option<f64>) {
     let mu = state.spec.grinder.error_copying;
     let within = |[least, most]: [f64; 2], value: f64| (least..=most).contains(&value);
     let nodes: Vec<(usize, [f64; 2])> = state.part.height.nodes().enumerate().collect();

@@ -55,12 +55,12 @@ impl WordOrder {
 
 /// Block of registers under construction.
 #[derive(Debug)]
-pub(crate) struct Image {
+pub(crate) struct RegisterBlock {
     order: WordOrder,
     registers: Vec<u16>,
 }
 
-impl Image {
+impl RegisterBlock {
     pub(crate) fn new(order: WordOrder, length: usize) -> Self {
         Self { order, registers: vec![0; length] }
     }

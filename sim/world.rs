@@ -1,6 +1,6 @@
 //! Ground truth of a grinding cell: one table contains all errors, and one seed draws all random numbers.
 //!
-//! [`World`] gives out the two machines as [`Body`](crate::body::Body). For tests only, it also returns the truth that
+//! [`World`] gives out the two machines as [`Body`](crate::body::Physics). For tests only, it also returns the truth that
 //! no controller may ask for: the real placement of the part, the real deviation of its surface from the nominal, and
 //! what the grinder really did.
 //!
@@ -11,19 +11,19 @@
 use std::fmt;
 use std::sync::{Arc, Mutex};
 
-use crate::cmm::{Cmm, Led};
+use crate::cmm::{Cmm, TouchProbe};
 use crate::executed::Wheel;
 use crate::part::{Approach, Contact};
 use crate::probe::Placement;
 use crate::process::{Grinder, systematic_mm};
-use crate::spec::{Faults, SpecError, WorldSpec};
-use crate::truth::{GrindEntry, State, Sweep, locked};
+use crate::spec::{SpecError, WorldFaults, WorldSpec};
+use crate::truth::{ExecutedPass, GrindEntry, WorldState, locked};
 use crate::wheel::PlainWheel;
 
 /// Simulated cell. Clones share one truth.
 #[derive(Clone)]
 pub struct World {
-    state: Arc<Mutex<State>>,
+    state: Arc<Mutex<WorldState>>,
 }
 
 impl fmt::Debug for World {
@@ -40,7 +40,7 @@ impl World {
     /// A number is outside the range for which the simulation is valid.
     pub fn new(spec: WorldSpec) -> Result<Self, SpecError> {
         spec.check()?;
-        Ok(Self { state: Arc::new(Mutex::new(State::new(spec, systematic_mm))) })
+        Ok(Self { state: Arc::new(Mutex::new(WorldState::new(spec, systematic_mm))) })
     }
 
     /// Returns the grinder. There is only one, so give it to one wire.
@@ -55,8 +55,8 @@ impl World {
 
     /// Returns the probe of the measuring machine, for control touch by touch. There is only one, so give it to one
     /// wire.
-    pub fn led(&self) -> Led {
-        Led::new(self.state.clone())
+    pub fn touch_probe(&self) -> TouchProbe {
+        TouchProbe::new(self.state.clone())
     }
 
     /// Returns a wheel of the grinder with this stated radius, which is moved from place to place on widely spaced
@@ -80,7 +80,7 @@ impl World {
     }
 
     /// Sets the faults, from the next job on.
-    pub fn set_faults(&self, faults: Faults) {
+    pub fn set_faults(&self, faults: WorldFaults) {
         let mut state = locked(&self.state);
         state.spec.faults = faults;
         state.on_table = false;
@@ -108,7 +108,7 @@ impl World {
     ///
     /// In a groove, this differs from [`Self::deviation_mm`], because the ball touches beside its centre. Beyond the
     /// part the ball touches nothing.
-    pub fn touched_mm(&self, places_mm: &[[f64; 2]], radius_mm: f64) -> Vec<Option<f64>> {
+    pub fn ball_heights_mm(&self, places_mm: &[[f64; 2]], radius_mm: f64) -> Vec<Option<f64>> {
         const REACH_MM: f64 = 1.0;
         let state = locked(&self.state);
         let (part, shape) = (&state.part, &state.part.shape);
@@ -150,7 +150,7 @@ impl World {
     }
 
     /// Returns the true RMS of the random error of a pass, in mm. No compensation can remove it.
-    pub fn floor_mm(&self) -> f64 {
+    pub fn repeatability_mm(&self) -> f64 {
         locked(&self.state).spec.grinder.repeatability_um * 1e-3
     }
 
@@ -160,8 +160,8 @@ impl World {
     }
 
     /// Returns every pass along an executed path, in order.
-    pub fn sweeps(&self) -> Vec<Sweep> {
-        locked(&self.state).sweeps.clone()
+    pub fn executed_passes(&self) -> Vec<ExecutedPass> {
+        locked(&self.state).executed_passes.clone()
     }
 
     /// Returns how often a pass was begun for a job and cycle.

@@ -18,7 +18,7 @@ use crate::compensation::path::{
 };
 use crate::compensation::{Contact, Correction, CorrectionLimits, MapOptions, WheelTerm, contact_width_mm};
 use crate::config::{CellConfig, Link, RotaryLetter};
-use crate::device::{AnyCmm, AnyGrinder, Line, Making, MakingError, ModbusSettings, Pass, hex};
+use crate::device::{AnyCmm, AnyGrinder, DriverContext, DriverError, LineAddress, ModbusSettings, Pass, hex};
 use crate::drive::{Adaptive, Probing, Programs, Sphere, TakenBack, Task, correction_grid};
 use crate::formats::gcode::DialectError;
 use crate::formats::{self, FormatError, NominalFile};
@@ -82,7 +82,7 @@ pub enum SetupError {
     #[error("{}: {source} (cell file {})", .recipe.display(), .cell.display())]
     Dialect { recipe: PathBuf, cell: PathBuf, source: DialectError },
     #[error("{cell}: {source}")]
-    Machine { cell: PathBuf, source: MakingError },
+    Machine { cell: PathBuf, source: DriverError },
 }
 
 /// Timeout of a job of a machine that a person serves without a wire.
@@ -148,7 +148,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         coordinates: cell.cmm.link.wire.coordinates(),
         parameters,
         datum,
-        place: MapLimits { place_mm: recipe.compensation.largest_displacement_mm, ..MapLimits::default() },
+        place: MapLimits { place_mm: recipe.compensation.max_displacement_mm, ..MapLimits::default() },
         map: map_options(recipe),
         gain: recipe.compensation.gain(),
         repeatability_mm: recipe.compensation.repeatability_um.map(Um::mm),
@@ -157,15 +157,15 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         kind,
         targets,
         limits: CorrectionLimits {
-            largest_depth_mm: cell.grinder.limits.largest_depth_mm,
-            least_depth_mm: recipe.compensation.least_depth_um.mm(),
+            max_depth_mm: cell.grinder.limits.max_depth_mm,
+            least_depth_mm: recipe.compensation.min_depth_um.mm(),
             depth_of_cut_mm: recipe.compensation.depth_of_cut_um.mm(),
-            largest_correction_mm: recipe.compensation.largest_correction_um.mm(),
+            max_correction_mm: recipe.compensation.max_correction_um.mm(),
             allowance_mm: recipe.grinding.allowance_um.mm(),
             removal_budget_mm: recipe.compensation.removal_budget_um.mm(),
         },
         tolerance_mm: recipe.acceptance.pv_um.map(|pv| 0.5 * pv.mm()),
-        least_found: recipe.measure.minimum_coverage,
+        least_found: recipe.measure.min_coverage,
         temperature_c: recipe.measure.temperature_c,
         expansion: expansion(recipe, cell),
         machine: cell.cmm.uncertainty,
@@ -197,7 +197,7 @@ fn taken_back(
     let Pass { x_mm, y_mm, .. } = pass(recipe, nominal, [0; 32], 1.0);
     let grid = correction_grid([x_mm, y_mm], recipe.compensation.spacing_mm);
     // A program moves the centre of the wheel along the normals. A grinder with its own path is guided in height.
-    let is_program = cell.grinder.link.wire.works_from_run();
+    let is_program = cell.grinder.link.wire.reads_run_folder();
     let wheel_term = if is_program { WheelTerm::AlongNormal } else { WheelTerm::InHeight };
     Ok(Some(TakenBack { tolerances: parameters.tolerances(), wheel_term, nodes: Contact::under(field, &grid) }))
 }
@@ -207,21 +207,21 @@ fn taken_back(
 fn datum(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
     let Pass { x_mm, y_mm, .. } = pass(recipe, nominal, [0; 32], 1.0);
     let half_mm = [x_mm, y_mm].map(|[low, high]| 0.5 * (high - low));
-    let shift_mm = 0.5 * recipe.registration.hold_uncertainty_um?.mm();
+    let shift_mm = 0.5 * recipe.registration.lock_uncertainty_um?.mm();
     Some([shift_mm, shift_mm / half_mm[0].max(half_mm[1])])
 }
 
 /// Returns the settings of a measurement with chosen touches.
 fn adaptive(recipe: &Recipe) -> Option<Adaptive> {
-    let accepted_risk = recipe.measuring.accepted_risk.filter(|_| recipe.measuring.mode == Mode::Adaptive)?;
-    Some(Adaptive { tolerance: tolerance(recipe), accepted_risk, most_cycles: u32::from(recipe.cycle.most_cycles) })
+    let accepted_risk = recipe.measure.accepted_risk.filter(|_| recipe.measure.mode == Mode::Adaptive)?;
+    Some(Adaptive { tolerance: tolerance(recipe), accepted_risk, max_cycles: u32::from(recipe.cycle.max_cycles) })
 }
 
 /// Returns the minimum share of a plan's targets that must be found.
 fn least_found(recipe: &Recipe) -> f64 {
     // One of the first touches can miss. The task checks the share of all touches.
-    let share = if recipe.measuring.mode == Mode::Adaptive { Adaptive::ONE_MAY_MISS } else { 1.0 };
-    share * recipe.measure.minimum_coverage
+    let share = if recipe.measure.mode == Mode::Adaptive { Adaptive::ONE_MAY_MISS } else { 1.0 };
+    share * recipe.measure.min_coverage
 }
 
 /// Returns the acceptance limits.
@@ -238,7 +238,7 @@ fn tolerance(recipe: &Recipe) -> Tolerance {
 
 /// Returns the timeout for the transfer of `bytes` over the line of a machine, with a margin for retries.
 fn transfer_within(link: &Link, bytes: usize) -> Duration {
-    let Some((Line::Rtu { baud, .. }, _)) = link.wire.line() else { return Duration::ZERO };
+    let Some((LineAddress::Rtu { baud, .. }, _)) = link.wire.modbus_line() else { return Duration::ZERO };
     // A page has 224 bytes of data in a frame of 249 and a response of 8. The machine needs some time for each page.
     let pages = bytes.div_ceil(224) as f64;
     let page_s = (249.0 + 8.0) * 11.0 / f64::from(baud.max(1)) + 0.05;
@@ -282,7 +282,7 @@ fn kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize) -> Stri
         grinding.spark_out_passes,
         map.depth_of_cut_um.mm(),
         measure.probe_radius_mm,
-        Coordinate::locked(&recipe.registration.hold),
+        Coordinate::locked(&recipe.registration.lock),
         map.cutoff_mm,
         map.smoothing,
         map.gain()
@@ -452,10 +452,10 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     let [least, most] = limits.wheel_radius_mm;
     beyond("grinding.wheel.radius_mm", recipe.grinding.wheel.radius_mm(), least, most, "grinder.limits")?;
     let feed = recipe.grinding.feed_mm_min;
-    beyond("grinding.feed_mm_min", feed, 0.0, limits.largest_feed_mm_min, "grinder.limits.largest_feed_mm_min")?;
+    beyond("grinding.feed_mm_min", feed, 0.0, limits.max_feed_mm_min, "grinder.limits.max_feed_mm_min")?;
     // Each value keeps its own unit in the message: micrometres in the recipe, millimetres in the cell file.
-    let (depth_um, most_um) = (recipe.compensation.depth_of_cut_um.0, 1e3 * limits.largest_depth_mm);
-    beyond("compensation.depth_of_cut_um", depth_um, 0.0, most_um, "1000 times grinder.limits.largest_depth_mm")?;
+    let (depth_um, most_um) = (recipe.compensation.depth_of_cut_um.0, 1e3 * limits.max_depth_mm);
+    beyond("compensation.depth_of_cut_um", depth_um, 0.0, most_um, "1000 times grinder.limits.max_depth_mm")?;
     if targets.is_empty() && !cell.cmm.link.wire.is_by_person() {
         return Err(SetupError::NeedsPlan { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() });
     }
@@ -465,7 +465,7 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     ];
     // Checked here, because the first measurement comes after the first grinding.
     if let Some((key, _)) = of_temperature.into_iter().find(|(_, is_there)| *is_there)
-        && !cell.cmm.link.wire.tells_temperature()
+        && !cell.cmm.link.wire.reports_temperature()
     {
         return Err(SetupError::NoTemperature { recipe: recipe.path().into(), cell: cell.path().into(), key });
     }
@@ -584,9 +584,9 @@ fn programs(
     // The wheel reaches its feed before it touches the part.
     let machine = Limits {
         travel_mm: limits.travel.map(|travel| [travel.least_mm, travel.most_mm]),
-        speed_mm_s: limits.largest_speed_mm_s,
-        acceleration_mm_s2: limits.largest_acceleration_mm_s2,
-        jerk_mm_s3: limits.largest_jerk_mm_s3,
+        speed_mm_s: limits.max_speed_mm_s,
+        acceleration_mm_s2: limits.max_acceleration_mm_s2,
+        jerk_mm_s3: limits.max_jerk_mm_s3,
     };
     let run_up_mm = 1.1 * machine.run_up_mm(grinding.feed_mm_min);
     let options = PathOptions {
@@ -602,7 +602,7 @@ fn programs(
         overrun_mm: grinding.overrun_mm,
         lead_mm: plain.lead_mm.max(run_up_mm - grinding.overrun_mm),
         safe_height_mm: grinding.safe_height_mm,
-        spiral_acceleration_mm_s2: limits.largest_acceleration_mm_s2,
+        spiral_acceleration_mm_s2: limits.max_acceleration_mm_s2,
         ..plain
     };
     Programs {
@@ -635,7 +635,7 @@ fn tilted(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions
             about,
             reversed: head.reversed,
             range_rad: head.range_deg.map(f64::to_radians),
-            rate_rad_s: head.largest_rate_deg_min.to_radians() / 60.0,
+            rate_rad_s: head.max_rate_deg_min.to_radians() / 60.0,
             step_rad,
             pivot_mm: head.pivot_mm.map(Vector::from),
         }
@@ -693,7 +693,7 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
     }
     CellPlan {
         begin_with: recipe.cycle.begin_with,
-        max_cycles: u32::from(recipe.cycle.most_cycles),
+        max_cycles: u32::from(recipe.cycle.max_cycles),
         tolerance: tolerance(recipe),
         stall_share: 0.02,
         stall_mm: recipe.cycle.stall_um.mm(),
@@ -701,14 +701,14 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
         on_divergence: recipe.cycle.on_divergence,
         on_refusal: Disposal::Stop,
         gates: Gates {
-            least_found: recipe.measure.minimum_coverage,
-            least_coverage: recipe.registration.least_coverage,
-            most_shift_mm: recipe.registration.largest_shift_mm,
-            most_turn_rad: recipe.registration.largest_turn_deg.to_radians(),
+            least_found: recipe.measure.min_coverage,
+            min_coverage: recipe.registration.min_coverage,
+            most_shift_mm: recipe.registration.max_shift_mm,
+            most_turn_rad: recipe.registration.max_turn_deg.to_radians(),
             most_radius_error_mm: recipe.measure.qualify.then_some(recipe.measure.radius_tolerance_um.mm()),
         },
         removal_budget_mm: recipe.compensation.removal_budget_um.mm(),
-        least_depth_mm: recipe.compensation.least_depth_um.mm(),
+        least_depth_mm: recipe.compensation.min_depth_um.mm(),
         clear_at_start: cell.simulated,
         deadlines,
     }
@@ -728,22 +728,22 @@ pub fn machines(
     [owner, epoch]: [u32; 2],
 ) -> Result<(AnyCmm, AnyGrinder), SetupError> {
     let failed = |source| SetupError::Machine { cell: cell.path().to_owned(), source };
-    let making = |link| Making {
+    let making = |link| DriverContext {
         part,
         cell_folder: cell.path().parent().unwrap_or(Path::new("")),
         run_folder: folder,
-        free_points: match &recipe.pattern {
+        min_free_points: match &recipe.pattern {
             Pattern::Free { least_points } => Some(usize::try_from(*least_points).unwrap_or(usize::MAX)),
             _ => None,
         },
-        least_found: least_found(recipe),
+        min_coverage: least_found(recipe),
         rehearsal: cell.rehearsal,
         volume_mm: volume_mm(cell),
         ..making(link, cell.simulated, [owner, epoch])
     };
-    let cmm = cell.cmm.link.wire.cmm(&making(&cell.cmm.link)).map_err(failed)?;
-    let beside = Making { beside: cmm.link(), ..making(&cell.grinder.link) };
-    let grinder = cell.grinder.link.wire.grinder(&beside).map_err(failed)?;
+    let cmm = cell.cmm.link.wire.create_cmm(&making(&cell.cmm.link)).map_err(failed)?;
+    let beside = DriverContext { shared_link: cmm.link(), ..making(&cell.grinder.link) };
+    let grinder = cell.grinder.link.wire.create_grinder(&beside).map_err(failed)?;
     Ok((cmm, grinder))
 }
 
@@ -751,24 +751,24 @@ pub fn machines(
 ///
 /// `simulated` states whether the cell's machines are simulated. A machine that reports the opposite is refused.
 pub fn modbus(link: &Link, simulated: bool, owner: u32, epoch: u32) -> Option<ModbusSettings> {
-    let (line, unit) = link.wire.line()?;
-    Some(ModbusSettings::of(line, unit, &making(link, simulated, [owner, epoch])))
+    let (line, unit) = link.wire.modbus_line()?;
+    Some(ModbusSettings::from_context(line, unit, &making(link, simulated, [owner, epoch])))
 }
 
 /// Checks that the resources of a machine exist, such as its exchange folders. Sends nothing to the machine.
 ///
 /// # Errors
 /// Those of [`machines`].
-pub fn is_there(cell: &CellConfig, device: Device) -> Result<(), MakingError> {
+pub fn is_there(cell: &CellConfig, device: Device) -> Result<(), DriverError> {
     let link = match device {
         Device::Cmm => &cell.cmm.link,
         Device::Grinder => &cell.grinder.link,
     };
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
-    let making = Making { cell_folder, volume_mm: volume_mm(cell), ..making(link, cell.simulated, [1, 1]) };
+    let making = DriverContext { cell_folder, volume_mm: volume_mm(cell), ..making(link, cell.simulated, [1, 1]) };
     match device {
-        Device::Cmm => link.wire.cmm(&making).map(drop),
-        Device::Grinder => link.wire.grinder(&making).map(drop),
+        Device::Cmm => link.wire.create_cmm(&making).map(drop),
+        Device::Grinder => link.wire.create_grinder(&making).map(drop),
     }
 }
 
@@ -776,20 +776,24 @@ pub fn is_there(cell: &CellConfig, device: Device) -> Result<(), MakingError> {
 ///
 /// # Errors
 /// Those of [`machines`].
-pub fn cmm(cell: &CellConfig) -> Result<AnyCmm, MakingError> {
+pub fn cmm(cell: &CellConfig) -> Result<AnyCmm, DriverError> {
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
     let link = &cell.cmm.link;
-    link.wire.cmm(&Making { cell_folder, volume_mm: volume_mm(cell), ..making(link, cell.simulated, [1, 1]) })
+    link.wire.create_cmm(&DriverContext {
+        cell_folder,
+        volume_mm: volume_mm(cell),
+        ..making(link, cell.simulated, [1, 1])
+    })
 }
 
 /// Builds the driver of the grinder without a part, for inspection only. Sends nothing to the machine.
 ///
 /// # Errors
 /// Those of [`machines`].
-pub fn grinder(cell: &CellConfig) -> Result<AnyGrinder, MakingError> {
+pub fn grinder(cell: &CellConfig) -> Result<AnyGrinder, DriverError> {
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
     let link = &cell.grinder.link;
-    link.wire.grinder(&Making { cell_folder, ..making(link, cell.simulated, [1, 1]) })
+    link.wire.create_grinder(&DriverContext { cell_folder, ..making(link, cell.simulated, [1, 1]) })
 }
 
 /// Returns the box of allowed positions of the probe's centre, as minimum and maximum in mm.
@@ -798,23 +802,23 @@ fn volume_mm(cell: &CellConfig) -> Option<[[f64; 3]; 2]> {
 }
 
 /// Returns the context for the driver of a machine, besides its wire, without a part.
-fn making(link: &Link, simulated: bool, [owner, epoch]: [u32; 2]) -> Making<'_> {
-    Making {
+fn making(link: &Link, simulated: bool, [owner, epoch]: [u32; 2]) -> DriverContext<'_> {
+    DriverContext {
         part: "",
         cell_folder: Path::new(""),
         run_folder: Path::new(""),
         simulated,
         owner,
         epoch,
-        free_points: None,
-        least_found: 0.0,
+        min_free_points: None,
+        min_coverage: 0.0,
         rehearsal: false,
         timing: &link.timing,
         registers: &link.registers,
         signals: &link.signals,
         expected_name: link.expected_name.as_deref(),
         volume_mm: None,
-        beside: None,
+        shared_link: None,
     }
 }
 

@@ -4,9 +4,9 @@ use crate::Vec3;
 
 /// Event of the machine.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Deed {
+pub enum MachineEvent {
     /// The machine began to move for this command. A touch continues from there along the normal, and returns.
-    Moves {
+    MotionStarted {
         /// Name of the command.
         command: String,
         /// Start position of the probe's centre, in the machine's frame.
@@ -15,7 +15,7 @@ pub enum Deed {
         to_mm: Vec3,
     },
     /// The motion has ended or was interrupted: the machine is at rest.
-    Stands {
+    MotionEnded {
         /// Position of the probe's centre.
         at_mm: Vec3,
     },
@@ -37,4 +37,4 @@ pub enum Deed {
 }
 
 /// Observer that receives each event when it happens.
-pub type Witness = Box<dyn FnMut(&Deed) + Send>;
+pub type Observer = Box<dyn FnMut(&MachineEvent) + Send>;

@@ -13,7 +13,7 @@ pub struct Tag {
 
 impl Tag {
     /// Tag of a message that no command requested.
-    pub const UNASKED: Self = Self { event: true, number: 0 };
+    pub const UNSOLICITED: Self = Self { event: true, number: 0 };
 
     /// Returns true if the tag is of a command that is carried out at once.
     pub fn is_event(self) -> bool {
@@ -29,7 +29,7 @@ impl fmt::Display for Tag {
 
 /// Error as it is sent.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Error {
+pub struct DmeError {
     /// Severity: 1 warns, 2 and 3 stop, 9 ends.
     pub severity: u8,
     /// Number of the error.
@@ -38,7 +38,7 @@ pub struct Error {
     pub cause: String,
 }
 
-impl Error {
+impl DmeError {
     /// Creates an error of the standard, with its severity.
     pub fn new(number: u16, cause: &str) -> Self {
         let severity = match number {
@@ -50,7 +50,7 @@ impl Error {
     }
 }
 
-impl fmt::Display for Error {
+impl fmt::Display for DmeError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let text = match self.number {
             1 => "Illegal tag",
@@ -109,7 +109,7 @@ impl Command {
     }
 }
 
-type Refused = (Option<Tag>, Error);
+type Refused = (Option<Tag>, DmeError);
 
 /// Parses a line without its line end.
 ///
@@ -118,15 +118,15 @@ type Refused = (Option<Tag>, Error);
 pub fn read(line: &str) -> Result<(Tag, Command), Refused> {
     let bytes = line.as_bytes();
     if let Some(bad) = bytes.iter().find(|b| !(32..127).contains(*b)) {
-        return Err((None, Error::new(7, &format!("byte {bad}"))));
+        return Err((None, DmeError::new(7, &format!("byte {bad}"))));
     }
-    let tag = tag(bytes).ok_or((None, Error::new(1, line)))?;
+    let tag = tag(bytes).ok_or((None, DmeError::new(1, line)))?;
     if bytes.get(5) != Some(&b' ') {
-        return Err((Some(tag), Error::new(2, line)));
+        return Err((Some(tag), DmeError::new(2, line)));
     }
-    let command = command(&line[6..]).map_err(|number| (Some(tag), Error::new(number, line)))?;
+    let command = command(&line[6..]).map_err(|number| (Some(tag), DmeError::new(number, line)))?;
     if command.name.ends_with('E') != tag.event {
-        return Err((Some(tag), Error::new(1, line)));
+        return Err((Some(tag), DmeError::new(1, line)));
     }
     Ok((tag, command))
 }

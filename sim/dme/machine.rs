@@ -3,10 +3,10 @@
 
 use std::collections::VecDeque;
 
-use super::deed::Deed;
-use super::line::{Argument, Command, Error};
+use super::deed::MachineEvent;
+use super::line::{Argument, Command, DmeError};
 use crate::Vec3;
-use crate::cmm::{Led, Touch};
+use crate::cmm::{TouchProbe, TouchResult};
 
 /// Options of the server and its machine.
 #[derive(Clone, Debug)]
@@ -20,7 +20,7 @@ pub struct Options {
     /// True if the machine is homed before the client connects.
     pub homed: bool,
     /// Maximum speeds of travel and of a touch, in mm/s.
-    pub fastest_mm_s: [f64; 2],
+    pub max_speeds_mm_s: [f64; 2],
 }
 
 impl Default for Options {
@@ -30,28 +30,28 @@ impl Default for Options {
             class: "CartCMM_Simulated".into(),
             version: "1.4".into(),
             homed: false,
-            fastest_mm_s: [1000.0, 50.0],
+            max_speeds_mm_s: [1000.0, 50.0],
         }
     }
 }
 
 /// Result of a command, and its duration.
 #[derive(Clone, Debug, Default)]
-pub struct Done {
+pub struct CommandResult {
     /// Duration in the machine's time, in s.
     pub seconds: f64,
     /// Lines of data, each as its fields.
     pub data: Vec<Vec<String>>,
     /// Warnings, which stop nothing.
-    pub warnings: Vec<Error>,
+    pub warnings: Vec<DmeError>,
     /// Lines that are sent while the machine moves.
     pub(super) scanned: VecDeque<super::scan::Scanned>,
     /// Touch that the command made.
-    pub(super) touched: Option<Deed>,
+    pub(super) touched: Option<MachineEvent>,
 }
 
-impl Done {
-    pub(super) fn told(fields: Vec<String>) -> Self {
+impl CommandResult {
+    pub(super) fn with_data(fields: Vec<String>) -> Self {
         Self { data: vec![fields], ..Self::default() }
     }
 }
@@ -102,7 +102,7 @@ impl Frame {
         std::array::from_fn(|k| (0..3).map(|i| self.rows[i][k] * v[i]).sum())
     }
 
-    pub(super) fn of_machine(&self, at: Vec3) -> Vec3 {
+    pub(super) fn machine_to_part(&self, at: Vec3) -> Vec3 {
         let turned = self.turned(at);
         std::array::from_fn(|k| turned[k] + self.origin[k])
     }
@@ -117,9 +117,9 @@ fn times(a: [Vec3; 3], b: [Vec3; 3]) -> [Vec3; 3] {
 }
 
 /// Simulated machine.
-pub struct Machine {
+pub struct DmeMachine {
     options: Options,
-    pub(super) probe: Led,
+    pub(super) probe: TouchProbe,
     homed: bool,
     tool: String,
     pub(super) parameters: [f64; 7],
@@ -128,8 +128,8 @@ pub struct Machine {
     report: Vec<String>,
     pub(super) scan_report: Vec<String>,
     pub(super) at_nominals: bool,
-    pub(super) scans: bool,
-    tells_radius: bool,
+    pub(super) can_scan: bool,
+    reports_radius: bool,
     pub(super) contacts: u32,
     pub(super) touched_mm: Option<f64>,
     /// Position of the probe's centre in the machine's frame, and the position to which it moves.
@@ -137,8 +137,8 @@ pub struct Machine {
     to_mm: Vec3,
     joystick: bool,
     /// Command that is being carried out, and the events that it has caused.
-    at: String,
-    pub(super) deeds: Vec<Deed>,
+    current_command: String,
+    pub(super) events: Vec<MachineEvent>,
 }
 
 /// Returns true if the command moves the machine.
@@ -146,9 +146,9 @@ pub(super) fn moves(command: &str) -> bool {
     matches!(command, "GoTo" | "PtMeas" | "ScanOnCurve" | "ChangeTool" | "Home")
 }
 
-impl Machine {
+impl DmeMachine {
     /// Creates a machine with its probe high over its table.
-    pub fn new(probe: Led, options: Options) -> Self {
+    pub fn new(probe: TouchProbe, options: Options) -> Self {
         let [least, most] = probe.volume_mm();
         let at_mm = [0.5 * (least[0] + most[0]), 0.5 * (least[1] + most[1]), most[2]];
         Self {
@@ -162,15 +162,15 @@ impl Machine {
             report: Vec::new(),
             scan_report: Vec::new(),
             at_nominals: false,
-            scans: true,
-            tells_radius: true,
+            can_scan: true,
+            reports_radius: true,
             contacts: 0,
             touched_mm: None,
             at_mm,
             to_mm: at_mm,
             joystick: true,
-            at: String::new(),
-            deeds: Vec::new(),
+            current_command: String::new(),
+            events: Vec::new(),
         }
     }
 
@@ -180,13 +180,13 @@ impl Machine {
     }
 
     /// Makes the probe a touch-trigger probe, which cannot scan.
-    pub fn touches_only(&mut self) {
-        self.scans = false;
+    pub fn disable_scanning(&mut self) {
+        self.can_scan = false;
     }
 
     /// Makes the server hide the radius of its tool.
-    pub fn tells_no_radius(&mut self) {
-        self.tells_radius = false;
+    pub fn hide_radius(&mut self) {
+        self.reports_radius = false;
     }
 
     /// Returns how often the probe came to the part: touches and scans.
@@ -224,7 +224,7 @@ impl Machine {
     }
 
     /// Moves the probe to a place while it is in contact.
-    pub(super) fn is_at(&mut self, at_mm: Vec3) {
+    pub(super) fn set_position(&mut self, at_mm: Vec3) {
         self.at_mm = at_mm;
     }
 
@@ -235,17 +235,17 @@ impl Machine {
         // High enough above the contact, the probe releases the part.
         if self.touched_mm.is_none_or(|height| self.at_mm[2] > height + 2.0 * self.parameters[2]) {
             self.touched_mm = None;
-            self.probe.let_go();
+            self.probe.release_part();
         }
     }
 
     /// Begins a command, and returns the result that it has when its time is over.
-    pub(super) fn carry_out(&mut self, command: &Command) -> Result<Done, Error> {
-        let no = |number| Error::new(number, &command.name);
+    pub(super) fn carry_out(&mut self, command: &Command) -> Result<CommandResult, DmeError> {
+        let no = |number| DmeError::new(number, &command.name);
         let arguments = &command.arguments[..];
-        let text = |text: String| Ok(Done::told(vec![text]));
+        let text = |text: String| Ok(CommandResult::with_data(vec![text]));
         self.joystick &= !moves(&command.name);
-        self.at.clone_from(&command.name);
+        self.current_command.clone_from(&command.name);
         match (command.name.as_str(), arguments) {
             ("GetDMEVersion", []) => text(format!("DMEVersion(\"{}\")", self.options.version)),
             ("GetMachineClass", []) => text(format!("GetMachineClass(\"{}\")", self.options.class)),
@@ -253,18 +253,18 @@ impl Machine {
             ("IsUserEnabled", []) => text(format!("IsUserEnabled({})", u8::from(self.joystick))),
             ("EnableUser" | "DisableUser", []) => {
                 self.joystick = command.name == "EnableUser";
-                Ok(Done::default())
+                Ok(CommandResult::default())
             }
             ("GetXtdErrStatus", []) => text(format!("IsHomed({})", u8::from(self.homed))),
             ("EnumTools", []) => {
                 let data = self.options.tools.iter().map(|(name, _)| vec![format!("\"{name}\"")]).collect();
-                Ok(Done { data, ..Done::default() })
+                Ok(CommandResult { data, ..CommandResult::default() })
             }
             ("Home", []) => {
                 let [least, most] = self.probe.volume_mm();
                 let corner = [least[0], most[1], most[2]];
                 self.homed = true;
-                Ok(self.moves_to(corner))
+                Ok(self.start_motion(corner))
             }
             ("GoTo" | "PtMeas" | "ScanOnCurve" | "ChangeTool", _) if !self.homed => Err(no(508)),
             ("ChangeTool", [Argument::Text(name)]) => {
@@ -273,8 +273,8 @@ impl Machine {
                     return Err(no(1502));
                 }
                 self.tool.clone_from(name);
-                self.moves_to(self.at_mm);
-                Ok(Done { seconds: 10.0, ..Done::default() })
+                self.start_motion(self.at_mm);
+                Ok(CommandResult { seconds: 10.0, ..CommandResult::default() })
             }
             ("SetCoordSystem", [Argument::Name(name, None)]) => {
                 self.in_part_frame = match name.as_str() {
@@ -282,7 +282,7 @@ impl Machine {
                     "MachineCsy" => false,
                     _ => return Err(no(509)),
                 };
-                Ok(Done::default())
+                Ok(CommandResult::default())
             }
             ("GetCoordSystem", []) => {
                 text(format!("CoordSystem({})", if self.in_part_frame { "PartCsy" } else { "MachineCsy" }))
@@ -295,7 +295,7 @@ impl Machine {
                     return Err(no(1007));
                 }
                 self.part_frame = Frame::new(written);
-                Ok(Done::default())
+                Ok(CommandResult::default())
             }
             ("GetCsyTransformation", [Argument::Name(name, None)]) if name == "PartCsy" => {
                 let numbers = self.part_frame.written.map(|n| n.to_string()).join(", ");
@@ -304,39 +304,39 @@ impl Machine {
             ("GetProp", properties) => self.get(properties).map_err(no),
             ("SetProp", properties) => self.set(properties, &command.name).map_err(no),
             ("OnPtMeasReport", fields) => {
-                let names: Option<Vec<String>> = fields.iter().map(asked).collect();
+                let names: Option<Vec<String>> = fields.iter().map(query_name).collect();
                 let known = ["X", "Y", "Z", "IJK", "ER", "Q"];
                 let names = names.filter(|names| names.iter().all(|name| known.contains(&name.as_str())));
                 self.report = names.ok_or_else(|| no(502))?;
-                Ok(Done::default())
+                Ok(CommandResult::default())
             }
             ("OnScanReport", fields) => {
-                let names: Option<Vec<String>> = fields.iter().map(asked).collect();
+                let names: Option<Vec<String>> = fields.iter().map(query_name).collect();
                 let known = ["X", "Y", "Z", "Q"];
                 let names = names.filter(|names| names.iter().all(|name| known.contains(&name.as_str())));
                 self.scan_report = names.ok_or_else(|| no(502))?;
-                Ok(Done::default())
+                Ok(CommandResult::default())
             }
-            ("ScanOnCurveHint", [Argument::Number(_), Argument::Number(_)]) => Ok(Done::default()),
+            ("ScanOnCurveHint", [Argument::Number(_), Argument::Number(_)]) => Ok(CommandResult::default()),
             ("ScanOnCurveDensity", fields) => {
                 let nominals = Argument::Name("AtNominals".into(), Some(vec![1.0]));
                 self.at_nominals = fields.contains(&nominals);
-                Ok(Done::default())
+                Ok(CommandResult::default())
             }
             ("ScanOnCurve", [closed, format, data]) => self.scan(closed, format, data).map_err(no),
             ("Get", fields) => {
-                let at = self.frame().of_machine(self.at_mm);
+                let at = self.frame().machine_to_part(self.at_mm);
                 let told = fields.iter().map(|field| {
-                    let name = asked(field)?;
+                    let name = query_name(field)?;
                     let k = ["X", "Y", "Z"].iter().position(|axis| *axis == name)?;
                     Some(format!("{name}({})", at[k]))
                 });
-                told.collect::<Option<_>>().map(Done::told).ok_or_else(|| no(502))
+                told.collect::<Option<_>>().map(CommandResult::with_data).ok_or_else(|| no(502))
             }
             ("GoTo", axes) => {
                 let to = self.place(axes).ok_or_else(|| no(502))?;
-                self.is_within(to).map_err(no)?;
-                Ok(self.moves_to(to))
+                self.check_volume(to).map_err(no)?;
+                Ok(self.start_motion(to))
             }
             ("PtMeas", axes) => self.touch(axes).map_err(no),
             _ => Err(no(501)),
@@ -349,7 +349,7 @@ impl Machine {
 
     /// Returns a place in the machine's frame; axes that are not named keep their value.
     fn place(&self, axes: &[Argument]) -> Option<Vec3> {
-        let mut at = self.frame().of_machine(self.at_mm);
+        let mut at = self.frame().machine_to_part(self.at_mm);
         for axis in axes {
             let Argument::Name(name, Some(numbers)) = axis else { return None };
             match (name.as_str(), &numbers[..]) {
@@ -363,22 +363,26 @@ impl Machine {
         Some(self.frame().to_machine(at))
     }
 
-    pub(super) fn is_within(&self, at: Vec3) -> Result<(), u16> {
+    pub(super) fn check_volume(&self, at: Vec3) -> Result<(), u16> {
         let [least, most] = self.probe.volume_mm();
         let within = (0..3).all(|k| (least[k] - 1e-9..=most[k] + 1e-9).contains(&at[k]));
         if within { Ok(()) } else { Err(1008) }
     }
 
-    pub(super) fn moves_to(&mut self, to_mm: Vec3) -> Done {
+    pub(super) fn start_motion(&mut self, to_mm: Vec3) -> CommandResult {
         let way_mm = (0..3).map(|k| (to_mm[k] - self.at_mm[k]).powi(2)).sum::<f64>().sqrt();
         self.to_mm = to_mm;
-        self.deeds.push(Deed::Moves { command: self.at.clone(), from_mm: self.at_mm, to_mm });
+        self.events.push(MachineEvent::MotionStarted {
+            command: self.current_command.clone(),
+            from_mm: self.at_mm,
+            to_mm,
+        });
         let speed = self.parameters[0].min(self.probe.travel_mm_s());
-        Done { seconds: way_mm / speed, ..Done::default() }
+        CommandResult { seconds: way_mm / speed, ..CommandResult::default() }
     }
 
     /// Touches the real part.
-    fn touch(&mut self, axes: &[Argument]) -> Result<Done, u16> {
+    fn touch(&mut self, axes: &[Argument]) -> Result<CommandResult, u16> {
         let point_mm = self.place(axes).ok_or(502u16)?;
         let direction = axes.iter().find_map(|axis| match axis {
             Argument::Name(name, Some(numbers)) if name == "IJK" => <Vec3>::try_from(numbers.clone()).ok(),
@@ -393,14 +397,14 @@ impl Machine {
         let radius_mm = self.radius().ok_or(508u16)?;
         let [_, _, approach_mm, search_mm, retract_mm, ..] = self.parameters;
         let on_way = |mm: f64| -> Vec3 { std::array::from_fn(|k| point_mm[k] + mm * normal[k]) };
-        self.is_within(on_way(approach_mm + radius_mm))?;
-        self.is_within(on_way(radius_mm - search_mm))?;
-        let moved = self.moves_to(on_way(approach_mm + radius_mm)).seconds;
+        self.check_volume(on_way(approach_mm + radius_mm))?;
+        self.check_volume(on_way(radius_mm - search_mm))?;
+        let moved = self.start_motion(on_way(approach_mm + radius_mm)).seconds;
         self.contacts += 1;
         self.touched_mm = Some(point_mm[2]);
         let seconds = moved + self.probe.seconds_per_point();
         match self.probe.touch(point_mm, normal, [radius_mm, approach_mm, search_mm]) {
-            Touch::Centre(centre) => {
+            TouchResult::Centre(centre) => {
                 let back = if retract_mm < 0.0 {
                     on_way(approach_mm + radius_mm)
                 } else {
@@ -408,14 +412,14 @@ impl Machine {
                 };
                 self.to_mm = back;
                 let fields = self.reported(centre, normal, radius_mm);
-                let touched = Some(Deed::Touched { point_mm, normal, centre_mm: centre });
-                Ok(Done { seconds, touched, ..Done::told(fields) })
+                let touched = Some(MachineEvent::Touched { point_mm, normal, centre_mm: centre });
+                Ok(CommandResult { seconds, touched, ..CommandResult::with_data(fields) })
             }
-            Touch::Missed => {
+            TouchResult::Missed => {
                 self.arrive();
                 Err(1006)
             }
-            Touch::Unexpected => {
+            TouchResult::Unexpected => {
                 self.arrive();
                 Err(1001)
             }
@@ -424,7 +428,7 @@ impl Machine {
 
     fn reported(&self, centre: Vec3, normal: Vec3, radius_mm: f64) -> Vec<String> {
         let frame = self.frame();
-        let (at, inward) = (frame.of_machine(centre), frame.turned(normal));
+        let (at, inward) = (frame.machine_to_part(centre), frame.turned(normal));
         let field = |name: &String| match name.as_str() {
             "X" => format!("X({})", at[0]),
             "Y" => format!("Y({})", at[1]),
@@ -441,12 +445,12 @@ impl Machine {
         tool.map(|(_, radius)| *radius).filter(|radius| *radius > 0.0)
     }
 
-    fn get(&self, properties: &[Argument]) -> Result<Done, u16> {
+    fn get(&self, properties: &[Argument]) -> Result<CommandResult, u16> {
         let told = properties.iter().map(|property| {
-            let name = asked(property).ok_or(502u16)?;
+            let name = query_name(property).ok_or(502u16)?;
             match name.as_str() {
                 "Tool.Name" => Ok(format!("Tool.Name(\"{}\")", self.tool)),
-                "Tool.AvrRadius" if !self.tells_radius => Err(510),
+                "Tool.AvrRadius" if !self.reports_radius => Err(510),
                 "Tool.AvrRadius" => self.radius().map(|radius| format!("Tool.AvrRadius({radius})")).ok_or(510),
                 other => {
                     let k = PARAMETERS.iter().position(|known| other.strip_prefix("Tool.") == Some(*known));
@@ -454,30 +458,30 @@ impl Machine {
                 }
             }
         });
-        told.collect::<Result<_, _>>().map(Done::told)
+        told.collect::<Result<_, _>>().map(CommandResult::with_data)
     }
 
     /// Sets parameters. A value beyond the machine's limits is limited, with a warning.
-    fn set(&mut self, properties: &[Argument], cause: &str) -> Result<Done, u16> {
+    fn set(&mut self, properties: &[Argument], cause: &str) -> Result<CommandResult, u16> {
         let mut warnings = Vec::new();
         for property in properties {
             let Argument::Name(name, Some(numbers)) = property else { return Err(502) };
             let k = PARAMETERS.iter().position(|known| name.strip_prefix("Tool.") == Some(*known)).ok_or(510u16)?;
             let [value] = numbers[..] else { return Err(502) };
-            let most = self.options.fastest_mm_s.get(k).copied().unwrap_or(100.0);
+            let most = self.options.max_speeds_mm_s.get(k).copied().unwrap_or(100.0);
             let least = if k == 4 || k == 6 { -1.0 } else { 1e-3 };
             let kept = value.clamp(least, most);
             if kept != value {
-                warnings.push(Error::new(504, cause));
+                warnings.push(DmeError::new(504, cause));
             }
             self.parameters[k] = kept;
         }
-        Ok(Done { warnings, ..Done::default() })
+        Ok(CommandResult { warnings, ..CommandResult::default() })
     }
 }
 
 /// Returns the name of a requested property.
-fn asked(argument: &Argument) -> Option<String> {
+fn query_name(argument: &Argument) -> Option<String> {
     match argument {
         Argument::Name(name, Some(numbers)) if numbers.is_empty() => Some(name.clone()),
         _ => None,

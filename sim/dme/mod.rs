@@ -22,10 +22,10 @@ mod scan;
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use deed::{Deed, Witness};
-use faults::{Fault, Faults};
-use line::{Command, Error, Tag};
-use machine::{Done, Machine};
+use deed::{MachineEvent, Observer};
+use faults::{CommandFaults, Fault};
+use line::{Command, DmeError, Tag};
+use machine::{CommandResult, DmeMachine};
 
 /// Line to send, or the end of the connection.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -46,9 +46,9 @@ struct Running {
     command: Command,
     began: Duration,
     ends: Duration,
-    done: Result<Done, Error>,
+    done: Result<CommandResult, DmeError>,
     /// True if its client is gone: nobody gets its result.
-    unheard: bool,
+    client_gone: bool,
 }
 
 impl Running {
@@ -63,8 +63,8 @@ impl Running {
 
 /// Server with its client and its machine.
 pub struct Server {
-    machine: Machine,
-    faults: Faults,
+    machine: DmeMachine,
+    faults: CommandFaults,
     /// Seconds of the machine's time in a real second.
     speed: f64,
     waiting: VecDeque<(Tag, Command)>,
@@ -72,12 +72,12 @@ pub struct Server {
     latched: bool,
     in_session: bool,
     out: VecDeque<Outgoing>,
-    witness: Option<Witness>,
+    observer: Option<Observer>,
 }
 
 impl Server {
     /// Creates a server for a machine.
-    pub fn new(machine: Machine, speed: f64, faults: Faults) -> Self {
+    pub fn new(machine: DmeMachine, speed: f64, faults: CommandFaults) -> Self {
         Self {
             machine,
             faults,
@@ -87,51 +87,51 @@ impl Server {
             latched: false,
             in_session: false,
             out: VecDeque::new(),
-            witness: None,
+            observer: None,
         }
     }
 
     /// Returns the machine, to read or change it.
-    pub fn machine(&mut self) -> &mut Machine {
+    pub fn machine(&mut self) -> &mut DmeMachine {
         &mut self.machine
     }
 
     /// Handles the loss of the client: the running command continues to its end, and no other command begins.
-    pub fn hung_up(&mut self, now: Duration) {
+    pub fn client_lost(&mut self, now: Duration) {
         self.waiting.clear();
         self.out.clear();
         // A command whose acknowledgement was delayed has not begun yet, so it is dropped.
         if self.running.as_ref().is_some_and(|running| running.began > now) {
-            self.abandon(now, &Error::new(6, ""));
+            self.abandon(now, &DmeError::new(6, ""));
             self.out.clear();
         }
-        self.running.iter_mut().for_each(|running| running.unheard = true);
+        self.running.iter_mut().for_each(|running| running.client_gone = true);
         (self.in_session, self.latched) = (false, false);
     }
 
     /// Restarts the server: the running command is interrupted where it is, and the machine must be homed.
     pub fn restart(&mut self, now: Duration) {
-        self.hung_up(now);
-        self.abandon(now, &Error::new(500, "restart"));
+        self.client_lost(now);
+        self.abandon(now, &DmeError::new(500, "restart"));
         self.out.clear();
         self.latched = false;
         self.machine.restart();
-        self.tell(&[Deed::Restarted]);
+        self.notify(&[MachineEvent::Restarted]);
     }
 
     /// Sets an observer of all events of the machine from now on.
-    pub fn witness(&mut self, witness: Witness) {
-        self.witness = Some(witness);
+    pub fn set_observer(&mut self, witness: Observer) {
+        self.observer = Some(witness);
     }
 
-    fn tell(&mut self, deeds: &[Deed]) {
-        if let Some(witness) = &mut self.witness {
+    fn notify(&mut self, deeds: &[MachineEvent]) {
+        if let Some(witness) = &mut self.observer {
             deeds.iter().for_each(witness);
         }
     }
 
     /// Returns true if the machine moves.
-    pub fn moves(&self) -> bool {
+    pub fn is_moving(&self) -> bool {
         self.running.as_ref().is_some_and(|running| machine::moves(&running.command.name))
     }
 
@@ -143,15 +143,15 @@ impl Server {
 
     /// Opens the stop circuit.
     pub fn emergency_stop(&mut self, now: Duration) {
-        self.abandon(now, &Error::new(500, "emergency"));
-        self.tell(&[Deed::Stopped]);
+        self.abandon(now, &DmeError::new(500, "emergency"));
+        self.notify(&[MachineEvent::Stopped]);
         self.latched = true;
-        self.say(now, format!("E0000 ! {}", Error::new(500, "emergency")));
+        self.say(now, format!("E0000 ! {}", DmeError::new(500, "emergency")));
     }
 
     /// Lets time pass, and returns the lines to send now.
     pub fn tick(&mut self, now: Duration) -> Vec<Outgoing> {
-        self.pass(now);
+        self.advance_time(now);
         let mut due = Vec::new();
         while self.out.front().is_some_and(|out| out.at <= now) {
             due.extend(self.out.pop_front());
@@ -160,7 +160,7 @@ impl Server {
     }
 
     /// Lets time pass without sending anything.
-    pub fn pass(&mut self, now: Duration) {
+    pub fn advance_time(&mut self, now: Duration) {
         while self.running.as_ref().is_some_and(|running| running.next(self.speed) <= now) {
             if self.say_scanned() {
                 continue;
@@ -174,14 +174,14 @@ impl Server {
     pub fn receive(&mut self, text: &str, now: Duration) {
         match line::read(text) {
             Err((tag, error)) => {
-                let tag = tag.unwrap_or(Tag::UNASKED);
+                let tag = tag.unwrap_or(Tag::UNSOLICITED);
                 self.say(now, format!("{tag} &"));
                 self.fail(tag, &error, now);
                 self.say(now, format!("{tag} %"));
             }
-            Ok((tag, command)) if tag.is_event() => self.at_once(tag, &command, now),
+            Ok((tag, command)) if tag.is_event() => self.run_event_command(tag, &command, now),
             Ok((tag, command)) => {
-                let fault = self.faults.at(|name| *name == command.name);
+                let fault = self.faults.next_at(|name| *name == command.name);
                 if fault == Some(Fault::EmergencyStop) {
                     return self.emergency_stop(now);
                 }
@@ -196,36 +196,36 @@ impl Server {
         }
     }
 
-    fn at_once(&mut self, tag: Tag, command: &Command, now: Duration) {
-        let fault = self.faults.at(|name| *name == command.name);
+    fn run_event_command(&mut self, tag: Tag, command: &Command, now: Duration) {
+        let fault = self.faults.next_at(|name| *name == command.name);
         self.say(now, format!("{tag} &"));
         match command.name.as_str() {
             "AbortE" if fault == Some(Fault::AbortIgnored) => return,
             "AbortE" => {
-                self.tell(&[Deed::Aborted]);
-                if self.abandon(now, &Error::new(6, "")) {
+                self.notify(&[MachineEvent::Aborted]);
+                if self.abandon(now, &DmeError::new(6, "")) {
                     self.latched = true;
                 }
             }
             "GetErrStatusE" => self.say(now, format!("{tag} # ErrStatus({})", u8::from(self.latched))),
-            _ => self.fail(tag, &Error::new(501, &command.name), now),
+            _ => self.fail(tag, &DmeError::new(501, &command.name), now),
         }
         self.say(now, format!("{tag} %"));
     }
 
     /// Aborts the running and the waiting commands; returns true if there were any.
-    fn abandon(&mut self, now: Duration, error: &Error) -> bool {
+    fn abandon(&mut self, now: Duration, error: &DmeError) -> bool {
         let running = self.running.take();
         if let Some(running) = running.as_ref().filter(|running| machine::moves(&running.command.name)) {
             let whole = running.ends.saturating_sub(running.began).as_secs_f64();
             let so_far = now.saturating_sub(running.began).as_secs_f64();
             self.machine.stop_short(if whole > 0.0 { (so_far / whole).min(1.0) } else { 1.0 });
-            self.tell(&[Deed::Stands { at_mm: self.machine.at_mm() }]);
+            self.notify(&[MachineEvent::MotionEnded { at_mm: self.machine.at_mm() }]);
         }
-        let running = running.filter(|running| !running.unheard).map(|running| (running.tag, running.command));
+        let running = running.filter(|running| !running.client_gone).map(|running| (running.tag, running.command));
         let victims: Vec<(Tag, Command)> = running.into_iter().chain(self.waiting.drain(..)).collect();
         for (tag, command) in &victims {
-            self.fail(*tag, &Error { cause: command.name.clone(), ..error.clone() }, now);
+            self.fail(*tag, &DmeError { cause: command.name.clone(), ..error.clone() }, now);
             self.say(now, format!("{tag} %"));
         }
         !victims.is_empty()
@@ -239,14 +239,14 @@ impl Server {
         let done = self.carry_out(&command);
         let lasts = done.as_ref().map_or(0.0, |done| done.seconds) / self.speed;
         let ends = now + Duration::try_from_secs_f64(lasts).unwrap_or_default();
-        self.tell_of_machine();
-        self.running = Some(Running { tag, command, began: now, ends, done, unheard: false });
+        self.notify_machine_events();
+        self.running = Some(Running { tag, command, began: now, ends, done, client_gone: false });
     }
 
     /// Carries out a command, after the checks that precede it.
-    fn carry_out(&mut self, command: &Command) -> Result<Done, Error> {
+    fn carry_out(&mut self, command: &Command) -> Result<CommandResult, DmeError> {
         let name = command.name.as_str();
-        let no = |number| Err(Error::new(number, name));
+        let no = |number| Err(DmeError::new(number, name));
         if self.latched && !matches!(name, "ClearAllErrors" | "GetXtdErrStatus") {
             return no(514);
         }
@@ -264,7 +264,7 @@ impl Server {
             _ if !self.in_session => return no(508),
             _ => return self.machine.carry_out(command),
         }
-        Ok(Done::default())
+        Ok(CommandResult::default())
     }
 
     /// Sends the next line of a scan; returns false if there is none.
@@ -272,13 +272,13 @@ impl Server {
         let Some(running) = &mut self.running else { return false };
         let at = running.next(self.speed);
         let Some(line) = running.done.as_mut().ok().and_then(|done| done.scanned.pop_front()) else { return false };
-        let (tag, fault, unheard) = (running.tag, running.command.fault.clone(), running.unheard);
+        let (tag, fault, client_gone) = (running.tag, running.command.fault.clone(), running.client_gone);
         let cut = fault == Some(Fault::CutInScan);
         if cut {
             running.command.fault = None;
         }
-        self.machine.is_at(line.at_mm);
-        if unheard {
+        self.machine.set_position(line.at_mm);
+        if client_gone {
             return true;
         }
         self.say_data(tag, &scan::spoilt(line, fault.as_ref()), fault.as_ref(), at);
@@ -286,22 +286,22 @@ impl Server {
         true
     }
 
-    fn tell_of_machine(&mut self) {
-        let deeds = std::mem::take(&mut self.machine.deeds);
-        self.tell(&deeds);
+    fn notify_machine_events(&mut self) {
+        let deeds = std::mem::take(&mut self.machine.events);
+        self.notify(&deeds);
     }
 
     fn finish(&mut self) {
-        let Some(Running { tag, command, ends, done, unheard, .. }) = self.running.take() else { return };
+        let Some(Running { tag, command, ends, done, client_gone, .. }) = self.running.take() else { return };
         if done.is_ok() {
             self.machine.arrive();
             let touched = done.as_ref().ok().and_then(|done| done.touched.clone());
-            self.tell(touched.as_slice());
+            self.notify(touched.as_slice());
         }
         if machine::moves(&command.name) {
-            self.tell(&[Deed::Stands { at_mm: self.machine.at_mm() }]);
+            self.notify(&[MachineEvent::MotionEnded { at_mm: self.machine.at_mm() }]);
         }
-        if unheard {
+        if client_gone {
             return;
         }
         let fault = command.fault.clone();
@@ -353,7 +353,7 @@ impl Server {
         }
     }
 
-    fn fail(&mut self, tag: Tag, error: &Error, at: Duration) {
+    fn fail(&mut self, tag: Tag, error: &DmeError, at: Duration) {
         self.latched |= error.severity >= 2;
         self.say(at, format!("{tag} ! {error}"));
     }

@@ -2,9 +2,9 @@
 
 use super::faults::Fault;
 use super::line::Argument;
-use super::machine::{Done, Machine};
+use super::machine::{CommandResult, DmeMachine};
 use crate::Vec3;
-use crate::cmm::Touch;
+use crate::cmm::TouchResult;
 
 /// Number of points in a line.
 const IN_A_LINE: usize = 7;
@@ -20,15 +20,15 @@ pub(super) struct Scanned {
     pub(super) points: Vec<Vec<String>>,
 }
 
-impl Machine {
+impl DmeMachine {
     /// Scans a curve as programmed; the scan ends where the probe loses the surface.
-    pub(super) fn scan(&mut self, closed: &Argument, format: &Argument, data: &Argument) -> Result<Done, u16> {
+    pub(super) fn scan(&mut self, closed: &Argument, format: &Argument, data: &Argument) -> Result<CommandResult, u16> {
         let open = Argument::Name("Closed".into(), Some(vec![0.0]));
         let written =
             Argument::Names("Format".into(), ["X()", "Y()", "Z()", "IJK()", "tag"].map(str::to_owned).to_vec());
         let Argument::Name(name, Some(numbers)) = data else { return Err(502) };
         let whole = name == "Data" && numbers.len() >= 14 && numbers.len().is_multiple_of(7);
-        if !self.scans {
+        if !self.can_scan {
             return Err(2002);
         }
         // Closed curves, curves that leave the surface, and other formats are refused: no client of this machine
@@ -38,7 +38,7 @@ impl Machine {
         }
         let [_, _, approach_mm, search_mm, _, speed_mm_s, retract_mm] = self.parameters;
         let (radius_mm, frame) = (self.radius().ok_or(508u16)?, self.frame());
-        let mut done = Done::default();
+        let mut done = CommandResult::default();
         self.contacts += 1;
         let mut last: Option<Vec3> = None;
         let mut normal = [0.0, 0.0, 1.0];
@@ -51,23 +51,23 @@ impl Machine {
             }
             normal = direction.map(|c| c / length);
             let over: Vec3 = std::array::from_fn(|k| point[k] + (approach_mm + radius_mm) * normal[k]);
-            self.is_within(over)?;
+            self.check_volume(over)?;
             let centre = match self.probe.touch(point, normal, [radius_mm, approach_mm, search_mm]) {
-                Touch::Centre(centre) => centre,
+                TouchResult::Centre(centre) => centre,
                 lost => {
-                    self.moves_to(over);
+                    self.start_motion(over);
                     self.arrive();
-                    return Err(if matches!(lost, Touch::Missed) { 1006 } else { 1001 });
+                    return Err(if matches!(lost, TouchResult::Missed) { 1006 } else { 1001 });
                 }
             };
             done.seconds += match last {
                 Some(last) => distance(last, centre) / speed_mm_s,
-                None => self.moves_to(over).seconds + self.probe.seconds_per_point(),
+                None => self.start_motion(over).seconds + self.probe.seconds_per_point(),
             };
             if k.is_multiple_of(IN_A_LINE) {
                 done.scanned.push_back(Scanned { seconds: 0.0, at_mm: centre, points: Vec::new() });
             }
-            let told = frame.of_machine(centre);
+            let told = frame.machine_to_part(centre);
             let fields = self.scan_report.iter().map(|name| match name.as_str() {
                 "X" => told[0].to_string(),
                 "Y" => told[1].to_string(),
@@ -81,7 +81,7 @@ impl Machine {
             self.touched_mm = Some(centre[2]);
         }
         let end = last.ok_or(502u16)?;
-        self.moves_to(std::array::from_fn(|k| end[k] + retract_mm.max(0.0) * normal[k]));
+        self.start_motion(std::array::from_fn(|k| end[k] + retract_mm.max(0.0) * normal[k]));
         Ok(done)
     }
 }

@@ -15,9 +15,9 @@ pub mod print;
 
 use std::time::Duration;
 
-use crate::cmm::{Led, Touch};
+use crate::cmm::{TouchProbe, TouchResult};
 use crate::payload::Feature;
-use faults::{Fault, Faults};
+use faults::{Fault, PrintFaults};
 use list::List;
 use print::Style;
 
@@ -44,18 +44,18 @@ pub struct Outgoing {
 }
 
 /// Part program with its probe, list and printer.
-pub struct Program {
-    probe: Led,
+pub struct PartProgram {
+    probe: TouchProbe,
     options: Options,
-    faults: Faults,
+    faults: PrintFaults,
     list: Option<List>,
     next: usize,
     printed: u64,
 }
 
-impl Program {
+impl PartProgram {
     /// Creates a program for a machine; it has no list yet.
-    pub fn new(probe: Led, options: Options, faults: Faults) -> Self {
+    pub fn new(probe: TouchProbe, options: Options, faults: PrintFaults) -> Self {
         Self { probe, options, faults, list: None, next: 0, printed: 0 }
     }
 
@@ -78,7 +78,7 @@ impl Program {
         self.next += 1;
         let out = self.touch(&target);
         if self.next == self.list.as_ref().map_or(0, |list| list.targets.len()) {
-            self.probe.let_go();
+            self.probe.release_part();
         }
         Some(out)
     }
@@ -86,13 +86,13 @@ impl Program {
     fn touch(&mut self, target: &list::Target) -> Outgoing {
         let Options { radius_mm, search_mm: [before, beyond], .. } = self.options;
         let touched = self.probe.touch(target.point_mm, target.normal, [radius_mm, before, beyond]);
-        let Touch::Centre(centre_mm) = touched else { return Outgoing { bytes: Vec::new(), hangs_up: false } };
+        let TouchResult::Centre(centre_mm) = touched else { return Outgoing { bytes: Vec::new(), hangs_up: false } };
         let is_part = target.feature == Feature::Part;
         let back_mm = if self.options.contacts && is_part { radius_mm } else { 0.0 };
         let at_mm = std::array::from_fn(|k| centre_mm[k] - back_mm * target.normal[k]);
         self.printed += 1;
         let line = self.options.style.line(at_mm);
-        match self.faults.at(|number| *number == self.printed) {
+        match self.faults.next_at(|number| *number == self.printed) {
             Some(Fault::HangUp) => Outgoing { bytes: line, hangs_up: true },
             Some(fault) => Outgoing { bytes: fault.spoil(line), hangs_up: false },
             None => Outgoing { bytes: line, hangs_up: false },

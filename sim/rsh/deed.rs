@@ -2,7 +2,7 @@
 
 /// Event of a controller.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Deed {
+pub enum ControllerEvent {
     /// The controller has opened a program.
     Opened {
         /// Path of the program.
@@ -16,9 +16,9 @@ pub enum Deed {
         text: String,
     },
     /// The machine moves.
-    Moves,
+    MotionStarted,
     /// The machine is at rest.
-    Stands,
+    MotionEnded,
     /// The program has ended.
     Ended {
         /// Path of the program.
@@ -33,4 +33,4 @@ pub enum Deed {
 }
 
 /// Observer that receives each event when it happens.
-pub type Witness = Box<dyn FnMut(&Deed) + Send>;
+pub type Observer = Box<dyn FnMut(&ControllerEvent) + Send>;

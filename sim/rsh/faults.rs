@@ -22,12 +22,12 @@ pub enum Fault {
     /// The connection ends, and the line is not carried out.
     CutBefore,
     /// The line is carried out, and the connection ends.
-    CutBehind,
+    CutAfter,
     /// Lines that answer nothing come before the answer.
-    Aside,
+    UnmatchedLines,
     /// The program reaches a travel limit at this share of its lines, in thousandths.
     Limit(u32),
 }
 
 /// Faults by the beginning of the line.
-pub type Faults = crate::faults::Faults<String, Fault>;
+pub type LineFaults = crate::faults::PendingFaults<String, Fault>;

@@ -22,12 +22,12 @@ use std::time::Duration;
 
 use crate::Vec3;
 use crate::wheel::PlainWheel;
-use deed::{Deed, Witness};
-use faults::{Fault, Faults};
-use program::{Program, Said, Step, says};
+use deed::{ControllerEvent, Observer};
+use faults::{Fault, LineFaults};
+use program::{LogAction, Program, Step, says};
 
 /// Duration of a set, whatever it does.
-const SET_TAKES: Duration = Duration::from_millis(100);
+const SET_DURATION: Duration = Duration::from_millis(100);
 /// Maximum distance between two samples of the wheel along its way, in mm.
 const STEP_MM: f64 = 0.5;
 /// Position of the wheel's centre when it is away from everything.
@@ -65,7 +65,7 @@ enum Interpreter {
 /// Controller, and the machine that it moves.
 pub struct Controller {
     wheel: PlainWheel,
-    faults: Faults,
+    faults: LineFaults,
     /// Seconds of the machine's time in a real second.
     speed: f64,
     clients: BTreeMap<u64, Client>,
@@ -84,14 +84,14 @@ pub struct Controller {
     at_mm: Vec3,
     errors: VecDeque<String>,
     log: Option<String>,
-    passed: Duration,
+    last_time: Duration,
     moving: bool,
-    witness: Option<Witness>,
+    observer: Option<Observer>,
 }
 
 impl Controller {
     /// Creates a controller that is switched on and homed, with no program.
-    pub fn new(wheel: PlainWheel, speed: f64, faults: Faults) -> Self {
+    pub fn new(wheel: PlainWheel, speed: f64, faults: LineFaults) -> Self {
         Self {
             wheel,
             faults,
@@ -110,25 +110,25 @@ impl Controller {
             at_mm: AWAY_MM,
             errors: VecDeque::new(),
             log: None,
-            passed: Duration::ZERO,
+            last_time: Duration::ZERO,
             moving: false,
-            witness: None,
+            observer: None,
         }
     }
 
     /// Sets an observer of all events from now on.
-    pub fn witness(&mut self, witness: Witness) {
-        self.witness = Some(witness);
+    pub fn set_observer(&mut self, witness: Observer) {
+        self.observer = Some(witness);
     }
 
-    fn tell(&mut self, deed: Deed) {
-        if let Some(witness) = &mut self.witness {
+    fn notify(&mut self, deed: ControllerEvent) {
+        if let Some(witness) = &mut self.observer {
             witness(&deed);
         }
     }
 
     /// Returns true if the machine moves.
-    pub fn moves(&self) -> bool {
+    pub fn is_moving(&self) -> bool {
         self.moving
     }
 
@@ -143,14 +143,14 @@ impl Controller {
     pub fn emergency_stop(&mut self) {
         (self.stopped, self.on) = (true, false);
         self.break_off();
-        self.tell(Deed::Stopped);
+        self.notify(ControllerEvent::Stopped);
     }
 
     /// Switches the drives off.
     pub fn switch_off(&mut self) {
         self.on = false;
         self.break_off();
-        self.tell(Deed::Stopped);
+        self.notify(ControllerEvent::Stopped);
     }
 
     /// Makes the machine ready again, as a person would.
@@ -159,7 +159,7 @@ impl Controller {
     }
 
     /// Switches to another mode or back, as a person would; a running program continues.
-    pub fn turn_to(&mut self, mode: &'static str) {
+    pub fn set_mode(&mut self, mode: &'static str) {
         if !self.is_busy() {
             self.mode = mode;
         }
@@ -176,7 +176,7 @@ impl Controller {
     pub fn lead_away(&mut self) {
         if !self.is_busy() {
             self.at_mm = AWAY_MM;
-            self.wheel.let_go();
+            self.wheel.release_part();
         }
     }
 
@@ -198,7 +198,7 @@ impl Controller {
         (self.stopped, self.on, self.homed, self.mode) = (true, false, false, "MANUAL");
         (self.line, self.interpreter) = (0, Interpreter::Idle);
         self.errors.clear();
-        self.tell(Deed::Killed);
+        self.notify(ControllerEvent::Killed);
     }
 
     // ---- lines --------------------------------------------------------------------------------------------------------------------
@@ -209,7 +209,7 @@ impl Controller {
     }
 
     /// Handles the loss of a client. A running program continues.
-    pub fn hung_up(&mut self, client: u64) {
+    pub fn client_lost(&mut self, client: u64) {
         self.clients.remove(&client);
     }
 
@@ -246,7 +246,7 @@ impl Controller {
 
     /// Handles the lines of a client whose time has come.
     fn attend(&mut self, number: u64, now: Duration) {
-        self.pass(now);
+        self.advance_time(now);
         loop {
             let Some(client) = self.clients.get_mut(&number).filter(|client| client.free_at <= now) else { return };
             let Some(line) = client.lines.pop_front() else { return };
@@ -256,12 +256,12 @@ impl Controller {
     }
 
     fn carry_out(&mut self, number: u64, line: &str, now: Duration) {
-        let fault = self.faults.at(|begins| line.starts_with(begins));
+        let fault = self.faults.next_at(|begins| line.starts_with(begins));
         let word = |k: usize| line.split_whitespace().nth(k).unwrap_or_default().to_ascii_lowercase();
         let is_set = word(0) == "set";
         let nak = || if is_set { format!("SET {} NAK\n\r", word(1).to_uppercase()) } else { "GET NAK\r\n".to_owned() };
         let ack = || format!("SET {} ACK\n\r", word(1).to_uppercase());
-        let mut late = if is_set { SET_TAKES } else { Duration::ZERO };
+        let mut late = if is_set { SET_DURATION } else { Duration::ZERO };
         if let Some(Fault::Limit(thousandths)) = fault
             && let Some(program) = &self.program
         {
@@ -278,15 +278,15 @@ impl Controller {
             _ => self.obey(number, line),
         };
         let answer = match fault {
-            Some(Fault::Unanswered | Fault::CutBehind) => None,
+            Some(Fault::Unanswered | Fault::CutAfter) => None,
             Some(Fault::DoneAndRefused) => Some(nak()),
-            Some(Fault::Aside) => answer.map(|answer| format!("AXIS 7\r\n\u{e9}\r\n{answer}")),
+            Some(Fault::UnmatchedLines) => answer.map(|answer| format!("AXIS 7\r\n\u{e9}\r\n{answer}")),
             _ => answer,
         };
         if let Some(Fault::Late(by)) = fault {
             late += by;
         }
-        let closes = matches!(fault, Some(Fault::CutBefore | Fault::CutBehind));
+        let closes = matches!(fault, Some(Fault::CutBefore | Fault::CutAfter));
         let Some(client) = self.clients.get_mut(&number) else { return };
         client.free_at = now + late;
         if answer.is_some() || closes {
@@ -308,7 +308,7 @@ impl Controller {
                 client.greeted = second == "emc";
                 Some(if client.greeted { "HELLO ACK EMCNETSVR 1.1\r\n" } else { "HELLO NAK\r\n" }.to_owned())
             }
-            "get" => Some(match self.told(number, &second) {
+            "get" => Some(match self.query(number, &second) {
                 Some(told) => format!("{upper} {told}\r\n"),
                 None => format!("GET {upper} NAK\r\n"),
             }),
@@ -333,7 +333,7 @@ impl Controller {
         }
     }
 
-    fn told(&mut self, number: u64, what: &str) -> Option<String> {
+    fn query(&mut self, number: u64, what: &str) -> Option<String> {
         let switch = |on: bool| if on { "ON" } else { "OFF" }.to_owned();
         Some(match what {
             "enable" => switch(self.owner == Some(number)),
@@ -379,7 +379,7 @@ impl Controller {
             ("abort", _) => self.abort(),
             _ => self.errors.push_back(format!("can't do that ({what}) in {} mode", self.mode.to_lowercase())),
         }
-        self.see_whether_it_moves();
+        self.update_motion();
         Some(true)
     }
 
@@ -396,7 +396,7 @@ impl Controller {
         match std::fs::read_to_string(path) {
             Ok(text) => {
                 (self.program, self.line) = (Some(Program::new(path, text)), 0);
-                self.tell(Deed::Opened { path: path.to_owned() });
+                self.notify(ControllerEvent::Opened { path: path.to_owned() });
             }
             Err(_) => self.errors.push_back(format!("can't open {path}")),
         }
@@ -411,10 +411,10 @@ impl Controller {
         let (path, text) = (program.path.clone(), program.text.clone());
         (self.interpreter, self.line) = (Interpreter::Running, 1);
         self.steps.clear();
-        if !self.wheel.take() {
+        if !self.wheel.claim_part() {
             self.errors.push_back("the clamp is empty".to_owned());
         }
-        self.tell(Deed::Began { path, text });
+        self.notify(ControllerEvent::Began { path, text });
         self.read_on();
     }
 
@@ -425,21 +425,21 @@ impl Controller {
         }
     }
 
-    fn say(&mut self, said: Said) {
+    fn say(&mut self, said: LogAction) {
         let log = |path: &str, anew: bool| {
             OpenOptions::new().create(true).write(true).append(!anew).truncate(anew).open(path)
         };
         let done = match said {
-            Said::Open { path, anew } => {
+            LogAction::Open { path, truncate: anew } => {
                 let opened = log(&path, anew).map(drop);
                 self.log = Some(path);
                 opened
             }
-            Said::Log(text) => match &self.log {
+            LogAction::Log(text) => match &self.log {
                 Some(path) => log(path, false).and_then(|mut file| writeln!(file, "{text}")),
                 None => Ok(()),
             },
-            Said::Close => {
+            LogAction::Close => {
                 self.log = None;
                 Ok(())
             }
@@ -451,7 +451,7 @@ impl Controller {
 
     fn abort(&mut self) {
         self.break_off();
-        self.tell(Deed::Aborted);
+        self.notify(ControllerEvent::Aborted);
     }
 
     /// Ends the running program at its present position.
@@ -459,21 +459,21 @@ impl Controller {
         self.interpreter = Interpreter::Idle;
         self.steps.clear();
         (self.limit_at, self.log) = (None, None);
-        self.see_whether_it_moves();
+        self.update_motion();
     }
 
-    fn see_whether_it_moves(&mut self) {
+    fn update_motion(&mut self) {
         let moves = self.interpreter == Interpreter::Running;
         if std::mem::replace(&mut self.moving, moves) != moves {
-            self.tell(if moves { Deed::Moves } else { Deed::Stands });
+            self.notify(if moves { ControllerEvent::MotionStarted } else { ControllerEvent::MotionEnded });
         }
     }
 
     /// Lets time pass: the machine moves along its program.
-    pub fn pass(&mut self, now: Duration) {
-        let mut left_s = now.saturating_sub(self.passed).as_secs_f64() * self.speed;
-        self.passed = now;
-        self.see_whether_it_moves();
+    pub fn advance_time(&mut self, now: Duration) {
+        let mut left_s = now.saturating_sub(self.last_time).as_secs_f64() * self.speed;
+        self.last_time = now;
+        self.update_motion();
         while self.interpreter == Interpreter::Running {
             self.read_on();
             let Some(step) = self.steps.front().cloned() else {
@@ -494,14 +494,14 @@ impl Controller {
                     }
                     left_s -= way_mm / mm_s;
                 }
-                Step::Refused { why, line } => {
+                Step::Refused { reason: why, line } => {
                     self.line = line;
                     self.errors.push_back(why);
                     return self.break_off();
                 }
                 Step::Wait { line } => {
                     self.line = line;
-                    self.wheel.been_all_over();
+                    self.wheel.finish_sweep();
                     self.program.iter_mut().for_each(Program::go_on);
                 }
                 Step::End { line } => {
@@ -520,15 +520,15 @@ impl Controller {
         };
         let pieces = (goes_mm / STEP_MM).ceil().max(1.0) as u32;
         for piece in 1..=pieces {
-            self.wheel.come(place(goes_mm * f64::from(piece) / f64::from(pieces)));
+            self.wheel.move_to(place(goes_mm * f64::from(piece) / f64::from(pieces)));
         }
         self.at_mm = place(goes_mm);
     }
 
     fn end(&mut self) {
         let path = self.program.as_ref().map(|program| program.path.clone()).unwrap_or_default();
-        self.wheel.let_go();
-        self.tell(Deed::Ended { path });
+        self.wheel.release_part();
+        self.notify(ControllerEvent::Ended { path });
         self.break_off();
     }
 }

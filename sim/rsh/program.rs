@@ -3,10 +3,10 @@
 use std::collections::VecDeque;
 
 use crate::Vec3;
-use crate::program::{Stop, Turn};
+use crate::program::{CircularArc, Waypoint};
 
 /// Maximum number of motions that are read ahead.
-const AHEAD: usize = 200;
+const MAX_QUEUED_STEPS: usize = 200;
 /// Speed of rapid travel, in mm/s.
 const RAPID_MM_S: f64 = 100.0;
 /// Maximum distance of the chords of an arc from the arc, in mm.
@@ -20,7 +20,7 @@ pub(super) enum Step {
     /// Straight move to a place.
     Move { to_mm: Vec3, mm_s: f64, line: u32 },
     /// Arc that cannot be executed.
-    Refused { why: String, line: u32 },
+    Refused { reason: String, line: u32 },
     /// Barrier: the lines after it are not read before the motion has come here.
     Wait { line: u32 },
     /// End of the program.
@@ -29,9 +29,9 @@ pub(super) enum Step {
 
 /// Action that the interpreter carries out at once, when it reads it.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum Said {
+pub(super) enum LogAction {
     /// Opens a log file, empty or at its end.
-    Open { path: String, anew: bool },
+    Open { path: String, truncate: bool },
     /// Writes a line to the log file.
     Log(String),
     /// Closes the log file.
@@ -53,7 +53,7 @@ pub(super) struct Program {
     motion: u8,
     plane: [usize; 3],
     /// True if centres are absolute (G90.1), false if they are relative to the beginning of an arc (G91.1).
-    centres_are_places: bool,
+    centres_are_absolute: bool,
     mm_s: f64,
     /// True if nothing is read until the queued steps have been carried out.
     waits: bool,
@@ -64,7 +64,7 @@ impl Program {
         let lines = text.lines().map(str::to_owned).collect();
         let (next, repeats, waits) = (0, None, false);
         let (at_mm, plane) = ([0.0; 3], [0, 1, 2]);
-        let (motion, centres_are_places, mm_s) = (0, false, 0.0);
+        let (motion, centres_are_absolute, mm_s) = (0, false, 0.0);
         Self {
             path: path.to_owned(),
             text,
@@ -74,7 +74,7 @@ impl Program {
             at_mm,
             motion,
             plane,
-            centres_are_places,
+            centres_are_absolute,
             mm_s,
             waits,
         }
@@ -89,7 +89,7 @@ impl Program {
     pub(super) fn rewind(&mut self, at_mm: Vec3) {
         (self.next, self.repeats, self.waits) = (0, None, false);
         (self.at_mm, self.motion, self.mm_s) = (at_mm, 0, 0.0);
-        (self.plane, self.centres_are_places) = ([0, 1, 2], false);
+        (self.plane, self.centres_are_absolute) = ([0, 1, 2], false);
     }
 
     /// Continues reading: the queued steps have been carried out.
@@ -98,9 +98,9 @@ impl Program {
     }
 
     /// Reads ahead; returns the actions that are carried out at once.
-    pub(super) fn read_on(&mut self, steps: &mut VecDeque<Step>) -> Vec<Said> {
+    pub(super) fn read_on(&mut self, steps: &mut VecDeque<Step>) -> Vec<LogAction> {
         let mut said = Vec::new();
-        while !self.waits && steps.len() < AHEAD && self.next < self.lines.len() {
+        while !self.waits && steps.len() < MAX_QUEUED_STEPS && self.next < self.lines.len() {
             let text = self.lines[self.next].clone();
             self.next += 1;
             let line = self.next as u32;
@@ -137,7 +137,7 @@ impl Program {
                 ('G', 17.0) => self.plane = [0, 1, 2],
                 ('G', 18.0) => self.plane = [2, 0, 1],
                 ('G', 19.0) => self.plane = [1, 2, 0],
-                ('G', 90.1 | 91.1) => self.centres_are_places = value == 90.1,
+                ('G', 90.1 | 91.1) => self.centres_are_absolute = value == 90.1,
                 ('I' | 'J' | 'K', mm) => centre[letter as usize - 'I' as usize] = Some(mm),
                 ('F', feed) => self.mm_s = feed / 60.0,
                 ('X' | 'Y' | 'Z', mm) => {
@@ -162,36 +162,36 @@ impl Program {
                     let chords = stop.in_chords(self.at_mm, CHORDS_MM);
                     steps.extend(chords.into_iter().map(|to_mm| Step::Move { to_mm, mm_s, line }));
                 }
-                Err(why) => steps.push_back(Step::Refused { why, line }),
+                Err(why) => steps.push_back(Step::Refused { reason: why, line }),
             }
             self.at_mm = to_mm;
         }
     }
 
     /// Returns the way to a place: straight, or about a centre whose missing coordinates are 0.
-    fn way(&self, to_mm: Vec3, centre: [Option<f64>; 3]) -> Result<Stop, String> {
+    fn way(&self, to_mm: Vec3, centre: [Option<f64>; 3]) -> Result<Waypoint, String> {
         let turn = match self.motion {
             motion @ (2 | 3) => {
-                let begin = |axis: usize| if self.centres_are_places { 0.0 } else { self.at_mm[axis] };
+                let begin = |axis: usize| if self.centres_are_absolute { 0.0 } else { self.at_mm[axis] };
                 let [a, b, _] = self.plane;
                 let about = [a, b].map(|axis| begin(axis) + centre[axis].unwrap_or(0.0));
-                Some(Turn::new(self.plane, [self.at_mm, to_mm], about, motion == 2, RADII_MM)?)
+                Some(CircularArc::new(self.plane, [self.at_mm, to_mm], about, motion == 2, RADII_MM)?)
             }
             _ => None,
         };
-        Ok(Stop { at_mm: to_mm, turn_deg: None, feed_mm_min: None, minutes: None, turn })
+        Ok(Waypoint { at_mm: to_mm, rotary_deg: None, feed_mm_min: None, minutes: None, arc: turn })
     }
 }
 
 /// Returns the action that a comment requests.
-pub(super) fn says(text: &str) -> Option<Said> {
+pub(super) fn says(text: &str) -> Option<LogAction> {
     let comment = text.trim().strip_prefix('(')?.strip_suffix(')')?;
     let (word, rest) = comment.split_once(',').unwrap_or((comment, ""));
     Some(match word {
-        "LOGOPEN" => Said::Open { path: rest.to_owned(), anew: true },
-        "LOGAPPEND" => Said::Open { path: rest.to_owned(), anew: false },
-        "LOG" => Said::Log(rest.to_owned()),
-        "LOGCLOSE" => Said::Close,
+        "LOGOPEN" => LogAction::Open { path: rest.to_owned(), truncate: true },
+        "LOGAPPEND" => LogAction::Open { path: rest.to_owned(), truncate: false },
+        "LOG" => LogAction::Log(rest.to_owned()),
+        "LOGCLOSE" => LogAction::Close,
         _ => return None,
     })
 }
@@ -216,7 +216,7 @@ mod tests {
     fn what_a_program_says_runs_ahead_of_its_motion_but_for_an_input() {
         let text = "(LOG,a)\nG21 G90\nG64 P0.0001 Q0\nG0 Z5\nG1 X1.5Y-2Z0.25F600\n(LOG,b)\nM66 P0 L0\n(LOG,c)\nM2\n";
         let (mut program, mut steps) = (Program::new("p", text.to_owned()), VecDeque::new());
-        let log = |word: &str| Said::Log(word.to_owned());
+        let log = |word: &str| LogAction::Log(word.to_owned());
         assert_eq!(program.read_on(&mut steps), [log("a"), log("b")]);
         let moves = [
             Step::Move { to_mm: [0.0, 0.0, 5.0], mm_s: RAPID_MM_S, line: 4 },

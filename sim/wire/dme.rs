@@ -15,7 +15,7 @@ use super::executed::ExecutedPath;
 use crate::dme::{Outgoing, Server};
 
 /// Maximum length of a line, without its line end.
-const LONGEST_LINE: usize = 65_536;
+const MAX_LINE_LENGTH: usize = 65_536;
 
 /// Server shared by its wire, its client and a test.
 #[derive(Clone)]
@@ -60,7 +60,7 @@ impl SharedServer {
         // A failure of one client does not concern the others.
         let _ = self.converse(stream, grinder).await;
         let now = self.now();
-        self.locked().hung_up(now);
+        self.locked().client_lost(now);
     }
 
     async fn converse(
@@ -85,7 +85,7 @@ impl SharedServer {
                 }
                 self.locked().receive(line.trim_end_matches(['\r', '\n']), self.now());
             }
-            if unread.len() > LONGEST_LINE {
+            if unread.len() > MAX_LINE_LENGTH {
                 return Ok(());
             }
             let outgoing = self.locked().tick(self.now());

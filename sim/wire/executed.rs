@@ -26,18 +26,18 @@ use crate::executed::Wheel;
 /// Duration of a servo cycle, in s.
 const CYCLE_S: f64 = 1e-3;
 /// Time within which a question is not repeated: no pass can be loaded, begun and ended within it.
-const FRESH: Duration = Duration::from_millis(500);
+const QUESTION_VALIDITY: Duration = Duration::from_millis(500);
 /// Time without a mark after which a program counts as gone.
 const LOST_AFTER: Duration = Duration::from_secs(30);
 /// Time between two attempts to start the program: at first, and at most, after several programs in a row that reported
 /// nothing. A restarted controller is followed before anybody can make it grind.
-const AGAIN_AFTER: Duration = Duration::from_millis(200);
-const AGAIN_AFTER_MOST: Duration = Duration::from_secs(2);
+const RESTART_DELAY: Duration = Duration::from_millis(200);
+const MAX_RESTART_DELAY: Duration = Duration::from_secs(2);
 
 /// Wheel that follows the executed path of a controller, until this is dropped.
 pub struct ExecutedPath {
     shared: Arc<Shared>,
-    asked: Mutex<(u32, Option<Instant>)>,
+    last_question: Mutex<(u32, Option<Instant>)>,
 }
 
 struct Shared {
@@ -45,12 +45,12 @@ struct Shared {
     /// Program, while it runs.
     child: Mutex<Option<Child>>,
     input: Mutex<Option<ChildStdin>>,
-    told: watch::Sender<Told>,
+    report: watch::Sender<HelperReport>,
 }
 
 /// Last report of the program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Told {
+enum HelperReport {
     /// There is no program.
     Gone,
     /// The program has started, and has reported nothing.
@@ -74,29 +74,30 @@ impl ExecutedPath {
         let mut first = command.spawn()?;
         let (ended, input) = (AtomicBool::new(false), Mutex::new(first.stdin.take()));
         // From here on, a caller waits for an answer.
-        let told = watch::Sender::new(Told::Nothing);
-        let shared = Arc::new(Shared { ended, child: Mutex::default(), input, told });
+        let told = watch::Sender::new(HelperReport::Nothing);
+        let shared = Arc::new(Shared { ended, child: Mutex::default(), input, report: told });
         let following = Arc::clone(&shared);
         thread::spawn(move || follow(&following, &mut command, first, wheel));
-        Ok(Self { shared, asked: Mutex::new((rand::random(), None)) })
+        Ok(Self { shared, last_question: Mutex::new((rand::random(), None)) })
     }
 
     /// Waits until the wheel has been moved along everything that the controller has executed before now. If no program
     /// reports any more, the path reported so far is complete.
     pub async fn caught_up(&self) {
         let question = {
-            let (question, when) = &mut *locked(&self.asked);
-            if when.is_some_and(|when| when.elapsed() < FRESH) {
+            let (question, when) = &mut *locked(&self.last_question);
+            if when.is_some_and(|when| when.elapsed() < QUESTION_VALIDITY) {
                 return;
             }
             *question = question.wrapping_add(1).max(1);
             *when = Some(Instant::now());
             *question
         };
-        let mut told = self.shared.told.subscribe();
+        let mut told = self.shared.report.subscribe();
         let asked = locked(&self.shared.input).as_mut().is_some_and(|input| writeln!(input, "{question}").is_ok());
         if asked {
-            let seen = told.wait_for(|told| matches!(*told, Told::Gone) || *told == Told::Mark(question));
+            let seen =
+                told.wait_for(|told| matches!(*told, HelperReport::Gone) || *told == HelperReport::Mark(question));
             // Without an answer by then, the wait ends.
             let _ = timeout(LOST_AFTER, seen).await;
         }
@@ -124,7 +125,7 @@ fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel
         if let Ok(mut child) = next {
             if let Some(input) = child.stdin.take() {
                 *locked(&shared.input) = Some(input);
-                shared.told.send_replace(Told::Nothing);
+                shared.report.send_replace(HelperReport::Nothing);
             }
             let lines = child.stdout.take();
             *locked(&shared.child) = Some(child);
@@ -132,8 +133,8 @@ fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel
                 has_told = read(shared, BufReader::new(lines), &mut wheel);
             }
             *locked(&shared.input) = None;
-            wheel.away();
-            shared.told.send_replace(Told::Gone);
+            wheel.set_position_unknown();
+            shared.report.send_replace(HelperReport::Gone);
             if let Some(mut child) = locked(&shared.child).take() {
                 let _ = child.kill();
                 let _ = child.wait();
@@ -153,28 +154,28 @@ fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel
 
 /// Returns the pause after a number of consecutive programs that reported nothing.
 fn pause_after(silent: u32) -> Duration {
-    (AGAIN_AFTER * 2u32.pow(silent.min(8))).min(AGAIN_AFTER_MOST)
+    (RESTART_DELAY * 2u32.pow(silent.min(8))).min(MAX_RESTART_DELAY)
 }
 
 /// Moves the wheel line by line until the lines end. Returns true if any came.
 fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) -> bool {
     let mut expected = None;
     for line in lines.lines().map_while(Result::ok) {
-        let Some(Cycle { number, place_mm, homed, mark }) = Cycle::of(&line) else {
-            wheel.lost();
+        let Some(ServoCycle { number, place_mm, homed, mark }) = ServoCycle::parse(&line) else {
+            wheel.path_lost();
             continue;
         };
         if expected.is_some_and(|expected| expected != number) {
-            wheel.lost();
+            wheel.path_lost();
         }
         expected = Some(number + 1);
         match homed {
-            true => wheel.at(place_mm, number as f64 * CYCLE_S),
-            false => wheel.away(),
+            true => wheel.move_to(place_mm, number as f64 * CYCLE_S),
+            false => wheel.set_position_unknown(),
         }
-        if *shared.told.borrow() != Told::Mark(mark) {
-            wheel.settle();
-            shared.told.send_replace(Told::Mark(mark));
+        if *shared.report.borrow() != HelperReport::Mark(mark) {
+            wheel.finish_waiting_track();
+            shared.report.send_replace(HelperReport::Mark(mark));
         }
     }
     expected.is_some()
@@ -182,15 +183,15 @@ fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) -> bool {
 
 /// Content of a line.
 #[derive(Debug, PartialEq)]
-struct Cycle {
+struct ServoCycle {
     number: u64,
     place_mm: [f64; 3],
     homed: bool,
     mark: u32,
 }
 
-impl Cycle {
-    fn of(line: &str) -> Option<Self> {
+impl ServoCycle {
+    fn parse(line: &str) -> Option<Self> {
         let words: Vec<&str> = line.split_whitespace().collect();
         let [number, x, y, z, homed, mark] = words[..] else { return None };
         let place = |word: &str| word.parse().ok().filter(|mm: &f64| mm.is_finite());
@@ -212,10 +213,10 @@ mod tests {
 
     #[test]
     fn a_line_is_whole_or_none() {
-        let cycle = Cycle { number: 7, place_mm: [1.5, -2.0, 30.000001], homed: true, mark: 3 };
-        assert_eq!(Cycle::of("7 1.500000 -2.000000 30.000001 1 3 "), Some(cycle));
+        let cycle = ServoCycle { number: 7, place_mm: [1.5, -2.0, 30.000001], homed: true, mark: 3 };
+        assert_eq!(ServoCycle::parse("7 1.500000 -2.000000 30.000001 1 3 "), Some(cycle));
         for broken in ["", "overrun", "7 1 2 3 1", "7 1 2 nan 1 0", "7 1 2 3 2 0", "-7 1 2 3 1 0", "7 1 2 3 1 0 0"] {
-            assert_eq!(Cycle::of(broken), None, "{broken:?}");
+            assert_eq!(ServoCycle::parse(broken), None, "{broken:?}");
         }
     }
 
@@ -252,10 +253,10 @@ mod tests {
         let world = World::new(WorldSpec::default()).unwrap();
         let path = ExecutedPath::follow(command, world.wheel(12.5).unwrap()).unwrap();
         path.caught_up().await;
-        let question = locked(&path.asked).0;
-        assert_eq!(*path.shared.told.borrow(), Told::Mark(question));
+        let question = locked(&path.last_question).0;
+        assert_eq!(*path.shared.report.borrow(), HelperReport::Mark(question));
         // A question is not repeated within a short time.
         path.caught_up().await;
-        assert_eq!(locked(&path.asked).0, question);
+        assert_eq!(locked(&path.last_question).0, question);
     }
 }

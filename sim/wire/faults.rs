@@ -106,7 +106,7 @@ pub enum When {
 }
 
 impl When {
-    fn is_about(&mut self, request: &Request, rng: &mut Rng) -> bool {
+    fn matches(&mut self, request: &Request, rng: &mut Rng) -> bool {
         match self {
             Self::Any => true,
             Self::Nth(n) => request.number == *n,
@@ -172,21 +172,21 @@ impl FaultPlan {
 
 /// Fault plan shared by a wire and a test.
 #[derive(Clone)]
-pub struct Faults(Arc<Mutex<FaultPlan>>);
+pub struct SharedFaultPlan(Arc<Mutex<FaultPlan>>);
 
-impl Default for Faults {
+impl Default for SharedFaultPlan {
     fn default() -> Self {
         FaultPlan::new(0).into()
     }
 }
 
-impl From<FaultPlan> for Faults {
+impl From<FaultPlan> for SharedFaultPlan {
     fn from(plan: FaultPlan) -> Self {
         Self(Arc::new(Mutex::new(plan)))
     }
 }
 
-impl Faults {
+impl SharedFaultPlan {
     /// Creates a plan without faults.
     pub fn none() -> Self {
         Self::default()
@@ -208,14 +208,14 @@ impl Faults {
     }
 
     /// Numbers a request, and returns its faults.
-    pub(crate) fn meet(&self, request: &mut Request) -> Vec<Fault> {
+    pub(crate) fn draw(&self, request: &mut Request) -> Vec<Fault> {
         let mut plan = self.lock();
         let FaultPlan { rules, rng, requests, fired, .. } = &mut *plan;
         *requests += 1;
         request.number = *requests;
         let mut met = Vec::new();
         for rule in rules.iter_mut().filter(|rule| rule.left > 0 && !rule.faults.is_empty()) {
-            if !rule.when.is_about(request, rng) {
+            if !rule.when.matches(request, rng) {
                 continue;
             }
             if rule.skip > 0 {
@@ -231,12 +231,12 @@ impl Faults {
     }
 
     /// Stores a request that is to be carried out again.
-    pub(crate) fn keep(&self, before: u64, unit: u8, pdu: &[u8]) {
+    pub(crate) fn defer(&self, before: u64, unit: u8, pdu: &[u8]) {
         self.lock().again.push((before, unit, pdu.to_vec()));
     }
 
     /// Returns the requests that are carried out again before this one.
-    pub(crate) fn due(&self, number: u64) -> Vec<(u8, Vec<u8>)> {
+    pub(crate) fn take_due(&self, number: u64) -> Vec<(u8, Vec<u8>)> {
         let mut plan = self.lock();
         let (due, later) = plan.again.drain(..).partition(|(before, ..)| *before <= number);
         plan.again = later;

@@ -12,16 +12,16 @@ use tokio::task::JoinSet;
 use tokio::time::sleep;
 
 use super::pty::Pty;
-use crate::hits::Program;
+use crate::hits::PartProgram;
 
 /// Interval at which a part program checks for a new list.
-const LOOK: Duration = Duration::from_millis(20);
+const LIST_POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Minimum sleep; shorter times are accumulated.
-const SHORTEST: Duration = Duration::from_millis(5);
+const MIN_SLEEP: Duration = Duration::from_millis(5);
 
 /// Next action on the line.
-enum Put {
+enum LineAction {
     Bytes(Vec<u8>, Option<oneshot::Sender<()>>),
     HangUp,
 }
@@ -30,7 +30,7 @@ enum Put {
 pub struct ServingHits {
     path: Option<PathBuf>,
     local_addr: Option<SocketAddr>,
-    lines: mpsc::Sender<Put>,
+    lines: mpsc::Sender<LineAction>,
     tasks: JoinSet<()>,
 }
 
@@ -64,7 +64,7 @@ impl ServingHits {
             loop {
                 match listener.accept().await {
                     Ok((stream, _)) => drop(print(stream, &mut inbox).await),
-                    Err(_) => sleep(LOOK).await,
+                    Err(_) => sleep(LIST_POLL_INTERVAL).await,
                 }
             }
         });
@@ -84,19 +84,19 @@ impl ServingHits {
     /// Sends bytes, and returns after they are on the line or when there is no client.
     pub async fn send(&self, bytes: &[u8]) {
         let (written, are_written) = oneshot::channel();
-        if self.lines.send(Put::Bytes(bytes.to_vec(), Some(written))).await.is_ok() {
+        if self.lines.send(LineAction::Bytes(bytes.to_vec(), Some(written))).await.is_ok() {
             let _ = are_written.await;
         }
     }
 
     /// Ends the connection.
     pub async fn hang_up(&self) {
-        let _ = self.lines.send(Put::HangUp).await;
+        let _ = self.lines.send(LineAction::HangUp).await;
     }
 
     /// Runs a part program that measures every list that appears as `plan.csv` in a folder, faster than real time by
     /// the factor `speed`.
-    pub fn run(&mut self, mut program: Program, folder: &Path, speed: f64) {
+    pub fn run(&mut self, mut program: PartProgram, folder: &Path, speed: f64) {
         let (list, lines) = (folder.join("plan.csv"), self.lines.clone());
         self.tasks.spawn(async move {
             loop {
@@ -107,34 +107,37 @@ impl ServingHits {
                 let mut owed = Duration::ZERO;
                 while let Some(out) = program.touch_next() {
                     owed += program.per_touch().div_f64(speed);
-                    if owed > SHORTEST {
+                    if owed > MIN_SLEEP {
                         sleep(std::mem::take(&mut owed)).await;
                     }
-                    if !out.bytes.is_empty() && lines.send(Put::Bytes(out.bytes, None)).await.is_err() {
+                    if !out.bytes.is_empty() && lines.send(LineAction::Bytes(out.bytes, None)).await.is_err() {
                         return;
                     }
-                    if out.hangs_up && lines.send(Put::HangUp).await.is_err() {
+                    if out.hangs_up && lines.send(LineAction::HangUp).await.is_err() {
                         return;
                     }
                 }
-                sleep(LOOK).await;
+                sleep(LIST_POLL_INTERVAL).await;
             }
         });
     }
 }
 
 /// Prints the queued bytes until the other side is gone or the line is hung up.
-async fn print(mut stream: impl AsyncRead + AsyncWrite + Unpin, inbox: &mut mpsc::Receiver<Put>) -> io::Result<()> {
+async fn print(
+    mut stream: impl AsyncRead + AsyncWrite + Unpin,
+    inbox: &mut mpsc::Receiver<LineAction>,
+) -> io::Result<()> {
     let mut heard = [0; 256];
     loop {
         tokio::select! {
             put = inbox.recv() => match put {
-                Some(Put::Bytes(bytes, written)) => {
+                Some(LineAction::Bytes(bytes, written)) => {
                     stream.write_all(&bytes).await?;
                     stream.flush().await?;
                     written.map(|written| written.send(()));
                 }
-                Some(Put::HangUp) | None => return stream.shutdown().await,
+                Some(LineAction::HangUp) | None => return stream.shutdown().await,
             },
             // The printer ignores its input: it reads and discards it.
             read = stream.read(&mut heard) => if read? == 0 { return Ok(()) },

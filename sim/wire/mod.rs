@@ -37,44 +37,44 @@ use tokio::net::{TcpListener, ToSocketAddrs};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
-use crate::registers::{Exception, Machine};
+use crate::registers::{Exception, SimulatedMachine};
 use crate::words::{bytes_of, crc16, registers_of};
-use faults::{Fault, Faults, Request};
+use faults::{Fault, Request, SharedFaultPlan};
 
 /// Interval at which the machines' time advances.
 const TICK: Duration = Duration::from_millis(10);
 /// Maximum time that one tick lets pass. If the simulator gets no processor time, the machines' time stops too.
-const LONGEST_TICK: Duration = Duration::from_millis(100);
+const MAX_TICK: Duration = Duration::from_millis(100);
 
 /// Time step of a machine between two requests.
 const PIECE: Duration = Duration::from_millis(1);
 
 /// Machine shared by wires, tests and time.
 #[derive(Clone)]
-pub struct SharedMachine(Arc<Mutex<Living>>);
+pub struct SharedMachine(Arc<Mutex<TimedMachine>>);
 
-struct Living {
-    machine: Machine,
+struct TimedMachine {
+    machine: SimulatedMachine,
     ticked: Option<Instant>,
 }
 
-impl From<Machine> for SharedMachine {
-    fn from(machine: Machine) -> Self {
-        Self(Arc::new(Mutex::new(Living { machine, ticked: None })))
+impl From<SimulatedMachine> for SharedMachine {
+    fn from(machine: SimulatedMachine) -> Self {
+        Self(Arc::new(Mutex::new(TimedMachine { machine, ticked: None })))
     }
 }
 
 impl SharedMachine {
     /// Calls a function with exclusive access to the machine.
-    pub fn with<T>(&self, look: impl FnOnce(&mut Machine) -> T) -> T {
+    pub fn with<T>(&self, look: impl FnOnce(&mut SimulatedMachine) -> T) -> T {
         look(&mut self.lock().machine)
     }
 
     /// Lets the time since the last call pass at the machine.
-    fn live(&self) {
+    fn advance_time(&self) {
         let now = Instant::now();
         let last = self.lock().ticked.replace(now).unwrap_or(now);
-        let mut left = now.saturating_duration_since(last).min(LONGEST_TICK);
+        let mut left = now.saturating_duration_since(last).min(MAX_TICK);
         // The physics of a fast machine takes time to compute; a request must wait for at most one step of it.
         while !left.is_zero() {
             let piece = left.min(PIECE);
@@ -83,7 +83,7 @@ impl SharedMachine {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, Living> {
+    fn lock(&self) -> MutexGuard<'_, TimedMachine> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -92,12 +92,12 @@ impl SharedMachine {
 pub type Units = Vec<(u8, SharedMachine)>;
 
 /// Lets real time pass at the machines until it is dropped.
-pub async fn live(machines: Vec<SharedMachine>) {
+pub async fn advance_machines(machines: Vec<SharedMachine>) {
     let mut ticks = tokio::time::interval(TICK);
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
         ticks.tick().await;
-        machines.iter().for_each(SharedMachine::live);
+        machines.iter().for_each(SharedMachine::advance_time);
     }
 }
 
@@ -165,11 +165,11 @@ impl Delivery {
 }
 
 /// Carries out a request, and returns the answer as the wire delivers it.
-fn answer(units: &Units, faults: &Faults, framing: Framing, unit: u8, pdu: &[u8]) -> Delivery {
+fn answer(units: &Units, faults: &SharedFaultPlan, framing: Framing, unit: u8, pdu: &[u8]) -> Delivery {
     let machine = units.iter().find(|(id, _)| *id == unit).map(|(_, machine)| machine);
     let mut request = describe(machine, unit, pdu);
-    let met = faults.meet(&mut request);
-    for (unit, pdu) in faults.due(request.number) {
+    let met = faults.draw(&mut request);
+    for (unit, pdu) in faults.take_due(request.number) {
         if let Some((_, machine)) = units.iter().find(|(id, _)| *id == unit) {
             carry_out(machine, &pdu);
         }
@@ -179,11 +179,11 @@ fn answer(units: &Units, faults: &Faults, framing: Framing, unit: u8, pdu: &[u8]
         match (fault, machine) {
             (Fault::Exception(code), _) => exception = Some(vec![pdu[0] | 0x80, *code]),
             (Fault::DropRequest, _) => exception = Some(Vec::new()),
-            (Fault::CarryOutAgain(after), _) => faults.keep(request.number + after, unit, pdu),
+            (Fault::CarryOutAgain(after), _) => faults.defer(request.number + after, unit, pdu),
             (Fault::Freeze, Some(machine)) => machine.with(|machine| machine.freeze(true)),
             (Fault::Thaw, Some(machine)) => machine.with(|machine| machine.freeze(false)),
-            (Fault::Reboot, Some(machine)) => machine.with(Machine::reboot),
-            (Fault::TornStatus, Some(machine)) => machine.with(Machine::tear_status),
+            (Fault::Reboot, Some(machine)) => machine.with(SimulatedMachine::reboot),
+            (Fault::TornStatus, Some(machine)) => machine.with(SimulatedMachine::tear_status),
             _ => {}
         }
     }
@@ -286,7 +286,7 @@ pub struct Serving {
     local_addr: Option<SocketAddr>,
     path: Option<PathBuf>,
     machines: Units,
-    faults: Faults,
+    faults: SharedFaultPlan,
     tasks: JoinSet<io::Result<()>>,
     /// Link to a pseudo-terminal, and its target.
     linked: Option<(PathBuf, PathBuf)>,
@@ -309,7 +309,7 @@ impl Serving {
     /// # Errors
     /// The address cannot be bound.
     pub async fn tcp<M: Into<SharedMachine>>(addr: impl ToSocketAddrs, units: Vec<(u8, M)>) -> io::Result<Self> {
-        Self::tcp_with(addr, units, Faults::none()).await
+        Self::tcp_with(addr, units, SharedFaultPlan::none()).await
     }
 
     /// Serves machines over Modbus TCP with faults.
@@ -319,10 +319,10 @@ impl Serving {
     pub async fn tcp_with<M: Into<SharedMachine>>(
         addr: impl ToSocketAddrs,
         units: Vec<(u8, M)>,
-        faults: Faults,
+        faults: SharedFaultPlan,
     ) -> io::Result<Self> {
         let listener = TcpListener::bind(addr).await?;
-        let mut serving = Self::of(units, faults);
+        let mut serving = Self::new(units, faults);
         serving.local_addr = Some(listener.local_addr()?);
         let (machines, faults) = (serving.machines.clone(), serving.faults.clone());
         serving.tasks.spawn(async move { tcp::serve_tcp(listener, machines, faults).await });
@@ -333,9 +333,13 @@ impl Serving {
     ///
     /// # Errors
     /// No pseudo-terminal is available.
-    pub fn rtu<M: Into<SharedMachine>>(units: Vec<(u8, M)>, line: rtu::Line, faults: Faults) -> io::Result<Self> {
+    pub fn rtu<M: Into<SharedMachine>>(
+        units: Vec<(u8, M)>,
+        line: rtu::Line,
+        faults: SharedFaultPlan,
+    ) -> io::Result<Self> {
         let port = pty::Pty::open()?;
-        let mut serving = Self::of(units, faults);
+        let mut serving = Self::new(units, faults);
         serving.path = Some(port.path().to_path_buf());
         serving.spawn_rtu(port, line);
         Ok(serving)
@@ -365,23 +369,23 @@ impl Serving {
         path: impl AsRef<Path>,
         units: Vec<(u8, M)>,
         line: rtu::Line,
-        faults: Faults,
+        faults: SharedFaultPlan,
     ) -> io::Result<Self> {
         let path = path.as_ref();
         let builder = tokio_serial::new(path.to_string_lossy(), line.baud);
         let port = tokio_serial::SerialStream::open(&builder)?;
-        let mut serving = Self::of(units, faults);
+        let mut serving = Self::new(units, faults);
         serving.path = Some(path.to_path_buf());
         serving.spawn_rtu(port, line);
         Ok(serving)
     }
 
-    fn of<M: Into<SharedMachine>>(units: Vec<(u8, M)>, faults: Faults) -> Self {
+    fn new<M: Into<SharedMachine>>(units: Vec<(u8, M)>, faults: SharedFaultPlan) -> Self {
         let machines: Units = units.into_iter().map(|(unit, machine)| (unit, machine.into())).collect();
         let living = machines.iter().map(|(_, machine)| machine.clone()).collect();
         let mut tasks = JoinSet::new();
         tasks.spawn(async move {
-            live(living).await;
+            advance_machines(living).await;
             Ok(())
         });
         Self { local_addr: None, path: None, machines, faults, tasks, linked: None }
@@ -416,7 +420,7 @@ impl Serving {
     }
 
     /// Returns the faults of this wire; they can be changed at any time.
-    pub fn faults(&self) -> &Faults {
+    pub fn faults(&self) -> &SharedFaultPlan {
         &self.faults
     }
 

@@ -11,7 +11,7 @@ use tokio::time::{Instant, sleep_until};
 use crate::rsh::Controller;
 
 /// Maximum length of a line, without its line end.
-const LONGEST_LINE: usize = 4096;
+const MAX_LINE_LENGTH: usize = 4096;
 
 /// Controller shared by its wires, its clients and a test.
 #[derive(Clone)]
@@ -41,8 +41,8 @@ impl SharedController {
     }
 
     /// Lets the machine's time pass.
-    pub fn live(&self) {
-        self.locked().pass(self.now());
+    pub fn advance_time(&self) {
+        self.locked().advance_time(self.now());
     }
 
     /// Returns the time of the controller.
@@ -64,7 +64,7 @@ impl SharedController {
         self.locked().connected(client);
         // A failure of one client does not concern the others.
         let _ = self.converse(client, stream).await;
-        self.locked().hung_up(client);
+        self.locked().client_lost(client);
     }
 
     async fn converse(&self, client: u64, mut stream: impl AsyncRead + AsyncWrite + Unpin) -> io::Result<()> {
@@ -84,7 +84,7 @@ impl SharedController {
                     self.locked().receive(client, &line, self.now());
                 }
             }
-            if unread.len() > LONGEST_LINE || !self.locked().serves(client) {
+            if unread.len() > MAX_LINE_LENGTH || !self.locked().serves(client) {
                 return stream.shutdown().await;
             }
             let outgoing = self.locked().tick(client, self.now());

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite};
 
-use super::faults::Faults;
+use super::faults::SharedFaultPlan;
 use super::{After, Framing, Units, answer};
 use crate::words::crc16;
 
@@ -52,7 +52,7 @@ impl Line {
 ///
 /// # Errors
 /// The line cannot be read or written any more.
-pub async fn serve_rtu<P>(mut port: P, units: Units, line: Line, faults: Faults) -> io::Result<()>
+pub async fn serve_rtu<P>(mut port: P, units: Units, line: Line, faults: SharedFaultPlan) -> io::Result<()>
 where
     P: AsyncRead + AsyncWrite + Unpin,
 {

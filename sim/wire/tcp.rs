@@ -7,14 +7,14 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpListener;
 use tokio::task::JoinSet;
 
-use super::faults::Faults;
+use super::faults::SharedFaultPlan;
 use super::{After, Framing, Units, answer};
 
 /// Serves machines to any number of clients until it is dropped; it then closes every connection.
 ///
 /// # Errors
 /// None; the type is that of the other wires.
-pub async fn serve_tcp(listener: TcpListener, units: Units, faults: Faults) -> io::Result<()> {
+pub async fn serve_tcp(listener: TcpListener, units: Units, faults: SharedFaultPlan) -> io::Result<()> {
     let mut clients = JoinSet::new();
     loop {
         tokio::select! {
@@ -39,7 +39,7 @@ pub async fn serve_tcp(listener: TcpListener, units: Units, faults: Faults) -> i
 ///
 /// # Errors
 /// The stream cannot be read or written any more.
-pub async fn serve_client<S>(mut stream: S, units: &Units, faults: &Faults) -> io::Result<()>
+pub async fn serve_client<S>(mut stream: S, units: &Units, faults: &SharedFaultPlan) -> io::Result<()>
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {

@@ -476,8 +476,8 @@ impl Cell {
         let (shift, turn) = (figures.shift_mm, figures.turn_rad.to_degrees());
         if !figures.are_sound() {
             self.useless(AlarmId::RegistrationFailed, "a figure is not a number, or negative");
-        } else if figures.touch_on.is_none() && figures.coverage < gates.least_coverage {
-            let (found, least) = (100.0 * figures.coverage, 100.0 * gates.least_coverage);
+        } else if figures.touch_on.is_none() && figures.coverage < gates.min_coverage {
+            let (found, least) = (100.0 * figures.coverage, 100.0 * gates.min_coverage);
             self.useless(
                 AlarmId::Coverage,
                 &format!("{found:.0} % of the aperture are covered, and {least:.0} % are needed"),

@@ -281,7 +281,7 @@ catalogue! {
     WeakDirections {
         "The surface does not tell where on the part a correction would be ground in",
         "No correction is made. The error map of this cycle is in the run folder.", ProcessEngineer,
-        ["Hold the named directions in the recipe (registration.hold), if the fixture or the reference points hold them well enough.",
+        ["Hold the named directions in the recipe (registration.lock), if the fixture or the reference points hold them well enough.",
          "Or measure features that hold them: edges, reference marks, a wider aperture.", "Start a new run that begins with a measurement."]
     }
     /// No map for the next pass.

@@ -110,7 +110,8 @@ pub struct Gates {
     /// Minimum share of the planned points that must be found, 0 to 1.
     pub least_found: f64,
     /// Minimum share of the aperture that must be covered, 0 to 1.
-    pub least_coverage: f64,
+    #[serde(rename = "least_coverage")]
+    pub min_coverage: f64,
     /// Maximum shift of the part from its expected place.
     pub most_shift_mm: f64,
     /// Maximum turn of the part from its expected orientation.

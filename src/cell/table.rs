@@ -135,7 +135,7 @@ fn plan(disposal: Disposal) -> CellPlan {
         on_refusal: disposal,
         gates: Gates {
             least_found: 0.9,
-            least_coverage: 0.9,
+            min_coverage: 0.9,
             most_shift_mm: 1.0,
             most_turn_rad: 0.1,
             most_radius_error_mm: Some(0.002),

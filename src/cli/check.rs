@@ -115,7 +115,7 @@ fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     let checked = Recipe::read(path).and_then(|recipe| {
         check_files(&recipe)?;
         check_simulation(&recipe)?;
-        Ok(Good { sha256: hex(recipe.source_sha256()), notes: Vec::new() })
+        Ok(Good { sha256: hex(recipe.source_sha256()), notes: recipe.notes().to_vec() })
     });
     ("recipe", checked)
 }

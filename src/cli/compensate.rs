@@ -48,7 +48,7 @@ pub(super) struct Arguments {
     tolerance_um: f64,
     /// The largest correction that is applied, in um: a map in another unit is refused by it
     #[arg(long, value_name = "UM", default_value_t = 500.0, value_parser = finite_above_zero)]
-    largest_correction_um: f64,
+    max_correction_um: f64,
     /// Print JSON instead of a summary
     #[arg(long)]
     json: bool,
@@ -74,7 +74,7 @@ Between its nodes a map is a cubic spline, which swings by a tenth of a step bes
 are taken as they are of a map of Regrind; of another one the nearest valid value stands there.
 
 A program without a move at feed is refused, one of whose moves at feed hardly any lie over the map, and a correction of more
-than --largest-correction-um. Lengths beside the map are told: there its outermost values are levelled off within five
+than --max-correction-um. Lengths beside the map are told: there its outermost values are levelled off within five
 nodes. Before the new program gets its name its lines are read again by other means and held against base and map.
 
 The new program names the hash of the old one and of the map. Refused are a program that names the map already, a map of another
@@ -114,7 +114,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         tolerance_mm: 1e-3 * arguments.tolerance_um,
         map: &map,
         gain: arguments.gain,
-        largest_mm: 1e-3 * arguments.largest_correction_um,
+        largest_mm: 1e-3 * arguments.max_correction_um,
     };
     let amended = correct_program(&arguments.program, &arguments.out, &amendment).map_err(Failure::Program)?;
     if arguments.json {

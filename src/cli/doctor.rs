@@ -7,7 +7,7 @@ use clap::Args;
 use regrind::cell::Device;
 use regrind::config::{BUILT_IN, CellConfig, Link};
 use regrind::device::{
-    DeviceError, Line, Machine, MachineKind, MakingError, ModbusCmm, ModbusGrinder, ModbusSettings, Status,
+    DeviceError, DriverError, LineAddress, Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Status,
 };
 use regrind::drive::recover::{in_short, look};
 use regrind::formats::{ResultFolder, try_writing};
@@ -187,12 +187,12 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
     let settings = |link| setup::modbus(link, cell.simulated, 1, 1);
     let [cmm, grinder] = [&cell.cmm.link, &cell.grinder.link];
     vec![
-        match cmm.wire.dme() {
+        match cmm.wire.ippdme_address() {
             Some(_) => server(MachineKind::Cmm, cmm, setup::cmm(cell)).await,
-            None if cmm.wire.hit_line().is_some() => heard(cmm, setup::cmm(cell)).await,
+            None if cmm.wire.hit_source().is_some() => heard(cmm, setup::cmm(cell)).await,
             None => machine(Device::Cmm, cell, settings(cmm), ModbusCmm::new).await,
         },
-        match grinder.wire.rsh() {
+        match grinder.wire.linuxcncrsh_address() {
             Some(_) => server(MachineKind::Grinder, grinder, setup::grinder(cell)).await,
             None => machine(Device::Grinder, cell, settings(grinder), ModbusGrinder::new).await,
         },
@@ -200,7 +200,7 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
 }
 
 /// Checks a server that runs no job: opens a session, requests identity and status, and ends the session.
-async fn server<M: Machine>(kind: MachineKind, link: &Link, made: Result<M, MakingError>) -> Finding {
+async fn server<M: Machine>(kind: MachineKind, link: &Link, made: Result<M, DriverError>) -> Finding {
     let what = match kind {
         MachineKind::Cmm => Device::Cmm,
         MachineKind::Grinder => Device::Grinder,
@@ -229,7 +229,7 @@ async fn server<M: Machine>(kind: MachineKind, link: &Link, made: Result<M, Maki
 const LISTENS: Duration = Duration::from_secs(5);
 
 /// Checks a machine that only prints: opens its line, and reports the lines that arrive with the matching formats.
-async fn heard(link: &Link, made: Result<impl Machine, MakingError>) -> Finding {
+async fn heard(link: &Link, made: Result<impl Machine, DriverError>) -> Finding {
     let what = Device::Cmm.to_string();
     let _taken = match take(link, MachineKind::Cmm, Path::new("regrind doctor")) {
         Ok(taken) => taken,
@@ -282,7 +282,7 @@ async fn machine<M: Machine>(
         Ok(taken) => taken,
         Err(failure) => return Finding::new(what, Found::Notice, failure.to_string()),
     };
-    if let Some((Line::Rtu { device: port, .. }, _)) = link.wire.line()
+    if let Some((LineAddress::Rtu { device: port, .. }, _)) = link.wire.modbus_line()
         && !Path::new(&port).exists()
     {
         return Finding::new(

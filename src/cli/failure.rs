@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use regrind::compensation::NextPassError;
-use regrind::device::MakingError;
+use regrind::device::DriverError;
 use regrind::formats::FormatError;
 use regrind::journal::JournalError;
 use regrind::registration::RegistrationError;
@@ -242,7 +242,7 @@ impl Failure {
             | Self::OrderRefused { .. }
             | Self::NoAnswer { .. }
             | Self::Setup(SetupError::Machine {
-                source: MakingError::Line { .. } | MakingError::NoPort { .. }, ..
+                source: DriverError::Line { .. } | DriverError::NoPort { .. }, ..
             })
             | Self::Ended { .. } => FAULT,
             Self::Broken(_)

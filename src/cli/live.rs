@@ -170,9 +170,13 @@ async fn heed_endings(mut endings: Endings, orders: Orders, actor: Actor) {
 /// Locks a machine on a line against all other runs on this computer.
 pub(super) fn take(link: &Link, kind: MachineKind, run: &Path) -> Result<Option<MachineLock>, Failure> {
     let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
-    let on_line = link.wire.line().map(|(line, unit)| format!("{kind} at {line}, unit {unit}"));
-    let served = link.wire.dme().or(link.wire.rsh()).map(|(host, port)| format!("{kind} at {host}:{port}"));
-    let heard = link.wire.hit_line().map(|line| format!("{kind} at {line}"));
+    let on_line = link.wire.modbus_line().map(|(line, unit)| format!("{kind} at {line}, unit {unit}"));
+    let served = link
+        .wire
+        .ippdme_address()
+        .or(link.wire.linuxcncrsh_address())
+        .map(|(host, port)| format!("{kind} at {host}:{port}"));
+    let heard = link.wire.hit_source().map(|line| format!("{kind} at {line}"));
     let taken = on_line.or(served).or(heard).map(|machine| MachineLock::take(&machine, &run));
     let taken = taken.transpose().map_err(Failure::Machine)?;
     for note in taken.iter().flat_map(MachineLock::notes) {

@@ -107,7 +107,7 @@ impl Recovery {
         machine: fn(ModbusSettings) -> io::Result<M>,
     ) -> Result<bool, Failure> {
         let Some(settings) = settings else {
-            let words = match (link.wire.dme(), link.wire.rsh()) {
+            let words = match (link.wire.ippdme_address(), link.wire.linuxcncrsh_address()) {
                 (Some(_), _) => {
                     "its server keeps no job, so there is none to end; see at the machine that the probe is clear"
                 }

@@ -8,7 +8,7 @@ use std::time::SystemTime;
 use clap::Args;
 use regrind::cell::{Actor, Beginning, CellPlan, Ending, TABLE_VERSION};
 use regrind::config::{BUILT_IN, CellConfig, Link};
-use regrind::device::{Line, Wire};
+use regrind::device::{LineAddress, Wire};
 use regrind::drive::Task;
 use regrind::formats::{LEARNED, Learned, LearnedError, TaughtBy};
 use regrind::journal::{AuditKey, Header, Journal, free_bytes, utc_to_the_second};
@@ -85,6 +85,11 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let recipe = check::or_show(Recipe::read(&arguments.recipe))?;
     let mut cell = check::or_show(CellConfig::read(&arguments.cell))?;
+    for (path, notes) in [(&arguments.recipe, recipe.notes()), (&arguments.cell, cell.renamed_keys())] {
+        for note in notes.iter().filter(|_| !arguments.json) {
+            super::print(&format!("note     {}, {note}\n", path.display()))?;
+        }
+    }
     if arguments.rehearsal && !cell.is_by_person() {
         return Err(Failure::NoRehearsal { cell: arguments.cell.clone() });
     }
@@ -172,7 +177,7 @@ async fn carry_out(
     place.in_record(&mut header.content);
     let mut journal = begin(header, &live, earlier.and_then(|earlier| earlier.learned), key)?;
     drop(turn);
-    let works_by_program = cell.grinder.link.wire.works_from_run() || cell.grinder.program.folder.is_some();
+    let works_by_program = cell.grinder.link.wire.reads_run_folder() || cell.grinder.program.folder.is_some();
     if task.learned.is_some() || works_by_program {
         record_first_correction(&task, &mut journal)?;
     }
@@ -288,9 +293,9 @@ fn others_in_words(others: &TaughtBy) -> String {
 /// Returns true if the machines of a cell are simulated in this process. Only then can a port be left open.
 pub(super) fn within(cell: &CellConfig) -> bool {
     let open = |link: &Link| {
-        matches!(link.wire.line(), Some((Line::Tcp { port: 0, .. }, _)))
-            || matches!(link.wire.dme(), Some((_, 0)))
-            || matches!(&link.wire, Wire::HitLines(wire) if wire.is_open())
+        matches!(link.wire.modbus_line(), Some((LineAddress::Tcp { port: 0, .. }, _)))
+            || matches!(link.wire.ippdme_address(), Some((_, 0)))
+            || matches!(&link.wire, Wire::HitLines(wire) if wire.has_dynamic_address())
     };
     cell.simulated && (open(&cell.cmm.link) || open(&cell.grinder.link))
 }

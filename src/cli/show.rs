@@ -51,7 +51,7 @@ impl Show {
             head: format!("{}, {}", recipe.part.name, recipe.path().display()),
             tolerance,
             folder: folder.display().to_string(),
-            is_chosen: recipe.measuring.mode == Mode::Adaptive,
+            is_chosen: recipe.measure.mode == Mode::Adaptive,
             bar: (!json && io::stderr().is_terminal()).then(bar),
             said: None,
             job: None,

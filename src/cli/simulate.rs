@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::config::{CellConfig, Link};
-use regrind::device::{HitLine, Line};
+use regrind::device::{HitSource, LineAddress};
 use regrind::recipe::Recipe;
 use serde_json::{Value, json};
 
@@ -68,13 +68,15 @@ async fn until_stopped() -> Result<Outcome, Failure> {
 
 /// Returns the address of a machine. An open port is replaced by the assigned one.
 fn wire(link: &Link) -> Value {
-    match link.wire.line() {
-        Some((Line::Tcp { host, port }, unit)) => json!({ "host": host, "port": port, "unit": unit }),
-        Some((Line::Rtu { device, baud, .. }, unit)) => json!({ "device": device, "baud": baud, "unit": unit }),
-        None => match (link.wire.dme(), link.wire.hit_line(), link.wire.rsh()) {
+    match link.wire.modbus_line() {
+        Some((LineAddress::Tcp { host, port }, unit)) => json!({ "host": host, "port": port, "unit": unit }),
+        Some((LineAddress::Rtu { device, baud, .. }, unit)) => json!({ "device": device, "baud": baud, "unit": unit }),
+        None => match (link.wire.ippdme_address(), link.wire.hit_source(), link.wire.linuxcncrsh_address()) {
             (Some((host, port)), ..) => json!({ "host": host, "port": port, "kind": "ippdme" }),
-            (None, Some(HitLine::Tcp { host, port }), _) => json!({ "host": host, "port": port, "kind": "hit-lines" }),
-            (None, Some(HitLine::Serial { device, .. }), _) => json!({ "device": device, "kind": "hit-lines" }),
+            (None, Some(HitSource::Tcp { host, port }), _) => {
+                json!({ "host": host, "port": port, "kind": "hit-lines" })
+            }
+            (None, Some(HitSource::Serial { device, .. }), _) => json!({ "device": device, "kind": "hit-lines" }),
             (None, None, Some((host, port))) => json!({ "host": host, "port": port, "kind": "linuxcnc" }),
             (None, None, None) => Value::Null,
         },

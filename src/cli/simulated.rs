@@ -6,21 +6,21 @@ use std::time::SystemTime;
 
 use regrind::compensation::path::Pattern;
 use regrind::config::{CellConfig, Link, RotaryLetter};
-use regrind::device::{Coordinates, HitLine, HitLinesWire, IppdmeWire, Line, RegisterMap, Wire};
+use regrind::device::{Coordinates, HitLinesWire, HitSource, IppdmeWire, LineAddress, RegisterMap, Wire};
 use regrind::formats::{AddedLines, FormatError, ResultFolder, ScratchFolder, place_link, remove_link};
 use regrind::journal::utc;
 use regrind::recipe::{Recipe, Wheel};
-use regrind_sim::cmm::Led;
+use regrind_sim::cmm::TouchProbe;
 use regrind_sim::head::Head;
-use regrind_sim::options::{Layout, MachineOptions};
+use regrind_sim::options::{MachineOptions, RegisterLayout};
 use regrind_sim::process::Programs;
 use regrind_sim::program::Control;
-use regrind_sim::registers::Machine;
-use regrind_sim::seen::Seen;
+use regrind_sim::registers::SimulatedMachine;
+use regrind_sim::seen::LogEntry;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::dme::ServingDme;
 use regrind_sim::wire::executed::ExecutedPath;
-use regrind_sim::wire::faults::Faults;
+use regrind_sim::wire::faults::SharedFaultPlan;
 use regrind_sim::wire::hits::ServingHits;
 use regrind_sim::wire::rtu;
 use regrind_sim::wire::{Serving, SharedMachine};
@@ -55,7 +55,7 @@ struct Witnessed<'a> {
     machine: &'a str,
     unit: u8,
     #[serde(flatten)]
-    seen: &'a Seen,
+    seen: &'a LogEntry,
 }
 
 impl Drop for SimulatedCell {
@@ -109,12 +109,12 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
         let Wire::Ippdme(wire) = &mut cell.cmm.link.wire else {
             return Err(failed("beside LinuxCNC only a measuring machine behind I++ DME is simulated".into()));
         };
-        simulated.serve_dme(wire, world.led(), speed, probe_radius_mm, path).await.map_err(&failed)?;
+        simulated.serve_dme(wire, world.touch_probe(), speed, probe_radius_mm, path).await.map_err(&failed)?;
         return Ok(simulated);
     }
     let line = |link: &Link| {
         let none = "a machine that a person serves cannot be simulated; its part is yours to play";
-        link.wire.line().ok_or_else(|| failed(none.into()))
+        link.wire.modbus_line().ok_or_else(|| failed(none.into()))
     };
     if recipe.grinding.tilt.is_some() && cell.grinder.program.folder.is_none() {
         let why = "without programs the simulated grinder grinds upright, and grinding.tilt tilts the wheel; write grinder.program.folder";
@@ -124,23 +124,23 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
         Some(programs) => world.grinder().by_programs(programs),
         None => world.grinder(),
     };
-    let grinder = Machine::new(Box::new(grinder), boot_id(), options(&cell.grinder.link, speed, seed + 1));
+    let grinder = SimulatedMachine::new(Box::new(grinder), boot_id(), options(&cell.grinder.link, speed, seed + 1));
     let (of_grinder, unit) = line(&cell.grinder.link)?;
     let grinder = (unit, grinder.into());
     if let Wire::Ippdme(wire) = &mut cell.cmm.link.wire {
-        simulated.serve_dme(wire, world.led(), speed, probe_radius_mm, None).await.map_err(&failed)?;
+        simulated.serve_dme(wire, world.touch_probe(), speed, probe_radius_mm, None).await.map_err(&failed)?;
         let port = simulated.serve(&of_grinder, vec![grinder]).await.map_err(&failed)?;
         set_port(&mut cell.grinder.link.wire, port);
         return Ok(simulated);
     }
     if let Wire::HitLines(wire) = &mut cell.cmm.link.wire {
         let folder = path.parent().unwrap_or(Path::new(""));
-        simulated.serve_hits(wire, folder, world.led(), [speed, probe_radius_mm]).await.map_err(&failed)?;
+        simulated.serve_hits(wire, folder, world.touch_probe(), [speed, probe_radius_mm]).await.map_err(&failed)?;
         let port = simulated.serve(&of_grinder, vec![grinder]).await.map_err(&failed)?;
         set_port(&mut cell.grinder.link.wire, port);
         return Ok(simulated);
     }
-    let cmm = Machine::new(Box::new(world.cmm()), boot_id(), options(&cell.cmm.link, speed, seed));
+    let cmm = SimulatedMachine::new(Box::new(world.cmm()), boot_id(), options(&cell.cmm.link, speed, seed));
     let (of_cmm, unit) = line(&cell.cmm.link)?;
     let cmm = (unit, cmm.into());
     if of_cmm == of_grinder {
@@ -222,7 +222,7 @@ impl SimulatedCell {
             let (unit, lines) = (*unit, lines.clone());
             machine.with(|machine| {
                 let name = machine.name();
-                machine.witness(Box::new(move |seen| {
+                machine.set_observer(Box::new(move |seen| {
                     let utc = utc(SystemTime::now());
                     lines.add(&Witnessed { utc, machine: &name, unit, seen });
                 }));
@@ -235,14 +235,14 @@ impl SimulatedCell {
     async fn serve_dme(
         &mut self,
         wire: &mut IppdmeWire,
-        probe: Led,
+        probe: TouchProbe,
         speed: f64,
         radius_mm: f64,
         grinder: Option<ExecutedPath>,
     ) -> Result<(), String> {
         let tools = vec![("NoTool".to_owned(), 0.0), (wire.tool.clone(), radius_mm)];
-        let machine = dme::machine::Machine::new(probe, dme::machine::Options { tools, ..Default::default() });
-        let server = dme::Server::new(machine, speed, dme::faults::Faults::none());
+        let machine = dme::machine::DmeMachine::new(probe, dme::machine::Options { tools, ..Default::default() });
+        let server = dme::Server::new(machine, speed, dme::faults::CommandFaults::none());
         let (host, port) = (wire.host.clone(), wire.port);
         let serving = ServingDme::tcp_after((host.as_str(), port), server, grinder)
             .await
@@ -259,7 +259,7 @@ impl SimulatedCell {
         &mut self,
         wire: &mut HitLinesWire,
         cell_folder: &Path,
-        probe: Led,
+        probe: TouchProbe,
         [speed, radius_mm]: [f64; 2],
     ) -> Result<(), String> {
         let own = match &wire.plan_folder {
@@ -271,8 +271,8 @@ impl SimulatedCell {
             (own, _) => own.as_ref().map(|own| own.path().to_owned()).unwrap_or_default(),
         };
         wire.plan_folder = Some(folder.display().to_string());
-        let mut serving = match wire.line() {
-            HitLine::Tcp { host, port } => {
+        let mut serving = match wire.source() {
+            HitSource::Tcp { host, port } => {
                 let serving = ServingHits::tcp((host.as_str(), port)).await.map_err(|e| {
                     format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it")
                 })?;
@@ -280,10 +280,10 @@ impl SimulatedCell {
                 self.places.push(format!("hit lines {host}:{}", wire.port));
                 serving
             }
-            HitLine::Serial { device, .. } => {
+            HitSource::Serial { device, .. } => {
                 let serving = ServingHits::serial().map_err(|e| format!("no pseudo-terminal can be had: {e}"))?;
                 let terminal = serving.path().map(Path::to_owned).unwrap_or_default();
-                if wire.is_open() {
+                if wire.has_dynamic_address() {
                     wire.device = Some(terminal.display().to_string());
                 } else {
                     self.link(&terminal, &device)?;
@@ -295,10 +295,10 @@ impl SimulatedCell {
         let options = hits::Options {
             style: style(wire),
             radius_mm,
-            contacts: wire.what == Some(Coordinates::Contacts),
+            contacts: wire.coordinates == Some(Coordinates::Contacts),
             search_mm: [2.0, 2.0],
         };
-        serving.run(hits::Program::new(probe, options, hits::faults::Faults::none()), &folder, speed);
+        serving.run(hits::PartProgram::new(probe, options, hits::faults::PrintFaults::none()), &folder, speed);
         self.hits = Some((serving, own));
         Ok(())
     }
@@ -315,10 +315,10 @@ impl SimulatedCell {
         Ok(())
     }
 
-    async fn serve(&mut self, line: &Line, units: Vec<(u8, SharedMachine)>) -> Result<u16, String> {
+    async fn serve(&mut self, line: &LineAddress, units: Vec<(u8, SharedMachine)>) -> Result<u16, String> {
         let names: Vec<String> = units.iter().map(|(unit, _)| format!("unit {unit}")).collect();
         match line {
-            Line::Tcp { host, port } => {
+            LineAddress::Tcp { host, port } => {
                 let serving = Serving::tcp((host.as_str(), *port), units).await.map_err(|e| {
                     format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it")
                 })?;
@@ -327,8 +327,8 @@ impl SimulatedCell {
                 self.servings.push(serving);
                 Ok(bound)
             }
-            Line::Rtu { device, baud, .. } => {
-                let serving = Serving::rtu(units, rtu::Line::paced(*baud), Faults::none())
+            LineAddress::Rtu { device, baud, .. } => {
+                let serving = Serving::rtu(units, rtu::Line::paced(*baud), SharedFaultPlan::none())
                     .map_err(|e| format!("no pseudo-terminal can be had for {device}: {e}"))?;
                 let terminal = serving.path().map(Path::to_owned).unwrap_or_default();
                 self.link(&terminal, device)?;
@@ -351,7 +351,7 @@ fn list_folder() -> Result<ScratchFolder, FormatError> {
 /// Returns the print format of the machine from the cell file.
 fn style(wire: &HitLinesWire) -> hits::print::Style {
     use regrind::device::hit_lines::Separator;
-    let reading = wire.reading();
+    let reading = wire.parser();
     hits::print::Style {
         letters: reading.format.is_lettered(),
         whole: reading.format.is_integer(),
@@ -386,8 +386,8 @@ fn options(link: &Link, speed: f64, seed: u64) -> MachineOptions {
     }
 }
 
-fn layout(r: &RegisterMap) -> Layout {
-    Layout {
+fn layout(r: &RegisterMap) -> RegisterLayout {
+    RegisterLayout {
         identity: r.identity,
         sync: r.sync,
         beat: r.beat,

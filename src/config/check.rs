@@ -7,8 +7,8 @@ use super::written::{
     CellFile, FixtureTable, GrinderTable, RotaryTable, SphereTable, TimingTable, TravelTable, Turns, UncertaintyTable,
 };
 use super::{CellConfig, Cmm, Grinder, GrinderLimits, Link, Programming, ReferenceSphere, Rotary, Travel, dialect};
-use crate::device::{Place, RegisterMap, Signal, SignalTable, Timing, Wire};
-use crate::document::Document;
+use crate::device::{MachineTable, RegisterMap, Signal, SignalTable, Timing, Wire};
+use crate::document::{Document, sha256};
 use crate::formats::gcode::{DialectError, LINUXCNC};
 use crate::geometry::{Point, Pose, Twist};
 use crate::model;
@@ -24,7 +24,7 @@ pub(super) struct Checked {
 
 impl Checked {
     /// Returns the cell, or `None` if a value is missing.
-    pub(super) fn into_cell(self, path: &Path, text: &str, source_sha256: [u8; 32]) -> Option<CellConfig> {
+    pub(super) fn into_cell(self, path: &Path, text: &str, renamed: Vec<String>) -> Option<CellConfig> {
         Some(CellConfig {
             name: self.name?,
             simulated: self.simulated?,
@@ -34,7 +34,8 @@ impl Checked {
             grinder: self.grinder?,
             path: path.to_owned(),
             text: text.to_owned(),
-            source_sha256,
+            source_sha256: sha256(text),
+            renamed,
         })
     }
 }
@@ -79,7 +80,7 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
     }
     let [cmm_link, grinder_link] = machines.map(|machine| machine.link(simulated, document));
     if let (Some(cmm), Some(grinder)) = (&cmm_link, &grinder_link) {
-        cmm.wire.check_beside(&grinder.wire, document);
+        cmm.wire.check_against_grinder(&grinder.wire, document);
     }
     let sphere = cmm.reference_sphere.as_ref().map(|sphere| reference_sphere(sphere, cmm.travel.as_ref(), document));
     let travel = cmm.travel.as_ref().map(|travel| self::travel(travel, "cmm", document));
@@ -113,11 +114,11 @@ impl Machine<'_> {
     }
 
     fn link(&self, simulated: Option<bool>, document: &mut Document) -> Option<Link> {
-        let place = Place { table: self.key, simulated };
+        let place = MachineTable { table: self.key, simulated };
         let timing = self.timing(document);
         let registers = self.registers.copied().unwrap_or_default();
         registers.check(&place, document);
-        let signals = Signal::all(self.signals, registers.word_order, &place, document);
+        let signals = Signal::from_tables(self.signals, registers.word_order, &place, document);
         let wire = self.wire?;
         wire.check(&place, document);
         if !wire.has_registers() {
@@ -251,7 +252,7 @@ fn reference_sphere(
     document: &mut Document,
 ) -> Option<ReferenceSphere> {
     let (centre_mm, radius_mm) = (written.centre_mm?, written.radius_mm?);
-    if let Some((least, most)) = travel.and_then(|travel| travel.least_mm.zip(travel.most_mm))
+    if let Some((least, most)) = travel.and_then(|travel| travel.min_mm.zip(travel.max_mm))
         && (0..3).all(|k| least[k] < most[k])
         && (0..3).any(|k| !(least[k]..=most[k]).contains(&centre_mm[k]))
     {
@@ -268,16 +269,11 @@ fn reference_sphere(
 }
 
 fn travel(written: &TravelTable, machine: &str, document: &mut Document) -> Option<Travel> {
-    let (least_mm, most_mm) = (written.least_mm?, written.most_mm?);
+    let (least_mm, most_mm) = (written.min_mm?, written.max_mm?);
     for (k, axis) in ["x", "y", "z"].into_iter().enumerate() {
         if least_mm[k] >= most_mm[k] {
-            let found = format!("is {} in {axis}, `most_mm` is {}", least_mm[k], most_mm[k]);
-            document.report(
-                &format!("{machine}.travel.least_mm"),
-                found,
-                "it must be less",
-                "are the two interchanged?",
-            );
+            let found = format!("is {} in {axis}, `max_mm` is {}", least_mm[k], most_mm[k]);
+            document.report(&format!("{machine}.travel.min_mm"), found, "it must be less", "are the two interchanged?");
         }
     }
     Some(Travel { least_mm, most_mm })
@@ -292,37 +288,37 @@ fn rotary(written: &RotaryTable, document: &mut Document) -> Option<Rotary> {
             "leave the table [grinder.rotary] out: the wheel then stays upright",
         );
     }
-    let (letter, range_deg) = (written.axis?, [written.least_deg?, written.most_deg?]);
+    let (letter, range_deg) = (written.axis?, [written.min_deg?, written.max_deg?]);
     if range_deg[0] >= range_deg[1] {
         document.report(
-            "grinder.rotary.least_deg",
-            format!("is {}, `most_deg` is {}", range_deg[0], range_deg[1]),
+            "grinder.rotary.min_deg",
+            format!("is {}, `max_deg` is {}", range_deg[0], range_deg[1]),
             "it must be less",
             "are the two interchanged?",
         );
     }
-    let largest_rate_deg_min = written.largest_rate_deg_min?;
-    Some(Rotary { letter, reversed: written.reversed, range_deg, largest_rate_deg_min, pivot_mm: written.pivot_mm })
+    let max_rate_deg_min = written.max_rate_deg_min?;
+    Some(Rotary { letter, reversed: written.reversed, range_deg, max_rate_deg_min, pivot_mm: written.pivot_mm })
 }
 
 fn limits(grinder: &GrinderTable, document: &mut Document) -> Option<GrinderLimits> {
     let written = &grinder.limits;
-    let wheel_radius_mm = [written.least_wheel_radius_mm?, written.largest_wheel_radius_mm?];
+    let wheel_radius_mm = [written.min_wheel_radius_mm?, written.max_wheel_radius_mm?];
     if wheel_radius_mm[0] > wheel_radius_mm[1] {
         document.report(
-            "grinder.limits.least_wheel_radius_mm",
-            format!("is {} mm, more than `largest_wheel_radius_mm`, {} mm", wheel_radius_mm[0], wheel_radius_mm[1]),
+            "grinder.limits.min_wheel_radius_mm",
+            format!("is {} mm, more than `max_wheel_radius_mm`, {} mm", wheel_radius_mm[0], wheel_radius_mm[1]),
             "no wheel would fit",
             "are the two interchanged?",
         );
     }
     Some(GrinderLimits {
-        largest_feed_mm_min: written.largest_feed_mm_min?,
+        max_feed_mm_min: written.max_feed_mm_min?,
         wheel_radius_mm,
-        largest_depth_mm: written.largest_depth_mm?,
-        largest_speed_mm_s: written.largest_speed_mm_s,
-        largest_acceleration_mm_s2: written.largest_acceleration_mm_s2,
-        largest_jerk_mm_s3: written.largest_jerk_mm_s3,
+        max_depth_mm: written.max_depth_mm?,
+        max_speed_mm_s: written.max_speed_mm_s,
+        max_acceleration_mm_s2: written.max_acceleration_mm_s2,
+        max_jerk_mm_s3: written.max_jerk_mm_s3,
         travel: grinder.travel.as_ref().and_then(|travel| self::travel(travel, "grinder", document)),
     })
 }

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use crate::device::{RegisterMap, Signal, Timing, Wire};
-use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
+use crate::document::{Document, Problems, RenamedKey, problem_at, read_text, schema_of};
 use crate::formats::gcode::Dialect;
 use crate::geometry::{Point, Pose};
 use crate::model::MachineUncertainty;
@@ -46,6 +46,8 @@ pub struct CellConfig {
     path: PathBuf,
     text: String,
     source_sha256: [u8; 32],
+    /// Notes on keys that have a new name.
+    renamed: Vec<String>,
 }
 
 /// A measuring machine.
@@ -91,7 +93,7 @@ pub struct Rotary {
     /// Minimum and maximum angle on its scale.
     pub range_deg: [f64; 2],
     /// Maximum rate.
-    pub largest_rate_deg_min: f64,
+    pub max_rate_deg_min: f64,
     /// Vector from the wheel's centre to the pivot with the head upright. `None` if the control itself keeps the centre
     /// in place.
     pub pivot_mm: Option<[f64; 3]>,
@@ -149,23 +151,51 @@ pub struct Travel {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GrinderLimits {
     /// Maximum feed.
-    pub largest_feed_mm_min: f64,
+    pub max_feed_mm_min: f64,
     /// Minimum and maximum radius of a wheel.
     pub wheel_radius_mm: [f64; 2],
     /// Maximum depth that one pass removes.
-    pub largest_depth_mm: f64,
+    pub max_depth_mm: f64,
     /// Maximum speed of an axis, if known.
-    pub largest_speed_mm_s: Option<f64>,
+    pub max_speed_mm_s: Option<f64>,
     /// Maximum acceleration of an axis, if known.
-    pub largest_acceleration_mm_s2: Option<f64>,
+    pub max_acceleration_mm_s2: Option<f64>,
     /// Maximum jerk of an axis, if known.
-    pub largest_jerk_mm_s3: Option<f64>,
+    pub max_jerk_mm_s3: Option<f64>,
     /// Travel limits of the wheel's centre in the model frame, if known.
     pub travel: Option<Travel>,
 }
 
 /// Name of the built-in simulated cell.
 pub const BUILT_IN: &str = "sim";
+
+/// Keys that have a new name since version 0.2.
+const RENAMED: &[RenamedKey] = &[
+    RenamedKey { old: "cmm.wire.what", new: "cmm.wire.coordinates" },
+    RenamedKey { old: "cmm.wire.take_earlier", new: "cmm.wire.accept_earlier_files" },
+    RenamedKey { old: "cmm.wire.apart", new: "cmm.wire.cannot_reach_part" },
+    RenamedKey { old: "cmm.wire.tries_again", new: "cmm.wire.retries" },
+    RenamedKey { old: "cmm.wire.double_within_ms", new: "cmm.wire.duplicate_window_ms" },
+    RenamedKey { old: "cmm.wire.line_within_ms", new: "cmm.wire.line_timeout_ms" },
+    RenamedKey { old: "cmm.wire.passed_over", new: "cmm.wire.ignored_prefixes" },
+    RenamedKey { old: "cmm.wire.repeated", new: "cmm.wire.repeated_touch" },
+    RenamedKey { old: "grinder.wire.take_earlier", new: "grinder.wire.accept_earlier_files" },
+    RenamedKey { old: "grinder.wire.apart", new: "grinder.wire.cannot_reach_part" },
+    RenamedKey { old: "cmm.travel.least_mm", new: "cmm.travel.min_mm" },
+    RenamedKey { old: "cmm.travel.most_mm", new: "cmm.travel.max_mm" },
+    RenamedKey { old: "grinder.travel.least_mm", new: "grinder.travel.min_mm" },
+    RenamedKey { old: "grinder.travel.most_mm", new: "grinder.travel.max_mm" },
+    RenamedKey { old: "grinder.rotary.least_deg", new: "grinder.rotary.min_deg" },
+    RenamedKey { old: "grinder.rotary.most_deg", new: "grinder.rotary.max_deg" },
+    RenamedKey { old: "grinder.rotary.largest_rate_deg_min", new: "grinder.rotary.max_rate_deg_min" },
+    RenamedKey { old: "grinder.limits.largest_feed_mm_min", new: "grinder.limits.max_feed_mm_min" },
+    RenamedKey { old: "grinder.limits.least_wheel_radius_mm", new: "grinder.limits.min_wheel_radius_mm" },
+    RenamedKey { old: "grinder.limits.largest_wheel_radius_mm", new: "grinder.limits.max_wheel_radius_mm" },
+    RenamedKey { old: "grinder.limits.largest_depth_mm", new: "grinder.limits.max_depth_mm" },
+    RenamedKey { old: "grinder.limits.largest_speed_mm_s", new: "grinder.limits.max_speed_mm_s" },
+    RenamedKey { old: "grinder.limits.largest_acceleration_mm_s2", new: "grinder.limits.max_acceleration_mm_s2" },
+    RenamedKey { old: "grinder.limits.largest_jerk_mm_s3", new: "grinder.limits.max_jerk_mm_s3" },
+];
 
 static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<written::CellFile>);
 
@@ -193,10 +223,11 @@ impl CellConfig {
     /// Returns all errors of the text.
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
+        let renamed = document.rename_keys(RENAMED);
         document.hold_against(&SCHEMA);
         let checked = document.as_written().map(|written| check::check(&written, path, &mut document));
         document.finish()?;
-        let cell = checked.and_then(|checked| checked.into_cell(path, text, sha256(text)));
+        let cell = checked.and_then(|checked| checked.into_cell(path, text, renamed));
         cell.ok_or_else(|| {
             Problems::whole(path, text, "something is missing".into(), "compare it with config/sim.toml")
         })
@@ -204,15 +235,20 @@ impl CellConfig {
 
     /// Returns a problem with a key of this file that another module found, at the key's place in the text.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
-        problem_at(&self.path, &self.text, key, [found, allowed, remedy])
+        problem_at(&self.path, &self.text, RENAMED, key, [found, allowed, remedy])
     }
 
-    /// Returns notes about the wires on this computer: serial ports that do not exist here. A note is not an error,
-    /// because the file can be checked on a computer other than the cell's.
+    /// Returns notes on keys that have a new name, and about the wires on this computer: serial ports that do not exist
+    /// here. A note is not an error, because the file can be checked on a computer other than the cell's.
     pub fn notes(&self) -> Vec<String> {
-        let mut notes = [self.cmm.link.wire.notes(), self.grinder.link.wire.notes()].concat();
+        let mut notes = [self.renamed.clone(), self.cmm.link.wire.notes(), self.grinder.link.wire.notes()].concat();
         notes.dedup();
         notes
+    }
+
+    /// Returns a note for each key that has a new name, with its line. The old names of earlier files are read.
+    pub fn renamed_keys(&self) -> &[String] {
+        &self.renamed
     }
 
     /// Returns true if every record is marked SIMULATION: the machines are simulated, or the run is a rehearsal.

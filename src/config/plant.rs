@@ -119,7 +119,7 @@ impl PlantConfig {
 
     /// Returns a problem with a key of this file that another module found, at the key's place in the text.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
-        problem_at(&self.path, &self.text, key, [found, allowed, remedy])
+        problem_at(&self.path, &self.text, &[], key, [found, allowed, remedy])
     }
 
     /// Returns the path of the plant file.

@@ -148,13 +148,13 @@ pub(super) struct RotaryTable {
     pub reversed: bool,
     /// Least angle on its scale.
     #[schemars(range(min = -360.0, max = 360.0), extend("x-required" = true), example = -60.0)]
-    pub least_deg: Option<f64>,
+    pub min_deg: Option<f64>,
     /// Largest angle on its scale.
     #[schemars(range(min = -360.0, max = 360.0), extend("x-required" = true), example = 60.0)]
-    pub most_deg: Option<f64>,
+    pub max_deg: Option<f64>,
     /// Largest rate, in degrees a minute.
     #[schemars(range(min = 0.01, max = 10000000.0), extend("x-required" = true), example = 3600.0)]
-    pub largest_rate_deg_min: Option<f64>,
+    pub max_rate_deg_min: Option<f64>,
     /// From the wheel's centre to the pivot with the head upright, in the model frame: programs then have the places of the slides. Left out, the
     /// control keeps the wheel's centre by itself, and programs have its places.
     #[schemars(inner(range(min = -10000.0, max = 10000.0)), example = [0.0, 0.0, 180.0])]
@@ -254,10 +254,10 @@ pub(super) struct SphereTable {
 pub(super) struct TravelTable {
     /// Least x, y, z.
     #[schemars(extend("x-required" = true), inner(range(min = -1e5, max = 1e5)), example = [-300.0, -300.0, -200.0])]
-    pub least_mm: Option<[f64; 3]>,
+    pub min_mm: Option<[f64; 3]>,
     /// Largest x, y, z.
     #[schemars(extend("x-required" = true), inner(range(min = -1e5, max = 1e5)), example = [300.0, 300.0, 200.0])]
-    pub most_mm: Option<[f64; 3]>,
+    pub max_mm: Option<[f64; 3]>,
 }
 
 /// What a grinder can do.
@@ -266,25 +266,25 @@ pub(super) struct TravelTable {
 pub(super) struct LimitsTable {
     /// Largest feed.
     #[schemars(range(min = 0.1, max = 1000000.0), extend("x-required" = true), example = 3000.0)]
-    pub largest_feed_mm_min: Option<f64>,
+    pub max_feed_mm_min: Option<f64>,
     /// Smallest radius of a wheel.
     #[schemars(range(min = 0.1, max = 1000.0), extend("x-required" = true), example = 2.0)]
-    pub least_wheel_radius_mm: Option<f64>,
+    pub min_wheel_radius_mm: Option<f64>,
     /// Largest radius of a wheel.
     #[schemars(range(min = 0.1, max = 1000.0), extend("x-required" = true), example = 100.0)]
-    pub largest_wheel_radius_mm: Option<f64>,
+    pub max_wheel_radius_mm: Option<f64>,
     /// Most that one pass may take off.
     #[schemars(range(min = 0.00001, max = 100.0), extend("x-required" = true), example = 0.2)]
-    pub largest_depth_mm: Option<f64>,
+    pub max_depth_mm: Option<f64>,
     /// Largest speed of an axis.
     #[schemars(range(min = 0.01, max = 100000.0))]
-    pub largest_speed_mm_s: Option<f64>,
+    pub max_speed_mm_s: Option<f64>,
     /// Largest acceleration of an axis.
     #[schemars(range(min = 0.1, max = 10000000.0))]
-    pub largest_acceleration_mm_s2: Option<f64>,
+    pub max_acceleration_mm_s2: Option<f64>,
     /// Largest change of the acceleration of an axis in time, its jerk.
     #[schemars(range(min = 0.1, max = 1000000000.0))]
-    pub largest_jerk_mm_s3: Option<f64>,
+    pub max_jerk_mm_s3: Option<f64>,
 }
 
 impl Default for TimingTable {

@@ -125,7 +125,7 @@ pub enum Next {
 impl fmt::Display for Next {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::Nothing => "nothing: the cell works by itself",
+            Self::Nothing => "no action needed",
             Self::Load => {
                 "load the part, clamp it, see that wheel and probe are clear of it; then: regrind confirm loaded"
             }

@@ -7,35 +7,35 @@ use regrind_core::geometry::{Point, Vector, fit_rigid};
 
 /// Reason why a measurement does not belong to the plan.
 #[derive(Clone, Debug, Error, PartialEq)]
-pub enum BesidePlan {
+pub enum PlanMismatch {
     /// The points equal the points of the plan.
     #[error("it is the plan itself, to its last digit, and no measurement; export what was measured")]
-    GivenBack,
+    EqualsPlan,
     /// Points that are too far from their targets, for every pose of the part in its fixture.
     #[error(
-        "touched point {number} lies {off_mm:.3} mm from its target when all are laid on the plan, turned by {turned_deg:.1} degrees; at most {limit_mm:.1} mm \
-         and {MOST_TURNED_DEG:.0} degrees can be: are the rows in the order of the plan, and is it the plan of this part?"
+        "touched point {number} lies {distance_mm:.3} mm from its target when all are laid on the plan, turned by {rotation_deg:.1} degrees; at most {limit_mm:.1} mm \
+         and {MAX_ROTATION_DEG:.0} degrees can be: are the rows in the order of the plan, and is it the plan of this part?"
     )]
-    Elsewhere {
+    OffTarget {
         /// Position of the worst point among the touched points of the part, from 1.
         number: usize,
         /// Distance of this point from its target after the rigid fit, in mm.
-        off_mm: f64,
+        distance_mm: f64,
         /// Largest distance that is possible, in mm.
         limit_mm: f64,
         /// Rotation angle of the rigid motion that fits the points best, in degrees.
-        turned_deg: f64,
+        rotation_deg: f64,
     },
 }
 
 /// Largest rotation that is plausible, because the part lies in its fixture. If the plan fits only with a larger
 /// rotation, the points were measured in another order.
-const MOST_TURNED_DEG: f64 = 30.0;
+const MAX_ROTATION_DEG: f64 = 30.0;
 /// Allowance in addition to approach and search for the place where a touch ends, in mm.
-const ASIDE_MM: f64 = 1.0;
+const TOUCH_ALLOWANCE_MM: f64 = 1.0;
 /// Largest relative difference in size. A larger difference is not caused by the order of the points: points in another
 /// order have the size of the plan.
-const OTHER_SIZE: f64 = 0.02;
+const MAX_SIZE_DIFFERENCE: f64 = 0.02;
 
 impl Plan {
     /// Compares a measurement with this plan, point by point.
@@ -44,36 +44,36 @@ impl Plan {
     /// points of the part are compared.
     ///
     /// # Errors
-    /// * [`BesidePlan::GivenBack`]: the points equal the planned points, to the last digit that they have.
-    /// * [`BesidePlan::Elsewhere`]: a point is too far from its target, or the fit needs too large a rotation.
-    pub fn check(&self, measurement: &Measurement) -> Result<(), BesidePlan> {
+    /// * [`PlanMismatch::EqualsPlan`]: the points equal the planned points, to the last digit that they have.
+    /// * [`PlanMismatch::OffTarget`]: a point is too far from its target, or the fit needs too large a rotation.
+    pub fn check(&self, measurement: &Measurement) -> Result<(), PlanMismatch> {
         let pairs = measurement.points.iter().zip(&self.targets);
-        let part = pairs.filter(|(p, t)| p.status == PointStatus::Touched && t.what == TargetKind::Part);
+        let part = pairs.filter(|(p, t)| p.status == PointStatus::Touched && t.kind == TargetKind::Part);
         let radius_mm = if measurement.coordinates == Coordinates::Centres { self.probe_radius_mm } else { 0.0 };
         let (mut found, mut contacts, mut wanted) = (Vec::new(), Vec::new(), Vec::new());
         for (point, target) in part {
-            found.push(Point::from(point.at_mm));
+            found.push(Point::from(point.position_mm));
             contacts.push(Point::from(target.point_mm));
             wanted.push(Point::from(target.point_mm) + Vector::from(target.normal) * radius_mm);
         }
-        if is_given_back(&found, &contacts) || is_given_back(&found, &wanted) {
-            return Err(BesidePlan::GivenBack);
+        if equals_plan(&found, &contacts) || equals_plan(&found, &wanted) {
+            return Err(PlanMismatch::EqualsPlan);
         }
         // Points of another size have another unit or belong to another part. Other checks report that better.
-        if (size(&found) / size(&wanted) - 1.0).abs() > OTHER_SIZE {
+        if (size(&found) / size(&wanted) - 1.0).abs() > MAX_SIZE_DIFFERENCE {
             return Ok(());
         }
         // Fewer than three points, or points on a line, determine no pose.
         let Ok(fit) = fit_rigid(&wanted, &found) else { return Ok(()) };
         let off_mm = fit.residuals_mm.iter().map(Vector::norm).enumerate();
         let Some((worst, off_mm)) = off_mm.max_by(|a, b| a.1.total_cmp(&b.1)) else { return Ok(()) };
-        let limit_mm = self.search_mm + self.approach_mm + ASIDE_MM;
+        let limit_mm = self.search_mm + self.approach_mm + TOUCH_ALLOWANCE_MM;
         // If the points are almost on a line, noise alone can cause a rotation about this line.
-        let turned_deg = if is_strip(&wanted) { 0.0 } else { fit.pose.angle_rad().to_degrees() };
-        if off_mm <= limit_mm && turned_deg <= MOST_TURNED_DEG {
+        let turned_deg = if is_nearly_collinear(&wanted) { 0.0 } else { fit.pose.angle_rad().to_degrees() };
+        if off_mm <= limit_mm && turned_deg <= MAX_ROTATION_DEG {
             return Ok(());
         }
-        Err(BesidePlan::Elsewhere { number: worst + 1, off_mm, limit_mm, turned_deg })
+        Err(PlanMismatch::OffTarget { number: worst + 1, distance_mm: off_mm, limit_mm, rotation_deg: turned_deg })
     }
 }
 
@@ -86,8 +86,8 @@ fn size(points: &[Point]) -> f64 {
 
 /// Returns true if points lie almost on a line: their largest distance from it is at most a tenth of the longest
 /// distance from their centroid.
-fn is_strip(points: &[Point]) -> bool {
-    const LEAST_SHARE: f64 = 0.1;
+fn is_nearly_collinear(points: &[Point]) -> bool {
+    const MAX_WIDTH_SHARE: f64 = 0.1;
     let count = points.len().max(1) as f64;
     let middle = points.iter().map(|p| p.coords).sum::<Vector>() / count;
     let arms = || points.iter().map(|p| p.coords - middle);
@@ -95,16 +95,16 @@ fn is_strip(points: &[Point]) -> bool {
     let longest2 = along.norm_squared();
     let aside2 =
         arms().map(|arm| along.cross(&arm).norm_squared() / longest2.max(f64::MIN_POSITIVE)).fold(0.0, f64::max);
-    aside2 <= LEAST_SHARE * LEAST_SHARE * longest2
+    aside2 <= MAX_WIDTH_SHARE * MAX_WIDTH_SHARE * longest2
 }
 
 /// Returns true if points equal the planned points, rounded to the digits that they have. In a real measurement at
 /// least one touch ends somewhere else than planned.
-fn is_given_back(found: &[Point], planned: &[Point]) -> bool {
+fn equals_plan(found: &[Point], planned: &[Point]) -> bool {
     /// Minimum number of points; fewer can agree by chance.
-    const LEAST: usize = 3;
+    const MIN_POINTS: usize = 3;
     let is_same = |(p, q): (&Point, &Point)| p.iter().zip(q.iter()).all(|(p, q)| (p - q).abs() <= rounding_mm(*p));
-    found.len() >= LEAST && found.iter().zip(planned).all(is_same)
+    found.len() >= MIN_POINTS && found.iter().zip(planned).all(is_same)
 }
 
 /// Returns the largest rounding error of a coordinate in mm, from its number of decimals. A file with a fixed number of
@@ -130,7 +130,7 @@ mod tests {
             let (x, y) = (8.0 * f64::from(k % 5) - 16.0, 8.0 * f64::from(k / 5) - 12.0);
             let normal = Vector::new(-x / 100.0, -y / 100.0, 1.0).normalize();
             let point_mm = [x, y, (x * x + y * y) / 200.0];
-            Target { index: k, what: TargetKind::Part, point_mm, normal: normal.into() }
+            Target { index: k, kind: TargetKind::Part, point_mm, normal: normal.into() }
         };
         Plan {
             targets: (0..20).map(target).collect(),
@@ -139,7 +139,7 @@ mod tests {
             search_mm: 2.0,
             speed_mm_s: 5.0,
             safe_height_mm: 50.0,
-            careful: None,
+            careful_start: None,
         }
     }
 
@@ -170,7 +170,7 @@ mod tests {
             let target = &plan.targets[order(k)];
             let centre = Point::from(target.point_mm) + Vector::from(target.normal) * (1.5 + error_mm(k));
             let at_mm = [centre.x, centre.y, centre.z].map(|v| (v * scale).round() / scale);
-            MeasuredPoint { index: k as u32, status: PointStatus::Touched, quality: 0, at_mm }
+            MeasuredPoint { index: k as u32, status: PointStatus::Touched, quality: 0, position_mm: at_mm }
         };
         measurement((0..plan.targets.len()).map(touch).collect(), Coordinates::Centres)
     }
@@ -179,7 +179,7 @@ mod tests {
     fn the_plan_given_back_is_no_measurement_in_any_number_of_digits() {
         let plan = plan();
         for digits in [3, 4, 6, 9] {
-            assert_eq!(plan.check(&measured(&plan, digits, |_| 0.0, |k| k)), Err(BesidePlan::GivenBack), "{digits}");
+            assert_eq!(plan.check(&measured(&plan, digits, |_| 0.0, |k| k)), Err(PlanMismatch::EqualsPlan), "{digits}");
             // If a point is off by a few units of its last digit, the part was measured.
             let part = |k: usize| if k == 7 { 5.0 * 10f64.powi(-digits) } else { 0.0 };
             assert_eq!(plan.check(&measured(&plan, digits, part, |k| k)), Ok(()), "{digits}");
@@ -188,19 +188,19 @@ mod tests {
             index: target.index,
             status: PointStatus::Touched,
             quality: 0,
-            at_mm: target.point_mm,
+            position_mm: target.point_mm,
         };
         let given_back = measurement(plan.targets.iter().map(contacts).collect(), Coordinates::Contacts);
-        assert_eq!(plan.check(&given_back), Err(BesidePlan::GivenBack));
+        assert_eq!(plan.check(&given_back), Err(PlanMismatch::EqualsPlan));
         // Seven significant digits, as many programs print: some values have five decimals, others six.
         let significant = |v: f64| -> f64 {
             let decimals = 6 - v.abs().max(1e-6).log10().floor() as i32;
             (v * 10f64.powi(decimals)).round() / 10f64.powi(decimals)
         };
         let mut rounded = measured(&plan, 12, |_| 0.0, |k| k);
-        rounded.points.iter_mut().for_each(|point| point.at_mm = point.at_mm.map(significant));
-        assert_eq!(plan.check(&rounded), Err(BesidePlan::GivenBack));
-        rounded.points[3].at_mm[2] += 2e-5;
+        rounded.points.iter_mut().for_each(|point| point.position_mm = point.position_mm.map(significant));
+        assert_eq!(plan.check(&rounded), Err(PlanMismatch::EqualsPlan));
+        rounded.points[3].position_mm[2] += 2e-5;
         assert_eq!(plan.check(&rounded), Ok(()));
     }
 
@@ -221,7 +221,7 @@ mod tests {
         }];
         for order in orders {
             let found = plan.check(&measured(&plan, 6, form, order));
-            assert!(matches!(found, Err(BesidePlan::Elsewhere { .. })), "{found:?}");
+            assert!(matches!(found, Err(PlanMismatch::OffTarget { .. })), "{found:?}");
         }
         // Three points in a row are touched again. The middle one has a burr that is higher than the row is bent, so
         // the fit rotates the row about its own line.
@@ -231,7 +231,7 @@ mod tests {
         assert_eq!(row.check(&measured(&row, 6, burr, |k| k)), Ok(()));
         // Inches are reported by the measurement of a sphere or by the fit.
         let mut inches = measured(&plan, 6, form, |k| k);
-        inches.points.iter_mut().for_each(|point| point.at_mm = point.at_mm.map(|v| v / 25.4));
+        inches.points.iter_mut().for_each(|point| point.position_mm = point.position_mm.map(|v| v / 25.4));
         assert_eq!(plan.check(&inches), Ok(()));
     }
 }

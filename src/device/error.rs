@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::{Answer, Command, Fault, Job, MachineKind, State};
 
 /// Answer of a machine, or the reason why there is no answer.
-pub(super) type Answered<T> = Result<T, DeviceError>;
+pub(super) type DeviceResult<T> = Result<T, DeviceError>;
 
 /// Error of the communication with a machine, or refusal by the machine.
 ///
@@ -21,34 +21,34 @@ pub enum DeviceError {
     /// There is no connection, and none could be made within the time limit.
     #[error(
         "{machine} cannot be reached ({}) within {} ms: check that it is switched on, its cable, and address and port in the cell file",
-        kind_in_words(*.why), .limit.as_millis()
+        kind_in_words(*.kind), .limit.as_millis()
     )]
-    Unreachable { machine: Arc<str>, why: std::io::ErrorKind, limit: Duration },
+    Unreachable { machine: Arc<str>, kind: std::io::ErrorKind, limit: Duration },
     /// The connection exists, but no answer arrived in time.
     #[error(
-        "{machine} did not answer ({what}) within {} ms: check the line and its load, unit number and, on a serial line, baud rate and \
+        "{machine} did not answer ({operation}) within {} ms: check the line and its load, unit number and, on a serial line, baud rate and \
          parity",
         .limit.as_millis()
     )]
-    TimedOut { machine: Arc<str>, what: &'static str, limit: Duration },
+    TimedOut { machine: Arc<str>, operation: &'static str, limit: Duration },
     /// The machine, or a device between, closed the connection.
     #[error(
-        "{machine} closed the connection ({what}): another client may have taken its only place, or it was restarted"
+        "{machine} closed the connection ({operation}): another client may have taken its only place, or it was restarted"
     )]
-    Disconnected { machine: Arc<str>, what: &'static str },
+    Disconnected { machine: Arc<str>, operation: &'static str },
     /// The received data are inconsistent: wrong length, echo, checksum or page.
     #[error(
-        "{machine} sent a {what} that does not hold: expected {expected:#x}, found {found:#x}; nothing of it was used. If it happens \
+        "{machine} sent a {data} that does not hold: expected {expected:#x}, found {found:#x}; nothing of it was used. If it happens \
          again check cable, shielding and end resistors, and that no second client is on the line"
     )]
-    Corrupt { machine: Arc<str>, what: &'static str, expected: u64, found: u64 },
+    Corrupt { machine: Arc<str>, data: &'static str, expected: u64, found: u64 },
     /// The connection works, but the machine's application has stopped.
     #[error(
         "{machine} answers, but its application stands: its beat has been {beat} for {} ms (limit {} ms). Look at the machine; what it \
          says cannot be relied on",
-        .still.as_millis(), .limit.as_millis()
+        .unchanged_for.as_millis(), .limit.as_millis()
     )]
-    Frozen { machine: Arc<str>, beat: u16, still: Duration, limit: Duration },
+    Frozen { machine: Arc<str>, beat: u16, unchanged_for: Duration, limit: Duration },
     /// A command was written several times and never acknowledged. The driver knows that the machine did not act upon
     /// it later.
     #[error(
@@ -59,18 +59,18 @@ pub enum DeviceError {
     /// It is unknown whether the job was begun. The start is never repeated; see
     /// [`Machine::reconcile`](super::Machine::reconcile).
     #[error(
-        "{machine}: it is not known whether {job} was begun by START number {sequence} ({why}). It is not sent again; the machine has to \
+        "{machine}: it is not known whether {job} was begun by START number {sequence} ({cause}). It is not sent again; the machine has to \
          be asked, or looked at"
     )]
-    StartUnknown { machine: Arc<str>, job: Job, sequence: u32, why: Box<DeviceError> },
+    StartUnknown { machine: Arc<str>, job: Job, sequence: u32, cause: Box<DeviceError> },
     /// The transfer was interrupted by its [`Interrupt`](super::Interrupt).
     #[error(
-        "{machine}: the transfer of the {what} was broken off after {done} of {of} pages, as asked; nothing of it is in force"
+        "{machine}: the transfer of the {payload} was broken off after {done} of {total} pages, as asked; nothing of it is in force"
     )]
-    Interrupted { machine: Arc<str>, what: &'static str, done: u32, of: u32 },
+    Interrupted { machine: Arc<str>, payload: &'static str, done: u32, total: u32 },
     /// The driver was used before [`Machine::connect`](super::Machine::connect).
-    #[error("{machine} was asked ({what}) before it was connected")]
-    NotConnected { machine: Arc<str>, what: &'static str },
+    #[error("{machine} was asked ({operation}) before it was connected")]
+    NotConnected { machine: Arc<str>, operation: &'static str },
 
     /// The machine is of the right kind, but it is not the one that the cell file names.
     #[error(
@@ -83,27 +83,27 @@ pub enum DeviceError {
          cell.simulated",
         if *.simulation { "a simulation" } else { "a real machine" }, !.simulation
     )]
-    WrongReality { machine: Arc<str>, simulation: bool },
+    SimulationMismatch { machine: Arc<str>, simulation: bool },
     /// An operator confirmation was given for a machine that needs none.
     #[error("{machine} tells itself when a job begins and ends; nothing is confirmed by hand")]
-    TellsItself { machine: Arc<str> },
+    ConfirmationNotNeeded { machine: Arc<str> },
     /// An operator confirmation did not name the map with which the machine works.
     #[error("{machine} takes a word only with the map that it is about: --map and the first 8 digits of it, or more")]
-    MapUnnamed { machine: Arc<str> },
+    MapNotNamed { machine: Arc<str> },
     /// A file that the operator named is not the requested measurement, or it could not be stored.
-    #[error("{machine}: {why}")]
-    NotTaken { machine: Arc<str>, why: String },
+    #[error("{machine}: {reason}")]
+    NotAccepted { machine: Arc<str>, reason: String },
 
     /// The machine sent a line that has no meaning, or that belongs to no request.
     #[error(
-        "{machine} sent a line that cannot be used ({why}): {line:?}; nothing of it was used and the connection was given up. If it happens \
+        "{machine} sent a line that cannot be used ({reason}): {line:?}; nothing of it was used and the connection was given up. If it happens \
          again compare the server's version of I++ DME with docs/ippdme.md"
     )]
-    Unreadable { machine: Arc<str>, line: String, why: &'static str },
+    Unreadable { machine: Arc<str>, line: String, reason: &'static str },
 
     /// A line to send would not be one plain line of the protocol of the machine.
-    #[error("{machine}: {what} would hold what is no plain character, and was not sent: correct the cell file")]
-    Unsendable { machine: Arc<str>, what: &'static str },
+    #[error("{machine}: {operation} would hold what is no plain character, and was not sent: correct the cell file")]
+    Unsendable { machine: Arc<str>, operation: &'static str },
     /// Another client has taken control; the machine does not say which client.
     #[error(
         "{machine} is controlled by another client now: find out who commands it, and have that one let it go. It is not taken back but by an          abort, or by a run that is taken up again"
@@ -111,8 +111,8 @@ pub enum DeviceError {
     ControlTaken { machine: Arc<str> },
 
     /// The folders of a machine cannot be read or written, or they contain something that must not be changed.
-    #[error("{machine}: {why}")]
-    Folder { machine: Arc<str>, why: String },
+    #[error("{machine}: {reason}")]
+    Folder { machine: Arc<str>, reason: String },
 
     // ---- refused, or wrong content
     // -----------------------------------------------------------------------------------------------
@@ -123,14 +123,14 @@ pub enum DeviceError {
     #[error("{machine} is {state} with a fault: {fault}")]
     Faulted { machine: Arc<str>, state: State, fault: Fault },
     /// The machine refused a payload.
-    #[error("{machine} refused the {what}: {answer}")]
-    PayloadRefused { machine: Arc<str>, what: &'static str, answer: Answer },
+    #[error("{machine} refused the {payload}: {answer}")]
+    PayloadRefused { machine: Arc<str>, payload: &'static str, answer: Answer },
     /// The machine answered with a Modbus exception. Addresses count from 0.
     #[error(
-        "{machine} is there and answered exception {code} ({}) to {what} at register {address}: {}",
+        "{machine} is there and answered exception {code} ({}) to {operation} at register {address}: {}",
         exception_in_words(*.code), exception_remedy(*.code)
     )]
-    Exception { machine: Arc<str>, what: &'static str, address: u16, code: u8 },
+    Exception { machine: Arc<str>, operation: &'static str, address: u16, code: u8 },
     /// The device that answers is not a machine of this kind. The register at this address, counted from 0, shows it.
     #[error(
         "{machine} is not a {expected} of a Regrind cell: register {address} holds {found:#06x}, {required:#06x} was expected. Check \
@@ -138,8 +138,8 @@ pub enum DeviceError {
     )]
     WrongDevice { machine: Arc<str>, expected: MachineKind, address: u16, required: u16, found: u16 },
     /// The identity block of the map has a wrong layout: exchanged bytes, or addresses off by one.
-    #[error("{machine} answers with the identity block of this map, {how}; nothing was written to it")]
-    OtherLayout { machine: Arc<str>, how: std::borrow::Cow<'static, str> },
+    #[error("{machine} answers with the identity block of this map, {description}; nothing was written to it")]
+    WrongLayout { machine: Arc<str>, description: std::borrow::Cow<'static, str> },
     /// The cell file names one kind of machine, and this is the other kind.
     #[error(
         "{machine} is a {found}, and the cell file has it as the {expected}: the two addresses may be exchanged; nothing was written to it"
@@ -148,9 +148,9 @@ pub enum DeviceError {
     /// The sentinels are correct in the other word order, or in none.
     #[error(
         "{machine} sends its words in another order than the cell file says (word_order = \"{configured}\"): {}; nothing was written to it",
-        match .fits { Some(order) => format!("write word_order = \"{order}\""), None => "neither \"big\" nor \"little\" fits its sentinels".into() }
+        match .matching { Some(order) => format!("write word_order = \"{order}\""), None => "neither \"big\" nor \"little\" fits its sentinels".into() }
     )]
-    WrongWordOrder { machine: Arc<str>, configured: &'static str, fits: Option<&'static str> },
+    WrongWordOrder { machine: Arc<str>, configured: &'static str, matching: Option<&'static str> },
     /// The machine uses another version of the map.
     #[error("{machine} speaks version {found} of the register map, this program version {required}: {}; nothing was written to it", version_in_words(*.found, *.required))]
     WrongVersion { machine: Arc<str>, required: u16, found: u16 },
@@ -162,15 +162,15 @@ pub enum DeviceError {
             owner => format!("another client now (owner {owner:08x}, this client is {ours:08x}): find out who commands it; one of the two must let it go"),
         }
     )]
-    Taken { machine: Arc<str>, ours: u32, owner: u32 },
+    OwnedByOther { machine: Arc<str>, ours: u32, owner: u32 },
     /// The machine works in inches (unit code 2), or gives no known unit (1 is mm).
     #[error("{machine} gives lengths in {}, and this program takes millimetres only: set the machine to millimetres", if *.unit == 2 { "inches" } else { "an unknown unit" })]
-    Inches { machine: Arc<str>, unit: u16 },
+    WrongLengthUnit { machine: Arc<str>, unit: u16 },
     /// The machine was restarted without our knowledge.
     #[error(
-        "{machine} was restarted (boot id {was:08x}, now {is:08x}): what it was doing is not known; look at the machine, then connect anew"
+        "{machine} was restarted (boot id {old_boot_id:08x}, now {new_boot_id:08x}): what it was doing is not known; look at the machine, then connect anew"
     )]
-    Restarted { machine: Arc<str>, was: u32, is: u32 },
+    Restarted { machine: Arc<str>, old_boot_id: u32, new_boot_id: u32 },
     /// A received value is not a finite number.
     #[error(
         "{machine}: {field} is {value}, which is not a finite number; refused. The machine's program has not filled it in, or has put its words \
@@ -179,22 +179,22 @@ pub enum DeviceError {
     NotFinite { machine: Arc<str>, field: String, value: f64 },
     /// A received value is outside its possible range.
     #[error(
-        "{machine}: {field} is {value} {unit}, allowed is {least} to {most} {unit}: check scale, type and word order in the cell file, and the sensor"
+        "{machine}: {field} is {value} {unit}, allowed is {min} to {max} {unit}: check scale, type and word order in the cell file, and the sensor"
     )]
-    OutOfRange { machine: Arc<str>, field: String, value: f64, least: f64, most: f64, unit: String },
+    OutOfRange { machine: Arc<str>, field: String, value: f64, min: f64, max: f64, unit: String },
     /// A received code is not in the contract.
     #[error(
         "{machine}: {field} is {found}, which docs/modbus.md does not list: the machine's program does not follow it"
     )]
     Unlisted { machine: Arc<str>, field: &'static str, found: u32 },
     /// The number of elements is not the expected one.
-    #[error("{machine}: {found} {what}, {expected} were expected; nothing of it was used")]
-    Count { machine: Arc<str>, what: &'static str, expected: u64, found: u64 },
+    #[error("{machine}: {found} {elements}, {expected} were expected; nothing of it was used")]
+    WrongCount { machine: Arc<str>, elements: &'static str, expected: u64, found: u64 },
     /// The machine holds something else than was sent, or something of another job.
     #[error(
-        "{machine}: {field} is {held:#x} at the machine, {sent:#x} here: it would work on something else than was meant. Load it again"
+        "{machine}: {field} is {found:#x} at the machine, {sent:#x} here: it would work on something else than was meant. Load it again"
     )]
-    Mismatch { machine: Arc<str>, field: &'static str, sent: u64, held: u64 },
+    Mismatch { machine: Arc<str>, field: &'static str, sent: u64, found: u64 },
     /// A result was requested, but there is none.
     #[error(
         "{machine} is in {state} and has no finished result of {job}: a result stands from COMPLETE until it is acknowledged"
@@ -205,52 +205,52 @@ pub enum DeviceError {
     MethodRefused { machine: Arc<str>, method: &'static str, error: crate::ippdme::ServerError },
     /// An I++ DME server did not return the requested value.
     #[error("{machine} was asked {method} and did not tell {missing}: nothing is taken in its place")]
-    Untold { machine: Arc<str>, method: &'static str, missing: &'static str },
+    ValueMissing { machine: Arc<str>, method: &'static str, missing: &'static str },
     /// An I++ DME server does not know the tool that the cell file names.
     #[error("{machine} has no tool {tool:?}; it has {known}: correct cmm.wire.tool")]
     NoTool { machine: Arc<str>, tool: String, known: String },
     /// The probe of the machine is not the probe of the plan.
     #[error(
-        "{machine} says that the tool {tool:?} has a radius of {told_mm} mm, the plan is made for {plan_mm} mm; they may differ by {limit_mm} mm: \
+        "{machine} says that the tool {tool:?} has a radius of {reported_mm} mm, the plan is made for {plan_mm} mm; they may differ by {limit_mm} mm: \
          qualify the probe, or correct the tool in the cell file or the radius in the recipe"
     )]
-    ProbeRadius { machine: Arc<str>, tool: String, told_mm: f64, plan_mm: f64, limit_mm: f64 },
+    ProbeRadius { machine: Arc<str>, tool: String, reported_mm: f64, plan_mm: f64, limit_mm: f64 },
     /// A property was set, but another value is in force.
     #[error(
-        "{machine} was told to keep {property} at {wanted} and says that it is {told}: correct the recipe or the cell file"
+        "{machine} was told to keep {property} at {requested} and says that it is {in_force}: correct the recipe or the cell file"
     )]
-    NotSet { machine: Arc<str>, property: String, wanted: f64, told: f64 },
+    NotSet { machine: Arc<str>, property: String, requested: f64, in_force: f64 },
     /// A plan moves the probe out of the volume of the machine. This is checked before anything moves.
     #[error(
-        "{machine}: the {what} target {target} leads the probe's centre to {axis} = {value_mm} mm, and [cmm.travel] allows {least_mm} to {most_mm} \
+        "{machine}: the {motion} target {target} leads the probe's centre to {axis} = {value_mm} mm, and [cmm.travel] allows {min_mm} to {max_mm} \
          mm; nothing was moved. Move the part in [cmm.fixture], lower measure.safe_height_mm, or correct [cmm.travel]"
     )]
     OutOfVolume {
         machine: Arc<str>,
-        what: &'static str,
+        motion: &'static str,
         target: u32,
         axis: char,
         value_mm: f64,
-        least_mm: f64,
-        most_mm: f64,
+        min_mm: f64,
+        max_mm: f64,
     },
     /// A controller does not answer as linuxcncrsh does.
     #[error(
-        "{machine} does not answer as linuxcncrsh does: {told:?} to {asked}; nothing but questions was sent. Check host and port in the cell file"
+        "{machine} does not answer as linuxcncrsh does: {reply:?} to {request}; nothing but questions was sent. Check host and port in the cell file"
     )]
-    NotLinuxcnc { machine: Arc<str>, asked: &'static str, told: String },
+    NotLinuxcnc { machine: Arc<str>, request: &'static str, reply: String },
     /// A controller refused a password.
     #[error("{machine} refused the password: correct grinder.wire.{key}, or the options of linuxcncrsh (-w, -e)")]
     Password { machine: Arc<str>, key: &'static str },
     /// The machine is not ready for a job, and only a person can make it ready.
-    #[error("{machine} is not ready: {why}")]
-    Unready { machine: Arc<str>, why: &'static str },
+    #[error("{machine} is not ready: {reason}")]
+    NotReady { machine: Arc<str>, reason: &'static str },
     /// A controller reported errors.
-    #[error("{machine} reports, when {what}: {errors}")]
-    Reports { machine: Arc<str>, what: &'static str, errors: String },
+    #[error("{machine} reports, when {occasion}: {errors}")]
+    ControllerErrors { machine: Arc<str>, occasion: &'static str, errors: String },
     /// The driver was given a payload that no machine could accept.
-    #[error("{machine}: the {what} cannot be sent: {field} is {value}, allowed is {limit}")]
-    BadPayload { machine: Arc<str>, what: &'static str, field: String, value: f64, limit: &'static str },
+    #[error("{machine}: the {payload} cannot be sent: {field} is {value}, allowed is {limit}")]
+    BadPayload { machine: Arc<str>, payload: &'static str, field: String, value: f64, limit: &'static str },
 }
 
 /// Modbus exception codes: the machine is busy, the gateway finds no machine, memory error.
@@ -270,7 +270,7 @@ impl DeviceError {
                     | Self::Frozen { .. }
                     | Self::NotAcknowledged { .. }
                     | Self::StartUnknown { .. }
-                    | Self::Taken { .. }
+                    | Self::OwnedByOther { .. }
                     | Self::Folder { .. }
                     | Self::Unreadable { .. }
                     | Self::ControlTaken { .. }

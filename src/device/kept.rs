@@ -6,40 +6,40 @@ use crate::words::{Armed, Job};
 
 /// Job memory; `Load` is the type of the payload that is loaded for the next job.
 #[derive(Debug)]
-pub(crate) struct Kept<Load> {
+pub(crate) struct JobMemory<Load> {
     /// Loaded payload and its digest.
     pub(crate) loaded: Option<(Arc<Load>, u32)>,
     /// Unresolved job of an interrupted run with its start number. Nothing else is known of it.
-    pub(crate) untold: Option<(Job, u32)>,
+    pub(crate) unresolved: Option<(Job, u32)>,
     /// Number of the last start.
-    pub(crate) begun: u32,
+    pub(crate) last_start_sequence: u32,
     /// Number of points of the present job that were reported before its end.
-    pub(crate) told_ahead: usize,
+    pub(crate) reported_points: usize,
 }
 
-impl<Load> Kept<Load> {
-    pub(crate) fn none() -> Self {
-        Self { loaded: None, untold: None, begun: 0, told_ahead: 0 }
+impl<Load> JobMemory<Load> {
+    pub(crate) fn new() -> Self {
+        Self { loaded: None, unresolved: None, last_start_sequence: 0, reported_points: 0 }
     }
 
     /// Restores a job that an interrupted run had begun. It is not begun again, and its outcome is not reported yet.
     pub(crate) fn restore(&mut self, intended: &Armed) {
-        self.untold = Some((intended.job, intended.start_sequence));
-        self.begun = self.begun.max(intended.start_sequence);
+        self.unresolved = Some((intended.job, intended.start_sequence));
+        self.last_start_sequence = self.last_start_sequence.max(intended.start_sequence);
     }
 
     /// Returns the payload that is loaded for a job and forgets the unresolved job. The cell prepares another job only
     /// after it has resolved that one.
-    pub(crate) fn ready_for(&mut self, job: Job) -> Option<Arc<Load>> {
-        self.untold = None;
+    pub(crate) fn payload_for(&mut self, job: Job) -> Option<Arc<Load>> {
+        self.unresolved = None;
         self.loaded.as_ref().filter(|(_, digest)| *digest == job.digest).map(|(load, _)| Arc::clone(load))
     }
 
     /// Returns the armed start of a prepared job, with the next start number. The machine has no token and no boot id,
     /// so both are 0.
-    pub(crate) fn prepared(&mut self, job: Job) -> Armed {
-        self.told_ahead = 0;
-        Armed { job, start_sequence: self.begun + 1, token: 0, boot_id: 0 }
+    pub(crate) fn arm(&mut self, job: Job) -> Armed {
+        self.reported_points = 0;
+        Armed { job, start_sequence: self.last_start_sequence + 1, token: 0, boot_id: 0 }
     }
 }
 
@@ -50,12 +50,12 @@ mod tests {
     #[test]
     fn what_was_begun_is_not_begun_again() {
         let job = Job { job: 7, cycle: 2, digest: 9 };
-        let mut kept = Kept { loaded: Some((Arc::new("plan"), 9)), ..Kept::none() };
-        assert_eq!(kept.prepared(job).start_sequence, 1);
+        let mut kept = JobMemory { loaded: Some((Arc::new("plan"), 9)), ..JobMemory::new() };
+        assert_eq!(kept.arm(job).start_sequence, 1);
         kept.restore(&Armed { job, start_sequence: 4, token: 0, boot_id: 0 });
         kept.restore(&Armed { job, start_sequence: 3, token: 0, boot_id: 0 });
-        assert_eq!((kept.untold, kept.prepared(job).start_sequence), (Some((job, 3)), 5));
-        assert_eq!(kept.ready_for(Job { digest: 8, ..job }), None);
-        assert_eq!((kept.ready_for(job).as_deref(), kept.untold), (Some(&"plan"), None));
+        assert_eq!((kept.unresolved, kept.arm(job).start_sequence), (Some((job, 3)), 5));
+        assert_eq!(kept.payload_for(Job { digest: 8, ..job }), None);
+        assert_eq!((kept.payload_for(job).as_deref(), kept.unresolved), (Some(&"plan"), None));
     }
 }

@@ -18,7 +18,7 @@
 //! filled in here.
 //!
 //! A driver is a folder of this crate and a line in [`table`](self::Wire). The folder owns the table `wire` of a cell
-//! file ([`Wired`]), its checks, and the machines that are made from it.
+//! file ([`DriverFactory`]), its checks, and the machines that are made from it.
 //!
 //! One value of a driver is used by one task. Its futures may be dropped at any `.await`: a request that is under way
 //! is completed, its answer is discarded, and the connection stays valid. A `start` that is dropped has to be
@@ -42,10 +42,10 @@ mod table;
 mod wiring;
 mod words;
 
-pub use beside_plan::BesidePlan;
-use error::Answered;
+pub use beside_plan::PlanMismatch;
 pub use error::DeviceError;
-pub use hit_lines::{HitLine, HitLinesCmm, HitLinesSettings, HitLinesWire};
+use error::DeviceResult;
+pub use hit_lines::{HitLinesCmm, HitLinesSettings, HitLinesWire, HitSource};
 pub use ippdme::{IppdmeCmm, IppdmeSettings, IppdmeWire, Scanning};
 pub use linuxcnc::{LinuxcncGrinder, LinuxcncSettings, LinuxcncWire};
 pub use machine::{Cmm, Grinder, Interrupt, Machine};
@@ -53,20 +53,20 @@ pub use manual::{ManualMachine, ManualSettings, ManualWire};
 #[cfg(fuzzing)]
 pub use modbus::any_registers;
 pub use modbus::{
-    Dial, Dialled, Line, LineStream, Link, LinkFigures, ModbusCmm, ModbusGrinder, ModbusMachine, ModbusSettings,
-    Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
+    ConnectFuture, Connector, LineAddress, LineStream, Link, LinkStatistics, ModbusCmm, ModbusGrinder, ModbusMachine,
+    ModbusSettings, Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
 };
 pub use payload::{
-    Careful, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus, Preliminary,
-    Target, TargetKind,
+    CarefulStart, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus,
+    PreliminaryPoints, Target, TargetKind,
 };
-pub use place::Place;
-pub use range::{RANGES, Range};
+pub use place::MachineTable;
+pub use range::{RANGES, ValueRange};
 pub use regrind_formats::result::Coordinates;
 pub use table::{AnyCmm, AnyGrinder, Wire};
-pub use wiring::{Making, MakingError, Timing, Wired};
+pub use wiring::{DriverContext, DriverError, DriverFactory, Timing};
 pub use words::hex;
 pub use words::{
-    Answer, Armed, Command, Fault, Identity, Job, MachineKind, Number, Outcome, Reconciled, SignalValue, Started,
-    State, Status, Word, digest,
+    Answer, Armed, BatchId, Command, Fault, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled,
+    SignalValue, Started, State, Status, digest,
 };

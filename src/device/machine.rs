@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::error::DeviceError;
-use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan, Preliminary};
-use super::words::{Armed, Identity, Job, Reconciled, Started, Status, Word};
+use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan, PreliminaryPoints};
+use super::words::{Armed, Identity, Job, OperatorConfirmation, Reconciled, Started, Status};
 
 /// Operations of every machine of a cell, whatever its wire.
 ///
@@ -79,9 +79,12 @@ pub trait Machine: Send {
 
     /// Accepts an operator confirmation for a machine that cannot report the fact itself. Every other machine refuses.
     /// Returns the paths of the files that were kept, relative to the folder of the run.
-    fn confirm(&mut self, _word: Word) -> impl Future<Output = Result<Vec<String>, DeviceError>> + Send {
+    fn confirm(
+        &mut self,
+        _word: OperatorConfirmation,
+    ) -> impl Future<Output = Result<Vec<String>, DeviceError>> + Send {
         let machine: Arc<str> = Arc::from(self.name());
-        async move { Err(DeviceError::TellsItself { machine }) }
+        async move { Err(DeviceError::ConfirmationNotNeeded { machine }) }
     }
 }
 
@@ -95,7 +98,11 @@ pub trait Cmm: Machine {
     /// status, when no other request is due. It is short: at most one step between two calls of the status, and it
     /// stops if the flag is raised. Returns the new points, if there are any. An error is not returned; the next status
     /// shows it.
-    fn read_ahead(&mut self, _job: Job, _interrupt: &Interrupt) -> impl Future<Output = Option<Preliminary>> + Send {
+    fn read_ahead(
+        &mut self,
+        _job: Job,
+        _interrupt: &Interrupt,
+    ) -> impl Future<Output = Option<PreliminaryPoints>> + Send {
         std::future::ready(None)
     }
 

@@ -25,7 +25,7 @@ pub struct Target {
     /// Number of the target, which the measured point repeats.
     pub index: u32,
     /// Object to which it belongs.
-    pub what: TargetKind,
+    pub kind: TargetKind,
     /// Nominal contact point, in mm.
     pub point_mm: [f64; 3],
     /// Outward unit normal at this point.
@@ -49,14 +49,14 @@ pub struct Plan {
     pub safe_height_mm: f64,
     /// Careful beginning of the plan, if the part may not lie where it should. `None` if the part lies where it was
     /// found before.
-    pub careful: Option<Careful>,
+    pub careful_start: Option<CarefulStart>,
 }
 
 /// Careful beginning of a plan: a few targets at low speed.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Careful {
+pub struct CarefulStart {
     /// Number of first targets that are probed slowly.
-    pub targets: u32,
+    pub target_count: u32,
     /// Speed in mm/s for probing these targets and for all travel to them and between them.
     pub speed_mm_s: f64,
 }
@@ -118,7 +118,7 @@ pub struct MeasuredPoint {
     pub quality: u16,
     /// Position in the frame of the CMM, in mm: centre of the probe or contact point, as the measurement says.
     /// Meaningless unless touched.
-    pub at_mm: [f64; 3],
+    pub position_mm: [f64; 3],
 }
 
 /// Measurement of a CMM: one point for every target, in the order of the plan.
@@ -147,12 +147,12 @@ pub struct Measurement {
 /// Preliminary points that a CMM reports while it still measures. They are for display and never for judgement; only
 /// the final [`Measurement`] counts.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Preliminary {
+pub struct PreliminaryPoints {
     /// Job to which they belong.
     pub job: super::Job,
     /// Number of points of the job that were reported before these. 0 if the report starts again; then discard all
     /// earlier points.
-    pub from: usize,
+    pub first_index: usize,
     /// Points, in the order of the plan.
     pub points: Vec<MeasuredPoint>,
     /// Meaning of the coordinates: probe centres or contact points.
@@ -169,7 +169,7 @@ pub struct PassRecord {
     /// Volume removed, in mm³.
     pub removed_mm3: Option<f64>,
     /// Largest depth removed, in mm.
-    pub deepest_mm: Option<f64>,
+    pub max_depth_mm: Option<f64>,
     /// Fraction of the path that cut nothing, from 0 to 1.
     pub idle_share: Option<f64>,
     /// Mean spindle load; 1 is full load.
@@ -197,7 +197,7 @@ impl PassRecord {
             outcome,
             path_mm: None,
             removed_mm3: None,
-            deepest_mm: None,
+            max_depth_mm: None,
             idle_share: None,
             spindle_load: None,
             wheel_radius_mm: None,

@@ -2,14 +2,14 @@
 
 /// Position of a machine in a cell file.
 #[derive(Clone, Copy, Debug)]
-pub struct Place<'a> {
+pub struct MachineTable<'a> {
     /// Table of the machine: `cmm` or `grinder`.
     pub table: &'a str,
     /// True if the cell is simulated; `None` if the file does not say it.
     pub simulated: Option<bool>,
 }
 
-impl Place<'_> {
+impl MachineTable<'_> {
     /// Returns a key in the table of the machine, in the form that messages use.
     pub fn key(&self, rest: &str) -> String {
         format!("{}.{rest}", self.table)

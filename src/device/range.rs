@@ -7,96 +7,96 @@ use super::{DeviceError, Measurement, PassRecord, PointStatus, SignalValue};
 
 /// Possible range of a value.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Range {
+pub struct ValueRange {
     /// Name of the value, as in messages and docs/modbus.md.
-    pub figure: &'static str,
+    pub name: &'static str,
     /// Minimum possible value.
-    pub least: f64,
+    pub min: f64,
     /// Maximum possible value.
-    pub most: f64,
+    pub max: f64,
     /// Unit of the value.
     pub unit: &'static str,
 }
 
-const fn range(figure: &'static str, least: f64, most: f64, unit: &'static str) -> Range {
-    Range { figure, least, most, unit }
+const fn range(figure: &'static str, least: f64, most: f64, unit: &'static str) -> ValueRange {
+    ValueRange { name: figure, min: least, max: most, unit }
 }
 
-const TEMPERATURE: Range = range("the temperature", -40.0, 120.0, "degrees Celsius");
-const DURATION: Range = range("the duration", 0.0, 1e6, "s");
-const PROBE_RADIUS: Range = range("the probe's radius", 0.01, 50.0, "mm");
-const COORDINATE: Range = range("a coordinate", -1e5, 1e5, "mm");
-const QUALITY: Range = range("the quality of a point", 0.0, 100.0, "");
-const COUNT: Range = range("the scale of counts", 1e-9, 0.1, "mm");
-const SPINDLE_LOAD: Range = range("the spindle load", 0.0, 10.0, "");
-const IDLE_SHARE: Range = range("the share of the path that cut nothing", 0.0, 1.0, "");
+const TEMPERATURE: ValueRange = range("the temperature", -40.0, 120.0, "degrees Celsius");
+const DURATION: ValueRange = range("the duration", 0.0, 1e6, "s");
+const PROBE_RADIUS: ValueRange = range("the probe's radius", 0.01, 50.0, "mm");
+const COORDINATE: ValueRange = range("a coordinate", -1e5, 1e5, "mm");
+const QUALITY: ValueRange = range("the quality of a point", 0.0, 100.0, "");
+const COUNT: ValueRange = range("the scale of counts", 1e-9, 0.1, "mm");
+const SPINDLE_LOAD: ValueRange = range("the spindle load", 0.0, 10.0, "");
+const IDLE_SHARE: ValueRange = range("the share of the path that cut nothing", 0.0, 1.0, "");
 
 /// All ranges that apply to every machine. The ranges of a pass that depend on the command are in
 /// `drive/pass_record.rs`.
-pub const RANGES: [Range; 8] =
+pub const RANGES: [ValueRange; 8] =
     [TEMPERATURE, DURATION, PROBE_RADIUS, COORDINATE, QUALITY, COUNT, SPINDLE_LOAD, IDLE_SHARE];
 
-impl Range {
-    fn has(&self, value: f64) -> bool {
-        (self.least..=self.most).contains(&value)
+impl ValueRange {
+    fn contains(&self, value: f64) -> bool {
+        (self.min..=self.max).contains(&value)
     }
 
     /// Returns in words why a value is outside the range. Returns `None` if it is inside, or was not reported.
-    fn flaw(&self, value: Option<f64>) -> Option<String> {
-        let value = value.filter(|value| !self.has(*value))?;
-        let Self { figure, least, most, unit } = self;
+    fn violation(&self, value: Option<f64>) -> Option<String> {
+        let value = value.filter(|value| !self.contains(*value))?;
+        let Self { name: figure, min: least, max: most, unit } = self;
         let unit = if unit.is_empty() { String::new() } else { format!(" {unit}") };
         Some(format!("{figure} is {value}{unit}, and {least} to {most}{unit} are possible"))
     }
 
     fn refuse(&self, machine: &Arc<str>, value: f64) -> Result<(), DeviceError> {
-        if self.has(value) {
+        if self.contains(value) {
             return Ok(());
         }
-        let (field, unit) = (self.figure.to_owned(), self.unit.to_owned());
-        let Self { least, most, .. } = *self;
-        Err(DeviceError::OutOfRange { machine: Arc::clone(machine), field, value, least, most, unit })
+        let (field, unit) = (self.name.to_owned(), self.unit.to_owned());
+        let Self { min: least, max: most, .. } = *self;
+        Err(DeviceError::OutOfRange { machine: Arc::clone(machine), field, value, min: least, max: most, unit })
     }
 }
 
 /// Returns the temperature in °C and the progress `(done, total)`, each only if possible, and a signal for each
 /// impossible value. The status is reported all the same, because it also contains the state of the machine and the
 /// command that it acknowledged.
-pub(super) fn of_status(
+pub(super) fn plausible_status(
     temperature_c: Option<f64>,
     progress: (u32, u32),
 ) -> (Option<f64>, Option<(u32, u32)>, Vec<SignalValue>) {
     let (done, total) = progress;
     let of_progress = range("its progress", 0.0, f64::from(total), "of its job");
-    let signal = |of: Range, value: f64| {
-        let Range { figure, least, most, unit } = of;
+    let signal = |of: ValueRange, value: f64| {
+        let ValueRange { name: figure, min: least, max: most, unit } = of;
         let (name, unit) = (figure.to_owned(), unit.to_owned());
         SignalValue { name, value: Some(value), unit, range: [least, most], cause: None }
     };
-    let temperature = temperature_c.filter(|told| !TEMPERATURE.has(*told)).map(|told| signal(TEMPERATURE, told));
-    let steps = Some(f64::from(done)).filter(|done| !of_progress.has(*done)).map(|done| signal(of_progress, done));
+    let temperature = temperature_c.filter(|told| !TEMPERATURE.contains(*told)).map(|told| signal(TEMPERATURE, told));
+    let steps = Some(f64::from(done)).filter(|done| !of_progress.contains(*done)).map(|done| signal(of_progress, done));
     let told = (temperature_c.filter(|_| temperature.is_none()), Some(progress).filter(|_| steps.is_none()));
     (told.0, told.1, temperature.into_iter().chain(steps).collect())
 }
 
 /// Rejects an impossible scale of counts, in mm per count.
-pub(super) fn of_counts(machine: &Arc<str>, scale_mm: f64) -> Result<(), DeviceError> {
+pub(super) fn check_count_scale(machine: &Arc<str>, scale_mm: f64) -> Result<(), DeviceError> {
     COUNT.refuse(machine, scale_mm)
 }
 
 impl Measurement {
     /// Returns the first impossible value of a measurement with its range, in words. Values that were not reported are
     /// not checked.
-    pub fn flaw(&self) -> Option<String> {
+    pub fn range_violation(&self) -> Option<String> {
         let of_whole = TEMPERATURE
-            .flaw(self.temperature_c)
-            .or_else(|| DURATION.flaw(self.duration_s))
-            .or_else(|| PROBE_RADIUS.flaw(self.probe_radius_mm));
+            .violation(self.temperature_c)
+            .or_else(|| DURATION.violation(self.duration_s))
+            .or_else(|| PROBE_RADIUS.violation(self.probe_radius_mm));
         of_whole.or_else(|| {
             let mut touched = self.points.iter().filter(|point| point.status == PointStatus::Touched);
             touched.find_map(|point| {
-                let of_place = point.at_mm.into_iter().find_map(|at_mm| COORDINATE.flaw(Some(at_mm)));
-                let flaw = of_place.or_else(|| QUALITY.flaw(Some(f64::from(point.quality))))?;
+                let of_place = point.position_mm.into_iter().find_map(|at_mm| COORDINATE.violation(Some(at_mm)));
+                let flaw = of_place.or_else(|| QUALITY.violation(Some(f64::from(point.quality))))?;
                 Some(format!("target {}: {flaw}", point.index))
             })
         })
@@ -106,12 +106,12 @@ impl Measurement {
 impl PassRecord {
     /// Returns the first impossible value of a pass record with its range, in words. Values that were not reported are
     /// not checked.
-    pub fn flaw(&self) -> Option<String> {
+    pub fn range_violation(&self) -> Option<String> {
         TEMPERATURE
-            .flaw(self.temperature_c)
-            .or_else(|| DURATION.flaw(self.duration_s))
-            .or_else(|| SPINDLE_LOAD.flaw(self.spindle_load))
-            .or_else(|| IDLE_SHARE.flaw(self.idle_share))
+            .violation(self.temperature_c)
+            .or_else(|| DURATION.violation(self.duration_s))
+            .or_else(|| SPINDLE_LOAD.violation(self.spindle_load))
+            .or_else(|| IDLE_SHARE.violation(self.idle_share))
     }
 }
 
@@ -121,8 +121,8 @@ mod tests {
     use crate::{Coordinates, MeasuredPoint};
 
     fn measurement() -> Measurement {
-        let point = MeasuredPoint { index: 7, status: PointStatus::Touched, quality: 0, at_mm: [1.0, 2.0, 3.0] };
-        let missed = MeasuredPoint { index: 8, status: PointStatus::NotFound, quality: 0, at_mm: [f64::NAN; 3] };
+        let point = MeasuredPoint { index: 7, status: PointStatus::Touched, quality: 0, position_mm: [1.0, 2.0, 3.0] };
+        let missed = MeasuredPoint { index: 8, status: PointStatus::NotFound, quality: 0, position_mm: [f64::NAN; 3] };
         Measurement {
             points: vec![point, missed],
             coordinates: Coordinates::Centres,
@@ -138,12 +138,12 @@ mod tests {
 
     #[test]
     fn a_figure_of_a_measurement_that_cannot_be_is_named_with_its_range() {
-        assert_eq!(measurement().flaw(), None);
+        assert_eq!(measurement().range_violation(), None);
         let untold = Measurement { temperature_c: None, duration_s: None, probe_radius_mm: None, ..measurement() };
-        assert_eq!(untold.flaw(), None);
+        assert_eq!(untold.range_violation(), None);
         let point = |quality, at_mm| {
             let mut of = measurement();
-            (of.points[0].quality, of.points[0].at_mm) = (quality, at_mm);
+            (of.points[0].quality, of.points[0].position_mm) = (quality, at_mm);
             of
         };
         let cases = [
@@ -159,7 +159,8 @@ mod tests {
             (point(0, [1.0, 1.0, f64::NEG_INFINITY]), "target 7: a coordinate is -inf mm"),
         ];
         for (measurement, words) in cases {
-            let flaw = measurement.flaw().unwrap_or_else(|| panic!("nothing is found wrong, expected {words}"));
+            let flaw =
+                measurement.range_violation().unwrap_or_else(|| panic!("nothing is found wrong, expected {words}"));
             assert!(flaw.contains(words), "{flaw:?} without {words:?}");
         }
     }
@@ -168,11 +169,11 @@ mod tests {
     fn a_figure_of_a_status_that_cannot_be_is_told_and_the_others_are_kept() {
         let machine: Arc<str> = "a machine".into();
         for (temperature_c, progress) in [(Some(20.0), (0, 0)), (None, (7, 7)), (Some(-40.0), (0, 1000))] {
-            assert_eq!(of_status(temperature_c, progress), (temperature_c, Some(progress), Vec::new()));
+            assert_eq!(plausible_status(temperature_c, progress), (temperature_c, Some(progress), Vec::new()));
         }
         let flaws = |temperature_c, progress| {
-            let (kept_c, kept, signals) = of_status(temperature_c, progress);
-            (kept_c, kept, signals.iter().filter_map(SignalValue::flaw).collect::<Vec<_>>().join("; "))
+            let (kept_c, kept, signals) = plausible_status(temperature_c, progress);
+            (kept_c, kept, signals.iter().filter_map(SignalValue::problem).collect::<Vec<_>>().join("; "))
         };
         let (kept_c, kept, flaw) = flaws(Some(327.67), (3, 7));
         assert_eq!((kept_c, kept), (None, Some((3, 7))));
@@ -182,9 +183,9 @@ mod tests {
         assert_eq!(flaw, "its progress is 549 of its job, and 0 to 1 of its job are wanted");
         assert_eq!(flaws(Some(f64::NAN), (1, 0)).2.matches("are wanted").count(), 2);
         assert!(
-            of_counts(&machine, 1e-6).is_ok()
-                && of_counts(&machine, 0.0).is_err()
-                && of_counts(&machine, f64::NAN).is_err()
+            check_count_scale(&machine, 1e-6).is_ok()
+                && check_count_scale(&machine, 0.0).is_err()
+                && check_count_scale(&machine, f64::NAN).is_err()
         );
     }
 }

@@ -4,17 +4,17 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::exchange::ExchangeWire;
-use super::hit_lines::{HitLine, HitLinesWire};
+use super::hit_lines::{HitLinesWire, HitSource};
 use super::ippdme::IppdmeWire;
 use super::linuxcnc::LinuxcncWire;
 use super::machine::{Cmm, Grinder, Interrupt, Machine};
 use super::manual::ManualWire;
-use super::modbus::{Line, Link, RtuWire, TcpWire};
-use super::place::Place;
-use super::wiring::{Making, MakingError, Wired};
+use super::modbus::{LineAddress, Link, RtuWire, TcpWire};
+use super::place::MachineTable;
+use super::wiring::{DriverContext, DriverError, DriverFactory};
 use super::{
-    Armed, CorrectionMap, DeviceError, Identity, Job, Measurement, Pass, PassRecord, Plan, Preliminary, Reconciled,
-    Started, Status, Word,
+    Armed, CorrectionMap, DeviceError, Identity, Job, Measurement, OperatorConfirmation, Pass, PassRecord, Plan,
+    PreliminaryPoints, Reconciled, Started, Status,
 };
 use regrind_document::Document;
 use regrind_formats::result::Coordinates;
@@ -33,27 +33,27 @@ macro_rules! drivers {
         // A program has two of these; boxing would gain nothing.
         #[allow(clippy::large_enum_variant)]
         pub enum AnyCmm {
-            $($(#[$doc])* $wire(<$table as Wired>::Cmm)),+
+            $($(#[$doc])* $wire(<$table as DriverFactory>::Cmm)),+
         }
 
         /// Grinder on any wire.
         #[derive(Debug)]
         #[allow(clippy::large_enum_variant)]
         pub enum AnyGrinder {
-            $($(#[$doc])* $wire(<$table as Wired>::Grinder)),+
+            $($(#[$doc])* $wire(<$table as DriverFactory>::Grinder)),+
         }
 
         impl Wire {
             /// Reports to the document the errors of this wire that the schema does not detect.
-            pub fn check(&self, place: &Place<'_>, document: &mut Document) {
-                match self { $(Self::$wire(wire) => Wired::check(wire, place, document)),+ }
+            pub fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
+                match self { $(Self::$wire(wire) => DriverFactory::check(wire, place, document)),+ }
             }
 
             /// Reports to the document the conflicts between this wire, which is the CMM's, and the wire of the
             /// grinder.
-            pub fn check_beside(&self, grinder: &Self, document: &mut Document) {
+            pub fn check_against_grinder(&self, grinder: &Self, document: &mut Document) {
                 match (self, grinder) {
-                    $((Self::$wire(cmm), Self::$wire(grinder)) => Wired::check_beside(cmm, grinder, document),)+
+                    $((Self::$wire(cmm), Self::$wire(grinder)) => DriverFactory::check_against_grinder(cmm, grinder, document),)+
                     _ => {}
                 }
             }
@@ -69,8 +69,8 @@ macro_rules! drivers {
             }
 
             /// Returns true if its results may contain their temperature.
-            pub fn tells_temperature(&self) -> bool {
-                match self { $(Self::$wire(_) => <$table>::TELLS_TEMPERATURE),+ }
+            pub fn reports_temperature(&self) -> bool {
+                match self { $(Self::$wire(_) => <$table>::REPORTS_TEMPERATURE),+ }
             }
 
             /// Returns true if the tables `registers` and `signals` apply to it.
@@ -79,8 +79,8 @@ macro_rules! drivers {
             }
 
             /// Returns true if its grinder works from the files in the folder of the run.
-            pub fn works_from_run(&self) -> bool {
-                match self { $(Self::$wire(_) => <$table>::WORKS_FROM_RUN),+ }
+            pub fn reads_run_folder(&self) -> bool {
+                match self { $(Self::$wire(_) => <$table>::READS_RUN_FOLDER),+ }
             }
 
             /// Returns the meaning of the coordinates of a measurement; `None` if each result states it itself.
@@ -89,39 +89,39 @@ macro_rules! drivers {
             }
 
             /// Returns the Modbus line and the unit on it, if this is a Modbus wire.
-            pub fn line(&self) -> Option<(Line, u8)> {
-                match self { $(Self::$wire(wire) => Wired::line(wire)),+ }
+            pub fn modbus_line(&self) -> Option<(LineAddress, u8)> {
+                match self { $(Self::$wire(wire) => DriverFactory::modbus_line(wire)),+ }
             }
 
             /// Returns host and port of the I++ DME server, if this is an I++ DME wire.
-            pub fn dme(&self) -> Option<(String, u16)> {
-                match self { $(Self::$wire(wire) => Wired::dme(wire)),+ }
+            pub fn ippdme_address(&self) -> Option<(String, u16)> {
+                match self { $(Self::$wire(wire) => DriverFactory::ippdme_address(wire)),+ }
             }
 
             /// Returns the source of the hit lines, if this is a wire for them.
-            pub fn hit_line(&self) -> Option<HitLine> {
-                match self { $(Self::$wire(wire) => Wired::hit_line(wire)),+ }
+            pub fn hit_source(&self) -> Option<HitSource> {
+                match self { $(Self::$wire(wire) => DriverFactory::hit_source(wire)),+ }
             }
 
             /// Returns host and port of linuxcncrsh, if this is a wire to it.
-            pub fn rsh(&self) -> Option<(String, u16)> {
-                match self { $(Self::$wire(wire) => Wired::rsh(wire)),+ }
+            pub fn linuxcncrsh_address(&self) -> Option<(String, u16)> {
+                match self { $(Self::$wire(wire) => DriverFactory::linuxcncrsh_address(wire)),+ }
             }
 
             /// Creates the driver of a measuring machine. Sends nothing to the machine yet.
             ///
             /// # Errors
-            /// The errors of [`Wired::cmm`].
-            pub fn cmm(&self, making: &Making<'_>) -> Result<AnyCmm, MakingError> {
-                Ok(match self { $(Self::$wire(wire) => AnyCmm::$wire(wire.cmm(making)?)),+ })
+            /// The errors of [`DriverFactory::create_cmm`].
+            pub fn create_cmm(&self, making: &DriverContext<'_>) -> Result<AnyCmm, DriverError> {
+                Ok(match self { $(Self::$wire(wire) => AnyCmm::$wire(wire.create_cmm(making)?)),+ })
             }
 
             /// Creates the driver of a grinder. Sends nothing to the machine yet.
             ///
             /// # Errors
-            /// The errors of [`Wired::grinder`].
-            pub fn grinder(&self, making: &Making<'_>) -> Result<AnyGrinder, MakingError> {
-                Ok(match self { $(Self::$wire(wire) => AnyGrinder::$wire(wire.grinder(making)?)),+ })
+            /// The errors of [`DriverFactory::create_grinder`].
+            pub fn create_grinder(&self, making: &DriverContext<'_>) -> Result<AnyGrinder, DriverError> {
+                Ok(match self { $(Self::$wire(wire) => AnyGrinder::$wire(wire.create_grinder(making)?)),+ })
             }
         }
 
@@ -139,7 +139,7 @@ macro_rules! drivers {
             async fn load_plan(&mut self, plan: &Plan, interrupt: &Interrupt) -> Result<(), DeviceError> {
                 match self { $(Self::$wire(cmm) => cmm.load_plan(plan, interrupt).await),+ }
             }
-            async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<Preliminary> {
+            async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<PreliminaryPoints> {
                 match self { $(Self::$wire(cmm) => cmm.read_ahead(job, interrupt).await),+ }
             }
             async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<Measurement, DeviceError> {
@@ -215,7 +215,7 @@ macro_rules! machine {
             async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
                 match self { $(Self::$wire(machine) => machine.reconcile(intended).await),+ }
             }
-            async fn confirm(&mut self, word: Word) -> Result<Vec<String>, DeviceError> {
+            async fn confirm(&mut self, word: OperatorConfirmation) -> Result<Vec<String>, DeviceError> {
                 match self { $(Self::$wire(machine) => machine.confirm(word).await),+ }
             }
         }

@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use thiserror::Error;
 
-use super::hit_lines::HitLine;
+use super::hit_lines::HitSource;
 use super::machine::{Cmm, Grinder};
-use super::modbus::{Line, Link, RegisterMap, Signal};
-use super::place::Place;
+use super::modbus::{LineAddress, Link, RegisterMap, Signal};
+use super::place::MachineTable;
 use super::words::MachineKind;
 use regrind_document::Document;
 use regrind_formats::FormatError;
@@ -33,7 +33,7 @@ pub struct Timing {
 
 /// Data in addition to its wire from which a machine is made.
 #[derive(Clone, Copy, Debug)]
-pub struct Making<'a> {
+pub struct DriverContext<'a> {
     /// Name of the part in files and prompts.
     pub part: &'a str,
     /// Folder of the cell file, to which its paths are relative.
@@ -47,9 +47,9 @@ pub struct Making<'a> {
     /// Epoch of this client; it increases with each start.
     pub epoch: u32,
     /// Minimum number of points, if any number of points is allowed; `None` if each target of a plan needs one point.
-    pub free_points: Option<usize>,
+    pub min_free_points: Option<usize>,
     /// Minimum fraction of the targets of a plan that need a point in a measurement.
-    pub least_found: f64,
+    pub min_coverage: f64,
     /// True if people only act as the machines: the plan itself may be returned as the measurement.
     pub rehearsal: bool,
     /// Timing of the communication.
@@ -63,11 +63,11 @@ pub struct Making<'a> {
     /// Box that the centre of the probe must not leave: its minimum and maximum corner, in mm.
     pub volume_mm: Option<[[f64; 3]; 2]>,
     /// Line of the other machine, which may also be the line of this one.
-    pub beside: Option<&'a Link>,
+    pub shared_link: Option<&'a Link>,
 }
 
 /// Table `wire` of a cell file, with the driver that belongs to it.
-pub trait Wired {
+pub trait DriverFactory {
     /// Measuring machine on this wire.
     type Cmm: Cmm + std::fmt::Debug;
     /// Grinder on this wire.
@@ -77,18 +77,18 @@ pub trait Wired {
     /// machine.
     const BY_PERSON: bool = false;
     /// True if its results may contain their temperature.
-    const TELLS_TEMPERATURE: bool = true;
+    const REPORTS_TEMPERATURE: bool = true;
     /// True if the tables `registers` and `signals` apply to it.
     const HAS_REGISTERS: bool = false;
     /// True if the grinder works from the program and the map in the folder of the run, also for the first pass of a
     /// run.
-    const WORKS_FROM_RUN: bool = false;
+    const READS_RUN_FOLDER: bool = false;
 
     /// Reports to the document the errors of the table that the schema does not detect.
-    fn check(&self, _place: &Place<'_>, _document: &mut Document) {}
+    fn check(&self, _place: &MachineTable<'_>, _document: &mut Document) {}
 
     /// Reports to the document the conflicts between this wire, which is the CMM's, and the wire of the grinder.
-    fn check_beside(&self, _grinder: &Self, _document: &mut Document) {}
+    fn check_against_grinder(&self, _grinder: &Self, _document: &mut Document) {}
 
     /// Returns notes for a person about this wire on this computer. They are no errors of the cell file.
     fn notes(&self) -> Vec<String> {
@@ -104,13 +104,13 @@ pub trait Wired {
     ///
     /// # Errors
     /// The wire cannot be opened, a folder does not exist, or a file cannot be read.
-    fn cmm(&self, making: &Making<'_>) -> Result<Self::Cmm, MakingError>;
+    fn create_cmm(&self, making: &DriverContext<'_>) -> Result<Self::Cmm, DriverError>;
 
     /// Creates the driver of a grinder. Sends nothing to the machine yet.
     ///
     /// # Errors
-    /// The errors of [`Wired::cmm`].
-    fn grinder(&self, making: &Making<'_>) -> Result<Self::Grinder, MakingError>;
+    /// The errors of [`DriverFactory::create_cmm`].
+    fn create_grinder(&self, making: &DriverContext<'_>) -> Result<Self::Grinder, DriverError>;
 
     /// Returns the line that another machine may share.
     fn link(_cmm: &Self::Cmm) -> Option<&Link> {
@@ -118,22 +118,22 @@ pub trait Wired {
     }
 
     /// Returns host and port of the I++ DME server, if this is an I++ DME wire.
-    fn dme(&self) -> Option<(String, u16)> {
+    fn ippdme_address(&self) -> Option<(String, u16)> {
         None
     }
 
     /// Returns the source of the hit lines, if this is a wire for them.
-    fn hit_line(&self) -> Option<HitLine> {
+    fn hit_source(&self) -> Option<HitSource> {
         None
     }
 
     /// Returns host and port of linuxcncrsh, if this is a wire to it.
-    fn rsh(&self) -> Option<(String, u16)> {
+    fn linuxcncrsh_address(&self) -> Option<(String, u16)> {
         None
     }
 
     /// Returns the Modbus line and the unit on it, if this is a Modbus wire: a simulated machine is served there.
-    fn line(&self) -> Option<(Line, u8)> {
+    fn modbus_line(&self) -> Option<(LineAddress, u8)> {
         None
     }
 }
@@ -142,7 +142,7 @@ pub trait Wired {
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the message of each tells what its fields are")]
 #[non_exhaustive]
-pub enum MakingError {
+pub enum DriverError {
     /// A required folder does not exist.
     #[error(
         "{key}: the folder {path} is not there; make it where the {machine} finds it (mkdir -p {path}), or correct the cell file"

@@ -48,7 +48,7 @@ pub struct Identity {
 
 impl Identity {
     /// Returns the identity of a machine that a person operates. Silence never makes its client lost.
-    pub(super) fn by_person(kind: MachineKind, name: &str) -> Self {
+    pub(super) fn for_manual_machine(kind: MachineKind, name: &str) -> Self {
         Self { kind, name: name.to_owned(), boot_id: 0, simulation: false, silence_limit_s: None }
     }
 }
@@ -58,7 +58,7 @@ impl Identity {
 pub struct Job {
     /// Number of the run of the part; not 0.
     pub job: u32,
-    /// Cycle with its batch, in the encoding of [`Number::seen`].
+    /// Cycle with its batch, in the encoding of [`BatchId::encode`].
     pub cycle: u16,
     /// [`digest`] of the identities of the payloads, in the order plan, or map and pass.
     pub digest: u32,
@@ -66,46 +66,46 @@ pub struct Job {
 
 impl Job {
     /// Returns the cycle and the batch of touches to which it belongs.
-    pub fn number(&self) -> Number {
-        Number::of(self.cycle)
+    pub fn batch_id(&self) -> BatchId {
+        BatchId::decode(self.cycle)
     }
 }
 
 impl fmt::Display for Job {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "job {} cycle {} (digest {:08x})", self.job, self.number(), self.digest)
+        write!(f, "job {} cycle {} (digest {:08x})", self.job, self.batch_id(), self.digest)
     }
 }
 
 /// Cycle, and batch of touches in it if a measurement is taken batch by batch. The batch is the number of batches
 /// before it. A machine sees one number of 16 bits: the cycle plus 1024 for each earlier batch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Number {
+pub struct BatchId {
     /// Cycle.
     pub cycle: u32,
     /// Number of earlier batches.
     pub batch: u32,
 }
 
-impl Number {
+impl BatchId {
     /// Number of cycles that the encoding can distinguish; a run has fewer.
-    pub const CYCLES: u32 = 1024;
+    pub const MAX_CYCLES: u32 = 1024;
     /// Number of batches that the encoding can distinguish; a measurement has fewer.
-    pub const BATCHES: u32 = 64;
+    pub const MAX_BATCHES: u32 = 64;
 
     /// Decodes the number that a machine sees.
-    pub fn of(seen: u16) -> Self {
+    pub fn decode(seen: u16) -> Self {
         let seen = u32::from(seen);
-        Self { cycle: seen % Self::CYCLES, batch: seen / Self::CYCLES }
+        Self { cycle: seen % Self::MAX_CYCLES, batch: seen / Self::MAX_CYCLES }
     }
 
     /// Returns the number that a machine sees. It is unique for every batch as long as the limits are kept.
-    pub fn seen(self) -> u16 {
-        (self.cycle % Self::CYCLES + Self::CYCLES * (self.batch % Self::BATCHES)) as u16
+    pub fn encode(self) -> u16 {
+        (self.cycle % Self::MAX_CYCLES + Self::MAX_CYCLES * (self.batch % Self::MAX_BATCHES)) as u16
     }
 }
 
-impl fmt::Display for Number {
+impl fmt::Display for BatchId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.batch {
             0 => self.cycle.fmt(f),
@@ -169,7 +169,7 @@ pub enum Reconciled {
     /// The outcome cannot be determined from here. A person must look at the machine; nothing may be repeated.
     Unknown {
         /// Contradiction, in words.
-        why: String,
+        reason: String,
     },
 }
 
@@ -234,7 +234,7 @@ pub enum State {
 
 impl State {
     /// Returns true if something may be moving.
-    pub fn moves(self) -> bool {
+    pub fn is_moving(self) -> bool {
         matches!(self, Self::Execute | Self::Holding | Self::Stopping | Self::Aborting)
     }
 }
@@ -350,7 +350,7 @@ impl Fault {
     ];
 
     /// Returns the fault with a number.
-    pub fn of(number: u16) -> Self {
+    pub fn from_number(number: u16) -> Self {
         Self::NUMBERS.iter().find(|(_, known)| *known == number).map_or(Self::Other(number), |(fault, _)| *fault)
     }
 
@@ -395,7 +395,7 @@ pub enum Outcome {
     Failed,
 }
 
-/// Additional signal that a cell file requests. The value is given even if it is not good; [`Self::flaw`] judges it.
+/// Additional signal that a cell file requests. The value is given even if it is not good; [`Self::problem`] judges it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SignalValue {
     /// Name in the cell file.
@@ -412,7 +412,7 @@ pub struct SignalValue {
 
 impl SignalValue {
     /// Returns in words why the value is missing or out of range; `None` if it is good.
-    pub fn flaw(&self) -> Option<String> {
+    pub fn problem(&self) -> Option<String> {
         let Self { name, value, unit, range: [least, most], cause } = self;
         let flaw = match value {
             None => format!("{name}: the machine gives no number"),
@@ -455,7 +455,7 @@ pub struct Status {
 
 impl Status {
     /// Returns the status of a machine that reports nothing but its state.
-    pub(super) fn of(state: State) -> Self {
+    pub(super) fn from_state(state: State) -> Self {
         Self {
             state,
             job: None,
@@ -476,7 +476,7 @@ impl Status {
 /// Operator confirmation of a fact that a machine cannot report itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the fields are told above them")]
-pub enum Word {
+pub enum OperatorConfirmation {
     /// The machine has begun its job, with this map if one was named.
     Started { map_identity: Option<[u8; 32]> },
     /// The machine has ended its job, with this map if one was named, and is clear of the part. A measurement came as a

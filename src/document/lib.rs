@@ -20,6 +20,15 @@ pub use read::{problem_at, read_text, sha256};
 pub use schema::schema_of;
 pub use shown::{countable, misleading, visible};
 
+/// Key that has a new name. Both names are paths from the root of the file, without indices.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RenamedKey {
+    /// Name in earlier versions.
+    pub old: &'static str,
+    /// Present name.
+    pub new: &'static str,
+}
+
 /// All problems of one file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Problems {

@@ -8,11 +8,12 @@ use std::path::Path;
 use serde::de::DeserializeOwned;
 use serde_json::Value as Schema;
 use sha2::{Digest, Sha256};
+use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::schema::choices;
 use super::shown::{countable, misleading};
-use super::{Problem, Problems};
+use super::{Problem, Problems, RenamedKey, line_and_column};
 
 /// Maximum size of a file: far more than a person writes.
 const MOST_BYTES: usize = 256 << 10;
@@ -111,6 +112,31 @@ impl<'t> Document<'t> {
         self.push(start..end, String::new(), format!("no TOML: {}", error.message().trim()), "", remedy);
     }
 
+    /// Moves the values of old keys to their new names. Returns a note for each old key, with its line.
+    ///
+    /// A table that becomes empty is removed. If a file has both names, the old one is reported as a problem.
+    pub fn rename_keys(&mut self, renamed: &[RenamedKey]) -> Vec<String> {
+        let mut notes = Vec::new();
+        for RenamedKey { old, new } in renamed {
+            if !self.is_there(old) {
+                continue;
+            }
+            let (old_steps, new_steps) = (steps(old), steps(new));
+            let span = span_of_name(&self.places, &old_steps);
+            if self.is_there(new) {
+                let found = format!("is the old name of `{new}`, and the file has both");
+                self.push(span, (*old).to_owned(), found, "", "delete the old one");
+                take_value(&mut self.values, &names(&old_steps).collect::<Vec<_>>());
+                continue;
+            }
+            let line = line_and_column(self.text, span.start).0;
+            notes.push(format!("line {line}: `{old}` is called `{new}` now; this version still reads the old name"));
+            move_place(&mut self.places, &old_steps, &new_steps);
+            move_value(&mut self.values, &old_steps, &new_steps);
+        }
+        notes
+    }
+
     /// Checks the values against a schema. A value that does not fit is reported and removed.
     pub fn hold_against(&mut self, schema: &Schema) {
         let mut values = toml::Value::Table(std::mem::take(&mut self.values));
@@ -193,13 +219,91 @@ impl<'t> Document<'t> {
     }
 }
 
-/// Returns one problem with a value of a text that was read earlier.
-pub fn problem_at(file: &Path, text: &str, key: &str, [found, allowed, remedy]: [&str; 3]) -> Problems {
+/// Returns one problem with a value of a text that was read earlier. The key has its new name; the text may have the
+/// old one.
+pub fn problem_at(
+    file: &Path,
+    text: &str,
+    renamed: &[RenamedKey],
+    key: &str,
+    [found, allowed, remedy]: [&str; 3],
+) -> Problems {
     let (places, _) = DeTable::parse_recoverable(text);
-    let span = span_of(places.get_ref(), &steps(key));
+    let mut places = places.into_inner();
+    renamed.iter().for_each(|RenamedKey { old, new }| move_place(&mut places, &steps(old), &steps(new)));
+    let span = span_of(&places, &steps(key));
     let [found, allowed, remedy] = [found, allowed, remedy].map(str::to_owned);
     let problem = Problem { span, key: key.to_owned(), found, allowed, remedy };
     Problems { file: file.to_owned(), text: text.to_owned(), problems: vec![problem] }
+}
+
+/// Returns the names of a key that has no index.
+fn names(steps: &[Step]) -> impl DoubleEndedIterator<Item = &str> {
+    steps.iter().filter_map(|step| match step {
+        Step::Key(name) => Some(name.as_str()),
+        Step::Index(_) => None,
+    })
+}
+
+/// Moves the place of a value, with the span of its name.
+fn move_place(root: &mut DeTable, old: &[Step], new: &[Step]) {
+    let Some(taken) = take_place(root, &names(old).collect::<Vec<_>>()) else { return };
+    let mut inside = root;
+    let Some((last, before)) = new.split_last() else { return };
+    for name in names(before) {
+        if !inside.contains_key(name) {
+            let table = Spanned::new(taken.0.clone(), DeValue::Table(DeTable::new()));
+            inside.insert(Spanned::new(taken.0.clone(), name.to_owned().into()), table);
+        }
+        let Some(DeValue::Table(table)) = inside.get_mut(name).map(Spanned::get_mut) else { return };
+        inside = table;
+    }
+    for name in names(std::slice::from_ref(last)) {
+        inside.insert(Spanned::new(taken.0.clone(), name.to_owned().into()), taken.1.clone());
+    }
+}
+
+/// Removes a value, and the tables that become empty by that. Returns the span of its name, and the value.
+fn take_place<'t>(table: &mut DeTable<'t>, names: &[&str]) -> Option<(Range<usize>, Spanned<DeValue<'t>>)> {
+    let (first, rest) = names.split_first()?;
+    if rest.is_empty() {
+        let span = table.get_key_value(*first)?.0.span();
+        return table.remove(*first).map(|value| (span, value));
+    }
+    let DeValue::Table(inside) = table.get_mut(*first)?.get_mut() else { return None };
+    let taken = take_place(inside, rest);
+    if inside.is_empty() {
+        table.remove(*first);
+    }
+    taken
+}
+
+/// Removes a value, and the tables that become empty by that.
+fn take_value(table: &mut toml::Table, names: &[&str]) -> Option<toml::Value> {
+    let (first, rest) = names.split_first()?;
+    if rest.is_empty() {
+        return table.remove(*first);
+    }
+    let inside = table.get_mut(*first)?.as_table_mut()?;
+    let taken = take_value(inside, rest);
+    if inside.is_empty() {
+        table.remove(*first);
+    }
+    taken
+}
+
+/// Moves a value.
+fn move_value(root: &mut toml::Table, old: &[Step], new: &[Step]) {
+    let Some(value) = take_value(root, &names(old).collect::<Vec<_>>()) else { return };
+    let new: Vec<&str> = names(new).collect();
+    let Some((last, before)) = new.split_last() else { return };
+    let mut inside = root;
+    for name in before {
+        let next = inside.entry(*name).or_insert_with(|| toml::Table::new().into());
+        let Some(table) = next.as_table_mut() else { return };
+        inside = table;
+    }
+    inside.insert((*last).to_owned(), value);
 }
 
 /// Splits a key such as `cmm.signals[0].address` into steps.

@@ -47,8 +47,8 @@ use crate::cell::{
     Judgement, Phase, RecordFailure, State, StateName,
 };
 use crate::device::{
-    AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Job, Measurement, Number, PassRecord, Preliminary,
-    Word, hex,
+    AnyCmm, AnyGrinder, Armed, BatchId, Cmm, Grinder, Identified, Interrupt, Job, Measurement, OperatorConfirmation,
+    PassRecord, PreliminaryPoints, hex,
 };
 use crate::formats::{FormatError, LEARNED, ResultFolder, write_json_atomic};
 use crate::journal::{self, Artefact, Entry, Kind};
@@ -241,7 +241,7 @@ enum Then {
     Nothing,
     Execute(Box<Command>),
     Answer { answer: oneshot::Sender<Reply>, accepted: bool, message: String },
-    Confirm { device: Device, word: Word, answer: oneshot::Sender<Result<(), String>> },
+    Confirm { device: Device, word: OperatorConfirmation, answer: oneshot::Sender<Result<(), String>> },
 }
 
 /// Converts a change of the channel for orders into an event.
@@ -640,18 +640,20 @@ impl Drive {
     }
 
     /// Returns the machine that a person's confirmation is about, its name in the record, and the confirmation.
-    fn word(&self, request: &Request) -> Result<(Device, &'static str, Word), String> {
+    fn word(&self, request: &Request) -> Result<(Device, &'static str, OperatorConfirmation), String> {
         let at_work = self.cell.state().phase().and_then(Phase::moving);
         let job = || at_work.ok_or("no job of a machine is under way");
         let identity = |map: &Option<String>| map.as_ref().map(|digits| self.named_map(digits)).transpose();
         Ok(match request {
-            Request::Started { map } => (job()?, "started", Word::Started { map_identity: identity(map)? }),
+            Request::Started { map } => {
+                (job()?, "started", OperatorConfirmation::Started { map_identity: identity(map)? })
+            }
             Request::Done { map, file } => {
-                (job()?, "done", Word::Done { map_identity: identity(map)?, file: file.clone() })
+                (job()?, "done", OperatorConfirmation::Done { map_identity: identity(map)?, file: file.clone() })
             }
             Request::Still { device } => {
                 let device = device.or(at_work).ok_or("say which machine stands: --machine cmm, or grinder")?;
-                (device, "still", Word::Still)
+                (device, "still", OperatorConfirmation::Still)
             }
             _ => return Err("that is no word about a machine".into()),
         })
@@ -712,11 +714,11 @@ impl Drive {
     }
 
     /// Shows the preliminary figures of a measurement that still runs.
-    fn preview(&mut self, preliminary: &Preliminary) {
+    fn preview(&mut self, preliminary: &PreliminaryPoints) {
         let number = self.cell.cycle();
-        let asked = Number { cycle: number, batch: self.cycles.batch(number) };
+        let asked = BatchId { cycle: number, batch: self.cycles.batch(number) };
         let plan = self.cycles.get(number).and_then(|cycle| cycle.plan.clone());
-        match plan.filter(|_| preliminary.job.job == self.job && preliminary.job.number() == asked) {
+        match plan.filter(|_| preliminary.job.job == self.job && preliminary.job.batch_id() == asked) {
             Some(plan) => self.touching.take(&plan, preliminary),
             None => self.touching.forget(),
         }
@@ -729,15 +731,15 @@ impl Drive {
         let Some(cycle) = self.cycles.get(number) else { return Some(format!("there is no pass of cycle {number}")) };
         let (map, pass) = self.task.payloads(&cycle.correction);
         let job = Job { job: self.job, cycle: number as u16, digest: 0 };
-        let largest_depth_mm = self.task.limits.largest_depth_mm;
+        let max_depth_mm = self.task.limits.max_depth_mm;
         let outline = self.task.nominal.outline();
-        let told = pass_record::Told { job, pass: &pass, map_identity: map.identity(), largest_depth_mm, outline };
+        let told = pass_record::Told { job, pass: &pass, map_identity: map.identity(), max_depth_mm, outline };
         pass_record::flaw(&told, record)
     }
 
     /// Records and shows the speed of the transfer of points.
     async fn transferred(&mut self, measurement: &Measurement, taken: Duration) {
-        let cycle = Number::of(measurement.cycle).cycle;
+        let cycle = BatchId::decode(measurement.cycle).cycle;
         let (points, seconds) = (measurement.points.len(), taken.as_secs_f64());
         let ms_per_point = 1e3 * seconds / points.max(1) as f64;
         let payload = json!({ "transfer": { "points": points, "seconds": seconds, "ms_per_point": ms_per_point, "coordinates": measurement.coordinates } });
@@ -901,7 +903,7 @@ impl Drive {
             Command::AskWhetherClear { device } => self.notify(Notice::AskWhetherClear { device }),
             Command::Prepare { device, cycle } => {
                 let batch = if device == Device::Cmm { self.cycles.batch(cycle) } else { 0 };
-                self.ask(device, Ask::Prepare { number: Number { cycle, batch } }).await;
+                self.ask(device, Ask::Prepare { number: BatchId { cycle, batch } }).await;
             }
             Command::StartMachine { device, cycle } => self.ask(device, Ask::Start { cycle }).await,
             Command::HoldMachine { device } => self.ask_at_once(device, Ask::Hold).await,
@@ -1012,7 +1014,7 @@ impl Drive {
 
     /// Checks the points of a measurement and writes them.
     fn gate(&mut self, measurement: Box<Measurement>) {
-        let number = Number::of(measurement.cycle).cycle;
+        let number = BatchId::decode(measurement.cycle).cycle;
         let cycle = self.cycles.get(number).cloned();
         let earlier = self.cycles.measured_before(number);
         self.compute(Computation::Gate, number, move |task, files| {

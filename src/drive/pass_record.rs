@@ -28,14 +28,14 @@ pub(super) struct Told<'t> {
     pub(super) pass: &'t Pass,
     pub(super) map_identity: [u8; 32],
     /// Maximum removal of one pass at any place.
-    pub(super) largest_depth_mm: f64,
+    pub(super) max_depth_mm: f64,
     /// Outline of the part, if one was stated.
     pub(super) outline: Option<&'t Aperture>,
 }
 
 /// Returns the first implausible figure of a record, with its limit. A figure that was not reported is not checked.
 pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
-    let Told { job, pass, map_identity, largest_depth_mm, outline } = told;
+    let Told { job, pass, map_identity, max_depth_mm, outline } = told;
     if (record.job, record.cycle) != (job.job, job.cycle) {
         let (is_job, is_cycle) = (record.job, record.cycle);
         return Some(format!("it is of job {is_job}, cycle {is_cycle}; {}, {} was ground", job.job, job.cycle));
@@ -48,7 +48,7 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
     if record.outcome != Outcome::Complete {
         return None; // A pass that did not come to its end is judged by that alone.
     }
-    if let Some(flaw) = record.flaw() {
+    if let Some(flaw) = record.range_violation() {
         return Some(flaw);
     }
     let range = |value: Option<f64>, what: &str, least: f64, most: f64, unit: &str| {
@@ -67,7 +67,7 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
         None => LEAST_SHARE_OF_RECTANGLE * tracks_mm,
     };
     // The pass crosses the part once for each cut of the removal, once to finish, and then to spark out.
-    let times = (largest_depth_mm / pass.depth_of_cut_mm).ceil() + 1.0 + f64::from(pass.spark_out_passes);
+    let times = (max_depth_mm / pass.depth_of_cut_mm).ceil() + 1.0 + f64::from(pass.spark_out_passes);
     let most_path_mm = MOST_PATH_SHARE * tracks_mm * times;
     // Roughing and moves in the air may be faster than the feed. The last tracks need at least this time.
     let least_s = least_path_mm / (pass.feed_mm_min / 60.0);
@@ -75,12 +75,12 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
     let measured_s = record.duration_s.filter(|_| record.path_mm.is_some());
     let wheel = [1.0 - WHEEL_SHARE, 1.0 + WHEEL_SHARE].map(|share| share * pass.wheel_radius_mm);
     let any = f64::INFINITY;
-    let most_mm = DEPTH_SHARE * largest_depth_mm + DEPTH_SLACK_MM;
+    let most_mm = DEPTH_SHARE * max_depth_mm + DEPTH_SLACK_MM;
     let most_mm3 = STEEPNESS * width * height * most_mm;
     range(record.path_mm, "the path travelled", least_path_mm, any, "mm")
         .or_else(|| range(record.path_mm, "the path travelled", -any, most_path_mm, "mm"))
         .or_else(|| range(measured_s, "its duration", least_s, any, "s"))
-        .or_else(|| range(record.deepest_mm, "the largest depth taken off", -any, most_mm, "mm"))
+        .or_else(|| range(record.max_depth_mm, "the largest depth taken off", -any, most_mm, "mm"))
         .or_else(|| range(record.wheel_radius_mm, "the radius of the wheel", wheel[0], wheel[1], "mm"))
         .or_else(|| range(record.removed_mm3, "the volume removed", 0.0, most_mm3, "mm3"))
         .or_else(|| contradiction(record))
@@ -88,9 +88,9 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
 
 /// Returns a contradiction between figures of a record: a wheel that cut must have removed material.
 fn contradiction(record: &PassRecord) -> Option<String> {
-    let (removed_mm3, deepest_mm) = (record.removed_mm3?, record.deepest_mm?);
-    (removed_mm3 == 0.0 && deepest_mm > 0.0)
-        .then(|| format!("the volume removed is 0 mm3, and the largest depth taken off is {deepest_mm:.4} mm"))
+    let (removed_mm3, max_depth_mm) = (record.removed_mm3?, record.max_depth_mm?);
+    (removed_mm3 == 0.0 && max_depth_mm > 0.0)
+        .then(|| format!("the volume removed is 0 mm3, and the largest depth taken off is {max_depth_mm:.4} mm"))
 }
 
 /// Formats a figure for a message. An absurd value is not written with hundreds of digits.
@@ -103,7 +103,7 @@ pub(super) fn document(record: &PassRecord) -> Value {
     json!({
         "path_mm": record.path_mm,
         "removed_mm3": record.removed_mm3,
-        "deepest_mm": record.deepest_mm,
+        "deepest_mm": record.max_depth_mm,
         "idle_share": record.idle_share,
         "spindle_load": record.spindle_load,
         "wheel_radius_mm": record.wheel_radius_mm,
@@ -135,7 +135,7 @@ mod tests {
             outcome: Outcome::Complete,
             path_mm: Some(13_000.0),
             removed_mm3: Some(900.0),
-            deepest_mm: Some(0.2),
+            max_depth_mm: Some(0.2),
             idle_share: Some(0.1),
             spindle_load: Some(0.4),
             wheel_radius_mm: Some(12.49),
@@ -154,7 +154,7 @@ mod tests {
 
     fn judged_of(outline: Option<&Aperture>, record: &PassRecord) -> Option<String> {
         let job = Job { job: 41, cycle: 2, digest: 0 };
-        flaw(&Told { job, pass: &pass(), map_identity: [3; 32], largest_depth_mm: 0.5, outline }, record)
+        flaw(&Told { job, pass: &pass(), map_identity: [3; 32], max_depth_mm: 0.5, outline }, record)
     }
 
     #[test]
@@ -175,7 +175,7 @@ mod tests {
             (PassRecord { map_identity: [4; 32], ..record() }, "map 04040404 was ground, and 03030303 was handed over"),
             (PassRecord { job: 40, ..record() }, "it is of job 40, cycle 2; 41, 2 was ground"),
             (PassRecord { cycle: 1, ..record() }, "it is of job 41, cycle 1; 41, 2 was ground"),
-            (PassRecord { deepest_mm: Some(3.0), ..record() }, "3.000 mm, and at most 0.535 mm are allowed"),
+            (PassRecord { max_depth_mm: Some(3.0), ..record() }, "3.000 mm, and at most 0.535 mm are allowed"),
             (
                 PassRecord { path_mm: Some(-1.0), ..record() },
                 "the path travelled is -1.000 mm, and at least 6324.000 mm",
@@ -211,13 +211,13 @@ mod tests {
         let untold = PassRecord {
             path_mm: None,
             removed_mm3: None,
-            deepest_mm: None,
+            max_depth_mm: None,
             idle_share: None,
             wheel_radius_mm: None,
             duration_s: None,
             ..record()
         };
         assert_eq!(judged(&untold), None);
-        assert!(judged(&PassRecord { deepest_mm: Some(f64::NAN), ..record() }).is_some());
+        assert!(judged(&PassRecord { max_depth_mm: Some(f64::NAN), ..record() }).is_some());
     }
 }

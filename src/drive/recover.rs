@@ -163,7 +163,7 @@ async fn at_rest<M: Machine>(
     limit: Duration,
 ) -> Result<Status, RecoverError> {
     let by = Instant::now() + limit;
-    while status.state.moves() {
+    while status.state.is_moving() {
         if Instant::now() > by {
             return Err(RecoverError::Late { device, found: status.state, limit });
         }

@@ -29,7 +29,7 @@ use super::task::Product;
 use super::work;
 use super::{Computation, Task, batch_folder, folder_of, made};
 use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, Gate, Judgement};
-use crate::device::{Armed, Coordinates, Identified, Number, digest};
+use crate::device::{Armed, BatchId, Coordinates, Identified, digest};
 use crate::formats::{self, FormatError, ScratchFolder};
 use crate::journal::{Artefact, JournalError, Kind, Reader, Record, sha256_hex};
 
@@ -116,7 +116,7 @@ impl Interrupted {
         let Some(intent) = intent.and_then(|value| serde_json::from_value::<Intent>(value).ok()) else {
             return (None, false);
         };
-        let cycle = Number::of(intent.cycle).cycle;
+        let cycle = BatchId::decode(intent.cycle).cycle;
         let state = self.cell.state();
         let at_work = state.phase().map_or(!state.is_end(), |phase| phase.moving() == Some(device));
         (Some((cycle, intent.armed())), at_work && cycle == self.cell.cycle())
@@ -381,7 +381,7 @@ impl<'t> Replay<'t> {
     fn check_armed(&mut self, device: Device) -> Result<(), ReplayError> {
         let Some(value) = self.found.armed[device as usize].clone() else { return Ok(()) };
         let intent: Intent = serde_json::from_value(value).map_err(|error| self.unreadable(&error))?;
-        let Number { cycle: number, batch } = Number::of(intent.cycle);
+        let BatchId { cycle: number, batch } = BatchId::decode(intent.cycle);
         let Some(cycle) = self.found.cycles.get(number) else { return Ok(()) };
         // A preparation from before the plan of the next batch is over.
         if device == Device::Cmm && cycle.batch != batch {

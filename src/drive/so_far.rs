@@ -3,7 +3,7 @@
 
 use regrind_control::SoFar;
 
-use crate::device::{Coordinates, Job, MeasuredPoint, Plan, PointStatus, Preliminary, TargetKind};
+use crate::device::{Coordinates, Job, MeasuredPoint, Plan, PointStatus, PreliminaryPoints, TargetKind};
 
 /// Sums over the touches of the part received for a job so far.
 #[derive(Debug, Default)]
@@ -19,8 +19,8 @@ pub(super) struct Touching {
 impl Touching {
     /// Adds new points. Points that do not continue the previous ones, or do not belong to the plan, discard everything
     /// received so far.
-    pub(super) fn take(&mut self, plan: &Plan, preliminary: &Preliminary) {
-        let Preliminary { job, from, points, coordinates } = preliminary;
+    pub(super) fn take(&mut self, plan: &Plan, preliminary: &PreliminaryPoints) {
+        let PreliminaryPoints { job, first_index: from, points, coordinates } = preliminary;
         if *from == 0 {
             *self = Self { job: Some(*job), ..Self::default() };
         }
@@ -31,7 +31,7 @@ impl Touching {
             return self.forget();
         }
         self.came += points.len();
-        let part = points.iter().zip(due).filter(|(_, target)| target.what == TargetKind::Part);
+        let part = points.iter().zip(due).filter(|(_, target)| target.kind == TargetKind::Part);
         for (point, target) in part.filter(|(point, _)| point.status == PointStatus::Touched) {
             let ball_mm = if *coordinates == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
             self.add(deviation_mm(point, &target.point_mm, &target.normal, ball_mm));
@@ -60,7 +60,7 @@ impl Touching {
 /// Returns the signed distance of a touch from its target along the normal: the error of the part and of its place
 /// together.
 fn deviation_mm(point: &MeasuredPoint, target_mm: &[f64; 3], normal: &[f64; 3], ball_mm: f64) -> f64 {
-    (0..3).map(|k| (point.at_mm[k] - target_mm[k]) * normal[k]).sum::<f64>() - ball_mm
+    (0..3).map(|k| (point.position_mm[k] - target_mm[k]) * normal[k]).sum::<f64>() - ball_mm
 }
 
 #[cfg(test)]
@@ -73,7 +73,7 @@ mod tests {
     fn plan() -> Plan {
         let target = |index: u32| Target {
             index,
-            what: if index == 0 { TargetKind::ReferenceSphere } else { TargetKind::Part },
+            kind: if index == 0 { TargetKind::ReferenceSphere } else { TargetKind::Part },
             point_mm: [f64::from(index), 0.0, 5.0],
             normal: [0.6, 0.0, 0.8],
         };
@@ -84,20 +84,20 @@ mod tests {
             search_mm: 1.0,
             speed_mm_s: 2.0,
             safe_height_mm: 20.0,
-            careful: None,
+            careful_start: None,
         }
     }
 
     /// Centres that are higher than the plan by the given values, and each a little to the side, which is no deviation.
-    fn centres(from: u32, proud_mm: &[f64]) -> Preliminary {
+    fn centres(from: u32, proud_mm: &[f64]) -> PreliminaryPoints {
         let point = |(index, proud): (u32, &f64)| MeasuredPoint {
             index,
             status: PointStatus::Touched,
             quality: 0,
-            at_mm: [f64::from(index) + (2.0 + proud) * 0.6 + 0.8, 0.3, 5.0 + (2.0 + proud) * 0.8 - 0.6],
+            position_mm: [f64::from(index) + (2.0 + proud) * 0.6 + 0.8, 0.3, 5.0 + (2.0 + proud) * 0.8 - 0.6],
         };
         let points = (from..).zip(proud_mm).map(point).collect();
-        Preliminary { job: JOB, from: from as usize, points, coordinates: Coordinates::Centres }
+        PreliminaryPoints { job: JOB, first_index: from as usize, points, coordinates: Coordinates::Centres }
     }
 
     #[test]
@@ -118,9 +118,9 @@ mod tests {
     fn what_does_not_follow_or_is_of_another_plan_makes_it_nothing() {
         for wrong in [
             centres(3, &[0.001]),
-            Preliminary { job: Job { job: 2, ..JOB }, ..centres(2, &[0.001]) },
-            Preliminary { from: 2, ..centres(3, &[0.001]) },
-            Preliminary { from: usize::MAX - 1, ..centres(3, &[0.001]) },
+            PreliminaryPoints { job: Job { job: 2, ..JOB }, ..centres(2, &[0.001]) },
+            PreliminaryPoints { first_index: 2, ..centres(3, &[0.001]) },
+            PreliminaryPoints { first_index: usize::MAX - 1, ..centres(3, &[0.001]) },
             centres(2, &[0.001; 9]),
         ] {
             let mut touching = Touching::default();

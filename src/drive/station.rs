@@ -19,8 +19,9 @@ use crate::cell::{
     Asked, Condition, Device, Event, Gate, GateFailure, JobResult, Mismatch, Occupation, Reconciliation,
 };
 use crate::device::{
-    Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Number,
-    Outcome, Pass, PassRecord, Plan, Preliminary, Reconciled, SignalValue, State, Status, Word, digest,
+    Armed, BatchId, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement,
+    OperatorConfirmation, Outcome, Pass, PassRecord, Plan, PreliminaryPoints, Reconciled, SignalValue, State, Status,
+    digest,
 };
 
 /// Request to a machine. The answers are the events that [`crate::cell::Command`] names.
@@ -28,7 +29,7 @@ pub(super) enum Ask {
     Connect,
     Load { cycle: u32, load: Load },
     VerifyClear,
-    Prepare { number: Number },
+    Prepare { number: BatchId },
     Start { cycle: u32 },
     Hold,
     Resume,
@@ -38,7 +39,7 @@ pub(super) enum Ask {
     Reconcile { cycle: u32 },
     Collect { cycle: u32 },
     Acknowledge,
-    Confirm { word: Word, answer: oneshot::Sender<Result<(), String>> },
+    Confirm { word: OperatorConfirmation, answer: oneshot::Sender<Result<(), String>> },
 }
 
 /// Payload for one machine or the other.
@@ -71,7 +72,7 @@ pub(super) struct StationReport {
     pub(super) detail: Option<serde_json::Value>,
     pub(super) fetched: Option<Fetched>,
     /// Points that a CMM gives while it still measures.
-    pub(super) preliminary: Option<Preliminary>,
+    pub(super) preliminary: Option<PreliminaryPoints>,
     /// Information about a machine for a person, if it has changed.
     pub(super) notes: Option<Notes>,
     /// Files of the run folder that came with a person's confirmation, to be recorded.
@@ -87,7 +88,7 @@ pub(super) trait StationDriver: Send + 'static {
     fn load(&mut self, load: &Load, interrupt: &Interrupt) -> impl Future<Output = Result<u32, DeviceError>> + Send;
     fn fetch(&mut self, job: Job, interrupt: &Interrupt) -> impl Future<Output = Result<Fetched, DeviceError>> + Send;
     /// Reads new preliminary data while the job still runs; see [`Cmm::read_ahead`].
-    fn read_ahead(&mut self, _job: Job, _: &Interrupt) -> impl Future<Output = Option<Preliminary>> + Send {
+    fn read_ahead(&mut self, _job: Job, _: &Interrupt) -> impl Future<Output = Option<PreliminaryPoints>> + Send {
         std::future::ready(None)
     }
 }
@@ -115,7 +116,11 @@ impl<C: Cmm + 'static> StationDriver for CmmDriver<C> {
         Ok(Fetched::Points(Box::new(measurement), began.elapsed()))
     }
 
-    fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> impl Future<Output = Option<Preliminary>> + Send {
+    fn read_ahead(
+        &mut self,
+        job: Job,
+        interrupt: &Interrupt,
+    ) -> impl Future<Output = Option<PreliminaryPoints>> + Send {
         self.0.read_ahead(job, interrupt)
     }
 }
@@ -404,7 +409,7 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     fn is_at_another_job(&self, status: &Status) -> bool {
-        let at_a_job = status.state.moves() || matches!(status.state, State::Held | State::Complete);
+        let at_a_job = status.state.is_moving() || matches!(status.state, State::Held | State::Complete);
         at_a_job && status.job.is_none_or(|job| job.job != self.job)
     }
 
@@ -446,7 +451,7 @@ impl<B: StationDriver> MachineTask<B> {
                 let message = |clear: &str| format!("{name} is {} and {clear}", status.state);
                 self.tell(match status.clear_of_part {
                     Some(false) => Event::Obstructed { device, message: message("not clear of the part") },
-                    _ if status.state.moves() => Event::Obstructed { device, message: message("may be moving") },
+                    _ if status.state.is_moving() => Event::Obstructed { device, message: message("may be moving") },
                     Some(true) => Event::Cleared { device },
                     None => Event::ClearUnknown { device },
                 })
@@ -456,14 +461,14 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    async fn prepare(&mut self, number: Number) {
+    async fn prepare(&mut self, number: BatchId) {
         let cycle = number.cycle;
         self.armed = None;
         let Some(digest) = self.loaded else {
             let why = "nothing was loaded for it".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Prepare, why }).await;
         };
-        let job = Job { job: self.job, cycle: number.seen(), digest };
+        let job = Job { job: self.job, cycle: number.encode(), digest };
         let prepared = async {
             // A preparation whose answer was lost is still active but unknown here, so ask the machine.
             if self.driver.machine().status().await?.state == State::Prepared {
@@ -484,7 +489,7 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     async fn start(&mut self, cycle: u32) {
-        let armed = self.armed.clone().filter(|armed| armed.job.number().cycle == cycle);
+        let armed = self.armed.clone().filter(|armed| armed.job.batch_id().cycle == cycle);
         let Some(armed) = armed else {
             let why = "it is not prepared".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Start, why }).await;
@@ -505,7 +510,7 @@ impl<B: StationDriver> MachineTask<B> {
         match self.driver.machine().start(armed).await {
             Ok(started) => {
                 self.seen.state = Some(State::Execute);
-                self.seen.at_job = started.status.state.moves();
+                self.seen.at_job = started.status.state.is_moving();
                 let detail = serde_json::json!({ "start_sequence": started.start_sequence });
                 self.tell_with(Event::Started { device: B::DEVICE, cycle }, Some(detail)).await;
             }
@@ -537,7 +542,7 @@ impl<B: StationDriver> MachineTask<B> {
                 // Already on its way to HELD, by its key or a button: the next status reads see it arrive.
                 Ok(status) if status.state == State::Holding => self.note(&status).await,
                 Ok(status) if status.state == State::Complete && self.seen.running => self.note(&status).await,
-                Ok(status) if !status.state.moves() => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
+                Ok(status) if !status.state.is_moving() => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
                 Ok(_) => self.failed(Asked::Hold, error).await,
                 Err(error) => self.lost(&error).await,
             },
@@ -563,7 +568,7 @@ impl<B: StationDriver> MachineTask<B> {
             }
             Err(error) if error.is_link() => self.lost(&error).await,
             Err(error) => match self.driver.machine().status().await {
-                Ok(status) if !status.state.moves() => self.note(&status).await,
+                Ok(status) if !status.state.is_moving() => self.note(&status).await,
                 _ => self.failed(Asked::Stop, error).await,
             },
         }
@@ -612,7 +617,7 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     async fn reconcile(&mut self, cycle: u32) {
-        let Some(armed) = self.armed.clone().filter(|armed| armed.job.number().cycle == cycle) else {
+        let Some(armed) = self.armed.clone().filter(|armed| armed.job.batch_id().cycle == cycle) else {
             // The machine cannot be asked about a job that this program has not prepared, and nothing is concluded.
             let why = "this program has no preparation of this cycle to ask it for".to_owned();
             let outcome = Reconciliation::Unknown(why);
@@ -633,7 +638,7 @@ impl<B: StationDriver> MachineTask<B> {
                 self.seen.running = false;
                 Reconciliation::NotStarted
             }
-            Ok(Reconciled::Unknown { why }) => Reconciliation::Unknown(why),
+            Ok(Reconciled::Unknown { reason: why }) => Reconciliation::Unknown(why),
             Ok(answer) => Reconciliation::Unknown(format!("an answer that nobody here knows: {answer:?}")),
             Err(error) if error.is_link() => return self.lost(&error).await,
             Err(error) => Reconciliation::Unknown(error.to_string()),
@@ -647,7 +652,7 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     async fn collect(&mut self, cycle: u32) {
-        let armed = self.armed.as_ref().filter(|armed| armed.job.number().cycle == cycle);
+        let armed = self.armed.as_ref().filter(|armed| armed.job.batch_id().cycle == cycle);
         let Some(job) = armed.map(|armed| armed.job) else {
             let why = "no job of this run is known to it".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Collect, why }).await;
@@ -680,7 +685,7 @@ impl<B: StationDriver> MachineTask<B> {
         };
         match acknowledged.await {
             // A result that does not exist yet is not acknowledged.
-            Ok(status) if status.state.moves() || status.state == State::Held => {
+            Ok(status) if status.state.is_moving() || status.state == State::Held => {
                 let (device, why) =
                     (B::DEVICE, format!("{} is still {}", self.driver.machine().name(), at_work(&status)));
                 self.tell(Event::Refused { device, what: Asked::Discard, why }).await;
@@ -834,7 +839,7 @@ impl<B: StationDriver> MachineTask<B> {
             return;
         }
         let is_another = status.job.is_some_and(|job| job.job != self.job);
-        let at_a_job = status.state.moves() || matches!(status.state, State::Held | State::Complete);
+        let at_a_job = status.state.is_moving() || matches!(status.state, State::Held | State::Complete);
         if at_a_job && !is_another {
             (self.seen.at_job, self.seen.absent) = (true, 0);
         }
@@ -927,7 +932,7 @@ impl<B: StationDriver> MachineTask<B> {
 
     /// Reports when a signal leaves its range, and when all signals have been in range for a while.
     async fn note_signals(&mut self, status: &Status) {
-        let flaws: Vec<String> = status.signals.iter().filter_map(SignalValue::flaw).collect();
+        let flaws: Vec<String> = status.signals.iter().filter_map(SignalValue::problem).collect();
         let (device, condition) = (B::DEVICE, Condition::Signals);
         if !flaws.is_empty() {
             self.seen.signals_good_since = None;
@@ -1046,7 +1051,7 @@ fn unusable(error: &DeviceError) -> Option<GateFailure> {
         DeviceError::NotFinite { .. }
         | DeviceError::OutOfRange { .. }
         | DeviceError::Unlisted { .. }
-        | DeviceError::Count { .. } => Some(GateFailure::Broken(error.to_string())),
+        | DeviceError::WrongCount { .. } => Some(GateFailure::Broken(error.to_string())),
         DeviceError::Mismatch { .. } => Some(GateFailure::Foreign(error.to_string())),
         _ => None,
     }
@@ -1056,7 +1061,7 @@ fn mismatch(error: &DeviceError) -> Mismatch {
     let message = error.to_string();
     match error {
         DeviceError::WrongWordOrder { .. } => Mismatch::WordOrder(message),
-        DeviceError::Inches { .. } => Mismatch::Inches,
+        DeviceError::WrongLengthUnit { .. } => Mismatch::Inches,
         DeviceError::Refused { answer: crate::device::Answer::NotOwner, .. } => Mismatch::Owned(message),
         error if error.is_link() => Mismatch::Unreachable(message),
         _ => Mismatch::WrongDevice(message),

@@ -9,7 +9,7 @@ use crate::compensation::{
     Alike, Contact, Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError,
     ParameterKind, ParameterOptions, Parameters, Set, WheelTerm,
 };
-use crate::device::{Careful, Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
+use crate::device::{CarefulStart, Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
 use crate::formats::gcode::GcodeError;
 use crate::formats::{CellRun, CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
 use crate::geometry::{Grid, Point, Pose, Sample, Vector};
@@ -120,7 +120,7 @@ pub struct Adaptive {
     /// Probability with which a part that is out of tolerance may be accepted.
     pub accepted_risk: f64,
     /// Maximum number of passes of the grinder.
-    pub most_cycles: u32,
+    pub max_cycles: u32,
 }
 
 impl Adaptive {
@@ -539,15 +539,15 @@ impl Task {
         let rest = rest.iter().map(|t| on_part(t));
         let targets = begin.chain(sphere).chain(rest).enumerate().map(|(index, (what, point, normal))| Target {
             index: index as u32,
-            what,
+            kind: what,
             point_mm: point.into(),
             normal: normal.into(),
         });
         let Probing { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm } = self.probing;
         let targets: Vec<_> = targets.collect();
-        let slowly = Careful { targets: first.len() as u32, speed_mm_s: CAREFUL_SHARE * speed_mm_s };
+        let slowly = CarefulStart { target_count: first.len() as u32, speed_mm_s: CAREFUL_SHARE * speed_mm_s };
         let careful = (!first.is_empty()).then_some(slowly);
-        Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful }
+        Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful_start: careful }
     }
 
     /// Writes the correction of a pass, with the identity of the one that it replaces.

@@ -2,7 +2,7 @@
 
 use super::task::{Adaptive, Again, ControlPoint, Cycle, Points, Task};
 use crate::compensation::{ErrorMap, told_map};
-use crate::device::Number;
+use crate::device::BatchId;
 use crate::geometry::{Sample, Vector};
 use crate::measuring::Target;
 use crate::model::{
@@ -12,7 +12,7 @@ use crate::registration::{Deviation, PointStatus, Registration};
 use crate::surface::{OffsetSurface, Place, Side};
 
 // After the maximum number of batches follows one with all remaining targets. The batch numbers must be unique.
-const _: () = assert!(MAX_BATCHES < Number::BATCHES - 1);
+const _: () = assert!(MAX_BATCHES < BatchId::MAX_BATCHES - 1);
 
 /// Result of an evaluation.
 pub(super) struct Looked {
@@ -43,7 +43,7 @@ pub(super) fn look(
         return Looked { form: Err(why.to_owned()), next: Some((short_tour(&places, first), why)) };
     }
     let so_far = PartialMeasurement { targets: &places, tried: &tried, touched: &points.of };
-    let purpose = adaptive.purpose(u32::from(cycle.correction.cycle) < adaptive.most_cycles);
+    let purpose = adaptive.purpose(u32::from(cycle.correction.cycle) < adaptive.max_cycles);
     let given = ModelInputs { look_risk: adaptive.look_risk(), probability: adaptive.tolerance.probability, ..given };
     match model::decide(found, &given, &so_far, &purpose, u64::from(number)) {
         Ok(look) => {
@@ -77,7 +77,7 @@ pub(super) fn again(task: &Task, found: &Registration, points: &Points, noise_si
     /// Cosine of the angle between two directions, above which a neighbour is in the same direction as another one.
     const SAME_WAY: f64 = 0.7;
     let alone: Vec<usize> = found.left_out().map(|(k, _)| k).collect();
-    if task.targets.is_empty() || alone.is_empty() || alone.len() > MOST || points.rounds + 2 >= Number::BATCHES {
+    if task.targets.is_empty() || alone.is_empty() || alone.len() > MOST || points.rounds + 2 >= BatchId::MAX_BATCHES {
         return None;
     }
     let on_part: Vec<&Deviation> = found.deviations.iter().filter(|d| d.status != PointStatus::OffPart).collect();

@@ -15,7 +15,7 @@ use crate::cell::{
     LeftOut, ParameterTold, Response, TouchOn,
 };
 use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassError, Seen, Sense, error_map, response};
-use crate::device::{BesidePlan, Coordinates, Identified, MeasuredPoint, Measurement, Plan, PointStatus, TargetKind};
+use crate::device::{Coordinates, Identified, MeasuredPoint, Measurement, Plan, PlanMismatch, PointStatus, TargetKind};
 use crate::form::pv_of_most;
 use crate::formats::{
     FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_form, save_registration,
@@ -44,7 +44,7 @@ pub(super) fn gate_cycle(
     let before = cycle.filter(|_| task.adaptive.is_some());
     let so_far = before.and_then(|cycle| cycle.points.as_deref());
     let again = cycle.and_then(|cycle| Some((cycle.again.as_deref()?, cycle.points.as_deref()?)));
-    let planned = plan.targets.iter().filter(|t| t.what == TargetKind::Part).count() as u32;
+    let planned = plan.targets.iter().filter(|t| t.kind == TargetKind::Part).count() as u32;
     let planned = planned + so_far.map_or(0, |points| points.tried.iter().map(Vec::len).sum::<usize>() as u32);
     let unusable = foreign(task, &plan, measurement)
         .or_else(|| given_again(task, earlier, measurement))
@@ -109,9 +109,9 @@ fn touched_again(again: &Again, points: &Points, measurement: &Measurement) -> R
     let mut all = points.clone();
     all.rounds += 1;
     for (point, &number) in repeated.iter().zip(&again.points).filter(|(p, _)| p.status == PointStatus::Touched) {
-        all.part[number] = point.at_mm.into();
+        all.part[number] = point.position_mm.into();
     }
-    all.part.extend(around.iter().filter(|p| p.status == PointStatus::Touched).map(|p| Point::from(p.at_mm)));
+    all.part.extend(around.iter().filter(|p| p.status == PointStatus::Touched).map(|p| Point::from(p.position_mm)));
     Ok((all, found as u32))
 }
 
@@ -124,7 +124,7 @@ fn touched_again(again: &Again, points: &Points, measurement: &Measurement) -> R
 fn check_controls(again: &Again, points: &Points, repeated: &[MeasuredPoint]) -> Result<(), GateFailure> {
     let pairs = again.controls.iter().zip(repeated).filter(|(_, p)| p.status == PointStatus::Touched);
     let change_mm = |control: &ControlPoint, now: &MeasuredPoint| {
-        (Point::from(now.at_mm) - points.part[control.point]).dot(&control.normal).abs()
+        (Point::from(now.position_mm) - points.part[control.point]).dot(&control.normal).abs()
     };
     let mut changes_mm: Vec<f64> = pairs.map(|(control, now)| change_mm(control, now)).collect();
     changes_mm.sort_by(|a, b| b.total_cmp(a));
@@ -148,11 +148,11 @@ fn check_controls(again: &Again, points: &Points, repeated: &[MeasuredPoint]) ->
 /// Returns the touched points of the part and of the reference sphere. A machine without a plan of this program gives
 /// the points that the operator took.
 fn touched(plan: &Plan, planned: u32, measurement: &Measurement) -> [Vec<Point>; 2] {
-    let taken = measurement.points.iter().filter(|p| p.status == PointStatus::Touched).map(|p| p.at_mm.into());
+    let taken = measurement.points.iter().filter(|p| p.status == PointStatus::Touched).map(|p| p.position_mm.into());
     let of = |kind: TargetKind| -> Vec<Point> {
         let pairs = measurement.points.iter().zip(&plan.targets);
-        let touched = pairs.filter(|(p, t)| p.status == PointStatus::Touched && t.what == kind);
-        touched.map(|(p, _)| p.at_mm.into()).collect()
+        let touched = pairs.filter(|(p, t)| p.status == PointStatus::Touched && t.kind == kind);
+        touched.map(|(p, _)| p.position_mm.into()).collect()
     };
     let part = if planned == 0 { taken.collect() } else { of(TargetKind::Part) };
     [part, of(TargetKind::ReferenceSphere)]
@@ -176,7 +176,7 @@ fn gate(
     if planned > 0 && share + spared < task.least_found {
         let limit = 100.0 * task.least_found;
         return Err(GateFailure::Coverage(format!(
-            "{found} of {planned} points were found, {:.1} %, and the recipe asks for {limit:.1} % (minimum_coverage)",
+            "{found} of {planned} points were found, {:.1} %, and the recipe asks for {limit:.1} % (min_coverage)",
             100.0 * share
         )));
     }
@@ -219,7 +219,7 @@ impl Touches {
     fn and(so_far: Option<&Points>, asked: &[usize], plan: &Plan, measurement: &Measurement) -> Self {
         let (mut tried, mut of) = so_far.map(|points| (points.tried.clone(), points.of.clone())).unwrap_or_default();
         if !asked.is_empty() {
-            let pairs = measurement.points.iter().zip(&plan.targets).filter(|(_, t)| t.what == TargetKind::Part);
+            let pairs = measurement.points.iter().zip(&plan.targets).filter(|(_, t)| t.kind == TargetKind::Part);
             let found = pairs.zip(asked).filter(|((p, _), _)| p.status == PointStatus::Touched);
             of.extend(found.map(|(_, target)| *target));
             tried.push(asked.to_vec());
@@ -267,7 +267,7 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
         let (found, planned) = (measurement.points.len(), plan.targets.len());
         return Some(GateFailure::Broken(format!("{found} points came for {planned} targets")));
     }
-    if let Some(flaw) = measurement.flaw() {
+    if let Some(flaw) = measurement.range_violation() {
         return Some(GateFailure::Broken(flaw));
     }
     let order = measurement.points.iter().zip(&plan.targets).position(|(p, t)| p.index != t.index);
@@ -276,8 +276,8 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
         return Some(GateFailure::Broken(format!("point {} is of target {found}, and target {planned} is due", k + 1)));
     }
     match plan.check(measurement).err()? {
-        BesidePlan::GivenBack if task.rehearsal => None,
-        given_back @ BesidePlan::GivenBack => Some(GateFailure::Foreign(given_back.to_string())),
+        PlanMismatch::EqualsPlan if task.rehearsal => None,
+        given_back @ PlanMismatch::EqualsPlan => Some(GateFailure::Foreign(given_back.to_string())),
         elsewhere => Some(GateFailure::Broken(elsewhere.to_string())),
     }
 }
@@ -292,7 +292,7 @@ fn given_again(task: &Task, earlier: Option<&(u32, Arc<Points>)>, measurement: &
     // Ignore the order of the plan and the points of the reference sphere.
     let bits = |at_mm: [f64; 3]| at_mm.map(f64::to_bits);
     let old: HashSet<_> = points.part.iter().map(|point| bits([point.x, point.y, point.z])).collect();
-    let is_same = touched().filter(|point| old.contains(&bits(point.at_mm))).count() >= old.len();
+    let is_same = touched().filter(|point| old.contains(&bits(point.position_mm))).count() >= old.len();
     (is_same && old.len() >= ALIKE_BY_CHANCE).then(|| {
         let message = format!(
             "the points are those of cycle {number} to the last bit: the machine has given its old result again"
@@ -842,7 +842,7 @@ mod tests {
         let x_mm = [4.0, 0.0, 1.0, 2.0, 3.0, 3.6];
         let points = heights_mm.iter().zip(x_mm).zip(0..).map(|((height, x), index)| MeasuredPoint {
             index,
-            at_mm: [x, 0.0, height.unwrap_or(0.0)],
+            position_mm: [x, 0.0, height.unwrap_or(0.0)],
             status: if height.is_some() { PointStatus::Touched } else { PointStatus::NotFound },
             quality: 0,
         });

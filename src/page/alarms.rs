@@ -224,7 +224,7 @@ catalogue! { german:
     WeakDirections {
         "Die Fläche sagt nicht, wo auf dem Teil eine Korrektur eingeschliffen würde",
         "Es wird keine Korrektur gemacht. Die Fehlerkarte dieses Zyklus liegt im Ordner des Laufs.",
-        ["Die genannten Richtungen im Rezept festhalten (registration.hold), wenn Spannmittel oder Bezugspunkte sie gut genug halten.",
+        ["Die genannten Richtungen im Rezept festhalten (registration.lock), wenn Spannmittel oder Bezugspunkte sie gut genug halten.",
          "Oder Merkmale messen, die sie halten: Kanten, Marken, eine weitere Öffnung.", "Einen neuen Lauf beginnen, der mit einer Messung anfängt."]
     }
     CompensationFailed {
@@ -354,7 +354,7 @@ catalogue! { chinese:
     Temperature { "测量期间温度超出允许范围", "本次测量不予使用。", ["等待工件和室温稳定。", "按 RESUME 重新测量。"] }
     RegistrationFailed { "测量无法与名义面配准", "本次测量不予使用。", ["确认工件与配方中的名义面相符。", "查看运行文件夹中本循环的点。", "按 RESUME 重新测量，或结束运行。"] }
     ComputationLate { "计算超时", "单元在其之前保持。", ["查看计算机是否过载。", "按 RESUME 重新计算。"] }
-    WeakDirections { "该面无法确定修正会磨在工件的何处", "不作修正。本循环的误差图在运行文件夹中。", ["如果夹具或基准点足以固定所列方向，请在配方中固定它们 (registration.hold)。", "或测量能固定它们的特征：边缘、基准标记、更大的孔径。", "开始以测量为起点的新运行。"] }
+    WeakDirections { "该面无法确定修正会磨在工件的何处", "不作修正。本循环的误差图在运行文件夹中。", ["如果夹具或基准点足以固定所列方向，请在配方中固定它们 (registration.lock)。", "或测量能固定它们的特征：边缘、基准标记、更大的孔径。", "开始以测量为起点的新运行。"] }
     CompensationFailed { "没有用于下一次磨削的误差图", "不再磨削。", ["阅读原因和本循环的数值。", "按 RESUME 重新计算，或结束运行。"] }
     ParameterBeyond { "设备的一个参数偏差超出配方给定的公差", "在有人同意之前不会开始下一遍：将按修正后的参数磨削。", ["用其他方法测量：用轮廓或触碰基准测砂轮半径，用千分表测砂轮位置和工件姿态。", "若属实，按 RESUME：下一遍按该参数磨削，补偿图只含剩余部分。", "若不属实，停止运行，改正配方或设备后开始新的运行；compensation.parameters 中没有该键时，全部进入补偿图。"] }
     SignFlipped { "工件对误差图的响应方向相反", "再磨一次会更差；单元保持。", ["检查磨床上误差图的符号：正值留下材料。", "在废件上试磨证明符号正确之前不要按 RESUME。", "结束运行。"] }

@@ -106,7 +106,7 @@ texts! {
     // Column with the current work.
     NextAction { "Your next action", "Ihr nächster Schritt", "您的下一步" }
     TimeLeft { "left", "verbleiben", "剩余" }
-    Preliminary { "preliminary", "vorläufig", "初步" }
+    PreliminaryPoints { "preliminary", "vorläufig", "初步" }
     PreliminaryMeans {
         "from where the plan has the part; not registered, not judged",
         "gegen die Lage des Teils im Plan; nicht eingepasst, nicht beurteilt",
@@ -151,7 +151,7 @@ texts! {
         "零件沿法向的误差，单位微米。方向键移动标记或旋转立体图。"
     }
     KnownTo { "Standard uncertainty of the map, RMS:", "Standardunsicherheit der Karte, RMS:", "误差图的标准不确定度，RMS：" }
-    Filtered { "Of the map, which is filtered:", "Der gefilterten Karte:", "滤波后的图：" }
+    Filtered { "Filtered map (not judged):", "Der gefilterten Karte:", "滤波后的图：" }
     Planned { "planned", "geplant", "计划" }
     Touched { "touched", "angetastet", "已测" }
     // Orders.
@@ -176,7 +176,7 @@ texts! {
         "此处任何按钮都不能代替机器的急停。"
     }
     // Next actions.
-    Nothing { "Nothing: the cell works by itself.", "Nichts: die Zelle arbeitet selbst.", "无：单元自动运行。" }
+    Nothing { "No action needed.", "Nichts: die Zelle arbeitet selbst.", "无：单元自动运行。" }
     Load {
         "Load the part and clamp it. See that wheel and probe are clear of it. Then press THE PART IS LOADED.",
         "Teil laden und spannen. Prüfen, dass Scheibe und Taster frei sind. Dann TEIL IST GELADEN drücken.",
@@ -221,13 +221,13 @@ texts! {
     // States, by PackML's names.
     Idle { "IDLE", "BEREIT", "待机" }
     Starting { "STARTING", "STARTET", "启动中" }
-    Execute { "RUNNING", "LÄUFT", "运行中" }
+    Execute { "EXECUTE", "LÄUFT", "运行中" }
     Holding { "HOLDING", "HÄLT AN", "保持中" }
     Held { "HELD", "ANGEHALTEN", "已保持" }
-    Unholding { "RESUMING", "SETZT FORT", "恢复中" }
+    Unholding { "UNHOLDING", "SETZT FORT", "恢复中" }
     Suspending { "SUSPENDING", "SETZT AUS", "暂停中" }
     Suspended { "SUSPENDED", "AUSGESETZT", "已暂停" }
-    Unsuspending { "GOING ON", "MACHT WEITER", "恢复中" }
+    Unsuspending { "UNSUSPENDING", "MACHT WEITER", "恢复中" }
     Stopping { "STOPPING", "BEENDET", "停止中" }
     Stopped { "STOPPED", "BEENDET", "已停止" }
     Aborting { "ABORTING", "BRICHT AB", "中止中" }

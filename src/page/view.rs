@@ -256,7 +256,7 @@ fn job(live: &Snapshot, language: Language) -> Markup {
         progress max=(total.max(1)) value=(done) aria-label=(device) {}
         @if let Some(SoFar { touched, rms_um, least_um, most_um }) = live.so_far {
             p .quiet title=(Text::PreliminaryMeans.to(language)) {
-                (Text::Preliminary.to(language)) ": " (touched) " " (Text::Touched.to(language))
+                (Text::PreliminaryPoints.to(language)) ": " (touched) " " (Text::Touched.to(language))
                 (format!(", RMS {rms_um:.2} µm, {least_um:+.2} … {most_um:+.2} µm"))
             }
         }

@@ -33,7 +33,7 @@ pub(super) fn check(
     compare_with_part(written, nominal.as_ref(), document);
     compare_tables(written, document);
     measure(&written.measure, document);
-    measuring(written, document);
+    chosen_touches(written, document);
     registration(&written.registration, document);
     acceptance(&written.acceptance, document);
     compensation(&written.compensation, document);
@@ -142,18 +142,18 @@ fn in_place(key: &str, sentence: &str) -> String {
 /// Tolerance for the comparison of two probabilities that are meant to be equal.
 const ROUNDING: f64 = 1e-9;
 
-fn measuring(written: &RecipeFile, document: &mut Document) {
-    let risk = written.measuring.accepted_risk;
-    if written.measuring.mode == Mode::Fixed {
+fn chosen_touches(written: &RecipeFile, document: &mut Document) {
+    let risk = written.measure.accepted_risk;
+    if written.measure.mode == Mode::Fixed {
         if risk.is_some() {
             let remedy = "leave it out, or write `mode = \"adaptive\"`";
-            document.report("measuring.accepted_risk", "is for mode adaptive", "all targets are touched", remedy);
+            document.report("measure.accepted_risk", "is for mode adaptive", "all targets are touched", remedy);
         }
         return;
     }
-    if risk.is_none() && !document.has_problem("measuring.accepted_risk") {
+    if risk.is_none() && !document.has_problem("measure.accepted_risk") {
         document.report(
-            "measuring.accepted_risk",
+            "measure.accepted_risk",
             "is missing",
             "a part of which only some targets are touched may be accepted though it is not in tolerance",
             "consent to a probability for that: `accepted_risk = 0.025`",
@@ -163,7 +163,7 @@ fn measuring(written: &RecipeFile, document: &mut Document) {
         && 1.0 - probability > risk + ROUNDING
     {
         document.report(
-            "measuring.accepted_risk",
+            "measure.accepted_risk",
             format!(
                 "is {risk}, less than the {:.3} that `acceptance.probability`, {probability}, leaves",
                 1.0 - probability
@@ -175,7 +175,7 @@ fn measuring(written: &RecipeFile, document: &mut Document) {
     if written.measure.pattern == PatternWord::Free {
         let remedy = "lay a pattern, or write `mode = \"fixed\"`";
         document.report(
-            "measuring.mode",
+            "measure.mode",
             "is adaptive",
             "targets are chosen from a pattern, and this one is free",
             remedy,
@@ -278,16 +278,16 @@ fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<
 }
 
 fn registration(written: &RegistrationSettings, document: &mut Document) {
-    if !written.hold.is_empty() && written.start == StartAt::Search {
+    if !written.lock.is_empty() && written.start == StartAt::Search {
         document.report(
-            "registration.hold",
+            "registration.lock",
             "holds coordinates while `start` is \"search\"",
             "a held coordinate stays where the fixture has it",
             "write `start = \"fixture\"`, or hold nothing",
         );
     }
-    if Coordinate::locked(&written.hold) == [true; 6] {
-        document.report("registration.hold", "holds all six coordinates", "at least one must be free", "leave one out");
+    if Coordinate::locked(&written.lock) == [true; 6] {
+        document.report("registration.lock", "holds all six coordinates", "at least one must be free", "leave one out");
     }
 }
 
@@ -318,9 +318,7 @@ fn acceptance(written: &Acceptance, document: &mut Document) {
 
 fn compensation(written: &Compensation, document: &mut Document) {
     let budget = written.removal_budget_um;
-    for (key, um) in
-        [("depth_of_cut_um", written.depth_of_cut_um), ("largest_correction_um", written.largest_correction_um)]
-    {
+    for (key, um) in [("depth_of_cut_um", written.depth_of_cut_um), ("max_correction_um", written.max_correction_um)] {
         if um > budget {
             document.report(
                 &format!("compensation.{key}"),
@@ -392,7 +390,7 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
         );
     }
     let registration = &written.registration;
-    let held = Coordinate::locked(&registration.hold);
+    let held = Coordinate::locked(&registration.lock);
     let names = [
         ("wheel_x_um", "x"),
         ("wheel_y_um", "y"),
@@ -404,16 +402,16 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
         if !held[k] {
             document.report(
                 &format!("{KEY}.{key}"),
-                format!("stands while `registration.hold` does not hold {coordinate}"),
+                format!("stands while `registration.lock` does not hold {coordinate}"),
                 "what moves with the registration looks the same as a part that lies elsewhere",
                 &format!("leave it out, or hold \"{coordinate}\" where the fixture does"),
             );
-        } else if registration.hold_uncertainty_um.is_none() {
+        } else if registration.lock_uncertainty_um.is_none() {
             document.report(
                 &format!("{KEY}.{key}"),
-                "stands without `registration.hold_uncertainty_um`",
+                "stands without `registration.lock_uncertainty_um`",
                 "it is told no better than the fixture holds the part",
-                "add it: `hold_uncertainty_um = 0.5` in [registration]",
+                "add it: `lock_uncertainty_um = 0.5` in [registration]",
             );
         }
     }
@@ -486,13 +484,13 @@ fn compare_tables(written: &RecipeFile, document: &mut Document) {
         );
     }
     let (Um(allowance), Um(depth)) = (written.grinding.allowance_um, written.compensation.depth_of_cut_um);
-    let cycles = written.cycle.most_cycles;
+    let cycles = written.cycle.max_cycles;
     if allowance > depth * f64::from(cycles.saturating_sub(1)) {
         document.report(
             "grinding.allowance_um",
             format!("is {allowance} um, which {cycles} cycles of {depth} um never take off"),
             "the last pass must reach the nominal surface",
-            "lower it, or raise `cycle.most_cycles` or `compensation.depth_of_cut_um`",
+            "lower it, or raise `cycle.max_cycles` or `compensation.depth_of_cut_um`",
         );
     }
 }

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use crate::cell::Tolerance;
-use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
+use crate::document::{Document, Problems, RenamedKey, problem_at, read_text, schema_of, sha256};
 use crate::geometry::{Aperture, Pose};
 use crate::measuring::Layout;
 use crate::registration::{self, Coordinate, Start};
@@ -26,8 +26,8 @@ use crate::surface::{DefinedSurface, Projection};
 
 use tables::RecipeFile;
 pub use tables::{
-    Acceptance, Compensation, Cycle, Grinding, Leaning, MachineParameters, Measure, Measuring, Mode, Part,
-    RegistrationSettings, SpindleAxis, StartAt, Tilt, Um, Wheel,
+    Acceptance, Compensation, Cycle, Grinding, Leaning, MachineParameters, Measure, Mode, Part, RegistrationSettings,
+    SpindleAxis, StartAt, Tilt, Um, Wheel,
 };
 
 /// Checked recipe.
@@ -39,8 +39,6 @@ pub struct Recipe {
     pub nominal: NominalSource,
     /// Settings of the measurement.
     pub measure: Measure,
-    /// Selection of the targets that are touched.
-    pub measuring: Measuring,
     /// Pattern of the measured points.
     pub pattern: Pattern,
     /// Settings of the registration.
@@ -58,6 +56,7 @@ pub struct Recipe {
     path: PathBuf,
     text: String,
     source_sha256: [u8; 32],
+    notes: Vec<String>,
 }
 
 /// Format of a table of points in the words of the recipe, for files that do not state it themselves.
@@ -108,6 +107,22 @@ pub enum Pattern {
     },
 }
 
+/// Keys that have a new name since version 0.2.
+const RENAMED: &[RenamedKey] = &[
+    RenamedKey { old: "measuring.mode", new: "measure.mode" },
+    RenamedKey { old: "measuring.accepted_risk", new: "measure.accepted_risk" },
+    RenamedKey { old: "measure.minimum_coverage", new: "measure.min_coverage" },
+    RenamedKey { old: "registration.hold", new: "registration.lock" },
+    RenamedKey { old: "registration.hold_uncertainty_um", new: "registration.lock_uncertainty_um" },
+    RenamedKey { old: "registration.largest_shift_mm", new: "registration.max_shift_mm" },
+    RenamedKey { old: "registration.largest_turn_deg", new: "registration.max_turn_deg" },
+    RenamedKey { old: "registration.least_coverage", new: "registration.min_coverage" },
+    RenamedKey { old: "compensation.least_depth_um", new: "compensation.min_depth_um" },
+    RenamedKey { old: "compensation.largest_correction_um", new: "compensation.max_correction_um" },
+    RenamedKey { old: "compensation.largest_displacement_mm", new: "compensation.max_displacement_mm" },
+    RenamedKey { old: "cycle.most_cycles", new: "cycle.max_cycles" },
+];
+
 static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<RecipeFile>);
 
 /// Returns the JSON schema of a recipe.
@@ -144,6 +159,7 @@ impl Recipe {
     /// Returns all errors of the text.
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
+        let notes = document.rename_keys(RENAMED);
         document.hold_against(&SCHEMA);
         let written: Option<RecipeFile> = document.as_written();
         let made = written.as_ref().map(|written| check::check(written, path, &mut document));
@@ -152,23 +168,12 @@ impl Recipe {
             let found = "something is missing".into();
             return Err(Problems::whole(path, text, found, "compare it with a shipped recipe"));
         };
-        let RecipeFile {
-            part,
-            measure,
-            measuring,
-            registration,
-            acceptance,
-            compensation,
-            grinding,
-            cycle,
-            simulation,
-            ..
-        } = written;
+        let RecipeFile { part, measure, registration, acceptance, compensation, grinding, cycle, simulation, .. } =
+            written;
         Ok(Self {
             part,
             nominal,
             measure,
-            measuring,
             pattern,
             registration,
             acceptance,
@@ -179,12 +184,18 @@ impl Recipe {
             path: path.to_owned(),
             text: text.to_owned(),
             source_sha256: sha256(text),
+            notes,
         })
     }
 
     /// Returns a problem with a key of this recipe that another module found, at the key's place in the text.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
-        problem_at(&self.path, &self.text, key, [found, allowed, remedy])
+        problem_at(&self.path, &self.text, RENAMED, key, [found, allowed, remedy])
+    }
+
+    /// Returns a note for each key that has a new name, with its line. The old names of earlier recipes are read.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// Returns the options of a registration, given the pose of the part in the cell's fixture.
@@ -197,7 +208,7 @@ impl Recipe {
                 StartAt::Fixture => Start::Pose(fixture_cmm_from_model),
             },
             side: self.measure.side,
-            locked: Coordinate::locked(&settings.hold),
+            locked: Coordinate::locked(&settings.lock),
             loss: settings.loss,
             outlier_sigmas: settings.outlier_sigmas,
             rms_limit_mm: settings.max_rms_um.map(Um::mm),
@@ -208,7 +219,7 @@ impl Recipe {
     /// Returns the probability with which a figure must be within its limit. Unless the recipe sets it, the risk of a
     /// wrong acceptance is at most the accepted risk of a measurement with chosen touches.
     pub fn probability(&self) -> f64 {
-        let risk = self.measuring.accepted_risk.filter(|_| self.measuring.mode == Mode::Adaptive);
+        let risk = self.measure.accepted_risk.filter(|_| self.measure.mode == Mode::Adaptive);
         let usual = risk.filter(|risk| *risk < 1.0 - Tolerance::USUAL).map_or(Tolerance::USUAL, |risk| 1.0 - risk);
         self.acceptance.probability.unwrap_or(usual)
     }

@@ -42,8 +42,6 @@ pub(super) struct RecipeFile {
     /// How it is measured.
     #[schemars(extend("x-required" = true))]
     pub measure: Measure,
-    /// Whether all targets are touched, or those that tell most until enough is known.
-    pub measuring: Measuring,
     /// How the measured points are registered.
     pub registration: RegistrationSettings,
     /// When the part is good. At least one of pv_um and rms_um.
@@ -128,18 +126,6 @@ pub(super) enum PatternWord {
 }
 
 /// Which targets are touched.
-#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
-#[serde(default, deny_unknown_fields)]
-pub struct Measuring {
-    /// Which targets are touched.
-    pub mode: Mode,
-    /// The probability with which a part that is not in tolerance may be accepted after touches that were chosen: who writes it consents to
-    /// it. For mode adaptive, which needs it.
-    #[schemars(range(min = 0.01, max = 0.1), example = 0.025)]
-    pub accepted_risk: Option<f64>,
-}
-
-/// Which targets are touched.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mode {
@@ -157,6 +143,12 @@ pub struct Measure {
     /// Radius of the probe, or of the reflector of a tracker.
     #[schemars(range(min = 0.05, max = 50.0), example = 1.5)]
     pub probe_radius_mm: f64,
+    /// Which targets are touched.
+    pub mode: Mode,
+    /// The probability with which a part out of tolerance may be accepted in mode adaptive, which needs this key. By writing it you accept
+    /// this risk.
+    #[schemars(range(min = 0.01, max = 0.1), example = 0.025)]
+    pub accepted_risk: Option<f64>,
     /// On which side of the nominal surface the probe's centres lie.
     pub side: ProbeSide,
     /// Where points are taken.
@@ -202,7 +194,7 @@ pub struct Measure {
     pub safe_height_mm: f64,
     /// Least share of the points asked for that must be touched.
     #[schemars(range(min = 0.1, max = 1.0))]
-    pub minimum_coverage: f64,
+    pub min_coverage: f64,
     /// Whether the reference sphere is touched before the part.
     pub qualify: bool,
     /// How far the radius found on the reference sphere may be from the probe's.
@@ -237,23 +229,23 @@ pub struct RegistrationSettings {
     pub outlier_sigmas: f64,
     /// Coordinates of the model frame that stay as the fixture has them.
     #[schemars(length(max = 6))]
-    pub hold: Vec<Coordinate>,
+    pub lock: Vec<Coordinate>,
     /// The expanded uncertainty (k = 2) of where the fixture holds the part along what is held; of its turns as much at the edge of the
     /// part. What a part held elsewhere would look like is in the ± of its figures. Without it the fixture is taken for exact, and nothing
     /// is told of setting and tilt, which look the same.
     #[schemars(range(min = 0.0, max = 10000.0), example = 0.5)]
-    pub hold_uncertainty_um: Option<Um>,
+    pub lock_uncertainty_um: Option<Um>,
     /// Where to begin: anywhere, or where the cell's fixture holds the part.
     pub start: StartAt,
     /// The farthest that the part may lie from where the fixture holds it.
     #[schemars(range(min = 0.001, max = 100000.0))]
-    pub largest_shift_mm: f64,
+    pub max_shift_mm: f64,
     /// The most that the part may be turned from how the fixture holds it.
     #[schemars(range(min = 0.0001, max = 180.0))]
-    pub largest_turn_deg: f64,
+    pub max_turn_deg: f64,
     /// The least share of the part's surface that the measured points must cover; below, nothing is made of them.
     #[schemars(range(min = 0.0, max = 1.0))]
-    pub least_coverage: f64,
+    pub min_coverage: f64,
     /// Refuse a fit whose rms deviation is above this.
     #[schemars(range(min = 0.01, max = 1000000.0))]
     pub max_rms_um: Option<Um>,
@@ -274,7 +266,7 @@ pub struct Acceptance {
     /// Whether a figure must be within its limit with `probability`; else the most probable value is held against it.
     pub expanded_uncertainty: bool,
     /// The probability with which a figure must be within its limit to be accepted, and beyond it to be rejected. Left out 0.975, or where
-    /// `measuring.accepted_risk` is less than 0.025, one less that.
+    /// `measure.accepted_risk` is less than 0.025, one less that.
     #[schemars(range(min = 0.5, max = 0.995), example = 0.975)]
     pub probability: Option<f64>,
 }
@@ -298,7 +290,7 @@ pub struct Compensation {
     pub learn: bool,
     /// The least that a pass takes off where it takes off least.
     #[schemars(range(min = 0.0, max = 1000.0))]
-    pub least_depth_um: Um,
+    pub min_depth_um: Um,
     /// Wavelengths shorter than this are left alone.
     #[schemars(range(min = 0.05, max = 10000.0), example = 8.0)]
     pub cutoff_mm: f64,
@@ -310,13 +302,13 @@ pub struct Compensation {
     pub roughness: Roughness,
     /// The correction is nowhere larger than this.
     #[schemars(range(min = 0.01, max = 10000.0), example = 60.0)]
-    pub largest_correction_um: Um,
+    pub max_correction_um: Um,
     /// The most that may be taken off anywhere below the surface of the first pass, over all passes; it is allowance and what may go below the
     /// nominal surface together.
     #[schemars(range(min = 0.01, max = 100000.0), example = 300.0)]
     pub removal_budget_um: Um,
     /// How much deeper each pass goes than the one before; it goes deeper than that where the part is so low that the wheel would else cut
-    /// air there, and locally by as much as the part stands proud. The most that the machine may take off is grinder.limits.largest_depth_mm
+    /// air there, and locally by as much as the part stands proud. The most that the machine may take off is grinder.limits.max_depth_mm
     /// of the cell.
     #[schemars(range(min = 0.01, max = 10000.0), example = 60.0)]
     pub depth_of_cut_um: Um,
@@ -329,7 +321,7 @@ pub struct Compensation {
     /// The correction is refused where it might sit farther than this beside its place on the part (k = 2), because the surface does not
     /// tell the part's place any better.
     #[schemars(range(min = 0.001, max = 1000.0))]
-    pub largest_displacement_mm: f64,
+    pub max_displacement_mm: f64,
 }
 
 /// Tolerances of parameters of the machine: the expanded uncertainty (k = 2) with which each is set. One that stands is taken back where it is told
@@ -518,7 +510,7 @@ pub struct Cycle {
     pub begin_with: Beginning,
     /// Most cycles of grinding and measuring.
     #[schemars(range(min = 1, max = 100))]
-    pub most_cycles: u16,
+    pub max_cycles: u16,
     /// What to do when a cycle brings next to nothing.
     pub on_stall: Disposal,
     /// What to do when a cycle makes it worse.
@@ -534,6 +526,8 @@ impl Default for Measure {
     fn default() -> Self {
         Self {
             probe_radius_mm: f64::NAN,
+            mode: Mode::Fixed,
+            accepted_risk: None,
             side: ProbeSide::Auto,
             pattern: PatternWord::Grid,
             spacing_mm: None,
@@ -549,7 +543,7 @@ impl Default for Measure {
             search_mm: 2.0,
             speed_mm_s: 5.0,
             safe_height_mm: 10.0,
-            minimum_coverage: 0.95,
+            min_coverage: 0.95,
             qualify: true,
             radius_tolerance_um: Um(2.0),
             temperature_c: None,
@@ -563,12 +557,12 @@ impl Default for RegistrationSettings {
             distance: Distance::Curved,
             loss: Loss::None,
             outlier_sigmas: 6.0,
-            hold: Vec::new(),
-            hold_uncertainty_um: None,
+            lock: Vec::new(),
+            lock_uncertainty_um: None,
             start: StartAt::Search,
-            largest_shift_mm: 5.0,
-            largest_turn_deg: 5.0,
-            least_coverage: 0.5,
+            max_shift_mm: 5.0,
+            max_turn_deg: 5.0,
+            min_coverage: 0.5,
             max_rms_um: None,
         }
     }
@@ -598,13 +592,13 @@ impl Default for Compensation {
             smoothing: Smoothing::default(),
             filter_order: Order::default(),
             roughness: Roughness::default(),
-            least_depth_um: Um(0.5),
+            min_depth_um: Um(0.5),
             cutoff_mm: f64::NAN,
-            largest_correction_um: Um(f64::NAN),
+            max_correction_um: Um(f64::NAN),
             removal_budget_um: Um(f64::NAN),
             depth_of_cut_um: Um(f64::NAN),
             spacing_mm: 1.0,
-            largest_displacement_mm: 1.0,
+            max_displacement_mm: 1.0,
         }
     }
 }
@@ -635,7 +629,7 @@ impl Default for Cycle {
     fn default() -> Self {
         Self {
             begin_with: Beginning::Grind,
-            most_cycles: 5,
+            max_cycles: 5,
             on_stall: Disposal::Stop,
             on_divergence: Disposal::Hold,
             stall_um: Um(0.0),

@@ -85,7 +85,7 @@ fn the_default_recipe_is_what_it_says() {
     assert_eq!(recipe.pattern, Pattern::Laid(Layout::GridPoints([60, 30])));
     assert_eq!(recipe.measure.side, ProbeSide::Above);
     assert_eq!((recipe.acceptance.pv_um, recipe.acceptance.rms_um), (Some(Um(7.0)), Some(Um(1.0))));
-    assert_eq!(recipe.registration.largest_turn_deg, 5.0);
+    assert_eq!(recipe.registration.max_turn_deg, 5.0);
     assert!((recipe.compensation.removal_budget_um.mm() - 0.4).abs() < 1e-15);
     assert_eq!(recipe.grinding.wheel, Wheel::Sphere { radius_mm: 12.5 });
     assert_eq!((recipe.cycle.on_stall, recipe.cycle.on_divergence), (Disposal::Stop, Disposal::Hold));
@@ -125,7 +125,7 @@ fn the_probability_of_a_decision_is_no_less_than_the_accepted_risk_leaves() {
 fn the_filter_and_the_gate_of_coverage_are_chosen_by_the_recipe() {
     let told = |recipe: &Recipe| {
         let map = &recipe.compensation;
-        (map.filter_order, map.roughness, recipe.registration.least_coverage)
+        (map.filter_order, map.roughness, recipe.registration.min_coverage)
     };
     assert_eq!(told(&recipe(RECIPE).unwrap()), (Order::Plane, Roughness::Cutoff, 0.5));
     let text = changed(
@@ -214,7 +214,7 @@ fn places_to_measure_are_read_by_the_columns_and_units_that_the_recipe_gives() {
 #[test]
 fn the_telescope_holds_what_it_cannot_see() {
     let recipe = recipe(TELESCOPE).unwrap();
-    assert_eq!(recipe.registration.hold, [Coordinate::X, Coordinate::Y, Coordinate::Rz]);
+    assert_eq!(recipe.registration.lock, [Coordinate::X, Coordinate::Y, Coordinate::Rz]);
     assert_eq!(recipe.registration.start, StartAt::Fixture);
     assert_eq!(recipe.measure.side, ProbeSide::Below);
     let cell = cell(FILES).unwrap();
@@ -227,25 +227,29 @@ fn the_telescope_holds_what_it_cannot_see() {
     let Wire::FileExchange(files) = &cell.cmm.link.wire else { panic!("files") };
     assert_eq!((files.stations.len(), files.unit.in_mm()), (1, 1.0));
     assert_eq!(files.inbox, "../exchange/cmm/in");
-    assert_eq!((files.what, files.reference_limit_mm), (Some(Coordinates::Centres), 1.0));
-    assert_eq!((files.take_earlier, files.probe_tolerance_mm), (false, 1e-3));
+    assert_eq!((files.coordinates, files.reference_limit_mm), (Some(Coordinates::Centres), 1.0));
+    assert_eq!((files.accept_earlier_files, files.probe_tolerance_mm), (false, 1e-3));
     assert_eq!(recipe.cycle.begin_with, Beginning::Measure);
-    assert_eq!(recipe.compensation.largest_displacement_mm, 1.0);
+    assert_eq!(recipe.compensation.max_displacement_mm, 1.0);
 }
 
 #[test]
 fn what_a_file_wire_leaves_out_is_not_guessed() {
-    let text = changed(FILES, "what = \"centres\"", "# what");
-    let text = changed(&text, "take_earlier = false", "take_earlier = true\nresult = \"{part}-{job}-{cycle}_*.ply\"");
+    let text = changed(FILES, "coordinates = \"centres\"", "# coordinates");
+    let text = changed(
+        &text,
+        "accept_earlier_files = false",
+        "accept_earlier_files = true\nresult = \"{part}-{job}-{cycle}_*.ply\"",
+    );
     let cell = cell(&text).unwrap();
     let Wire::FileExchange(files) = &cell.cmm.link.wire else { panic!("files") };
-    assert_eq!((files.what, files.take_earlier), (None, true));
+    assert_eq!((files.coordinates, files.accept_earlier_files), (None, true));
     assert_eq!(files.result, "{part}-{job}-{cycle}_*.ply");
     let Wire::FileExchange(files) = &cell.grinder.link.wire else { panic!("files") };
     assert_eq!((files.result.as_str(), files.reference_limit_mm), ("{part}_c{cycle}.*", 0.1));
     let recipe = recipe(RECIPE).unwrap();
     assert_eq!(recipe.cycle.begin_with, Beginning::Grind);
-    assert_eq!(recipe.compensation.largest_displacement_mm, 1.0);
+    assert_eq!(recipe.compensation.max_displacement_mm, 1.0);
 }
 
 #[test]
@@ -277,19 +281,19 @@ const BAD_RECIPE_VALUES: &[BadValue] = &[
     (RECIPE, "measure.side", "\"left\"", "\"below\""),
     (RECIPE, "measure.edge_margin_mm", "31", "lower it"),
     (RECIPE, "measure.safe_height_mm", "1.0", "raise it"),
-    (RECIPE, "measure.minimum_coverage", "95", "0.1 to 1"),
+    (RECIPE, "measure.min_coverage", "95", "0.1 to 1"),
     (RECIPE, "measure.qualify", "\"yes\"", "true or false"),
     (RECIPE, "acceptance.pv_um", "0.5", "interchanged"),
     (RECIPE, "compensation.depth_of_cut_um", "500.0", "budget"),
-    (RECIPE, "compensation.largest_correction_um", "600", "budget"),
+    (RECIPE, "compensation.max_correction_um", "600", "budget"),
     (RECIPE, "compensation.cutoff_mm", "3.0", "measure more points"),
     (BICONIC, "compensation.cutoff_mm", "1.5", "two nodes"),
     (RECIPE, "grinding.feed_mm_min", "0", "mm/min"),
     (RECIPE, "grinding.track_mm", "13.0", "lower it"),
-    (RECIPE, "grinding.allowance_um", "90.0", "most_cycles"),
+    (RECIPE, "grinding.allowance_um", "90.0", "max_cycles"),
     (RECIPE, "grinding.wheel.shape", "\"cone\"", "\"torus\""),
     (RECIPE, "grinding.wheel.radius_mm", "120.0", "smaller"),
-    (RECIPE, "cycle.most_cycles", "0", "1 to 100"),
+    (RECIPE, "cycle.max_cycles", "0", "1 to 100"),
     (RECIPE, "cycle.on_stall", "\"go\"", "\"hold\""),
     (RECIPE, "registration.max_rms_um", "0.5", "raise it"),
     (RECIPE, "part.name", "\"\"", "1 to 80"),
@@ -298,7 +302,7 @@ const BAD_RECIPE_VALUES: &[BadValue] = &[
     (BICONIC, "nominal.projection", "\"yx\"", "best-fit"),
     (RECIPE, "measure.points", "1800", "leave it out"),
     (RECIPE, "compensation.gain", "1.5", "1.2"),
-    (RECIPE, "registration.hold", "[\"x\"]", "fixture"),
+    (RECIPE, "registration.lock", "[\"x\"]", "fixture"),
 ];
 
 const BAD_CELL_VALUES: &[BadValue] = &[
@@ -309,9 +313,9 @@ const BAD_CELL_VALUES: &[BadValue] = &[
     (TCP, "cmm.wire.host", "\"http://a\"", "the port has a key"),
     (TCP, "cmm.timing.heartbeat_ms", "900", "20 to 500"),
     (TCP, "cmm.timing.lost_after_ms", "1500", "retries"),
-    (TCP, "cmm.travel.least_mm", "[600.0, -500.0, -300.0]", "interchanged"),
+    (TCP, "cmm.travel.min_mm", "[600.0, -500.0, -300.0]", "interchanged"),
     (TCP, "cmm.reference_sphere.centre_mm", "[0.0, 1200.0, 20.0]", "outside"),
-    (TCP, "grinder.limits.least_wheel_radius_mm", "200", "no wheel"),
+    (TCP, "grinder.limits.min_wheel_radius_mm", "200", "no wheel"),
     (RTU, "cmm.wire.parity", "\"evn\"", "did you mean \"even\""),
     (RTU, "cmm.wire.stop_bits", "3", "1 to 2"),
     (FILES, "cell.simulated", "true", "simulated = false"),
@@ -345,33 +349,33 @@ const BAD_RECIPES: &[BadText] = &[
     (SPIRAL, "points = 1500", "spacing_mm = 80", "measure.spacing_mm", "80", "finer"),
     (
         RECIPE,
-        "[registration]",
-        "[measuring]\nmode = \"adaptive\"\n\n[registration]",
-        "measuring.accepted_risk",
-        "measuring]",
+        "probe_radius_mm = 1.5\n",
+        "probe_radius_mm = 1.5\nmode = \"adaptive\"\n",
+        "measure.accepted_risk",
+        "measure]",
         "accepted_risk = 0.025",
     ),
     (
         RECIPE,
-        "[registration]",
-        "[measuring]\naccepted_risk = 0.025\n\n[registration]",
-        "measuring.accepted_risk",
+        "probe_radius_mm = 1.5\n",
+        "probe_radius_mm = 1.5\naccepted_risk = 0.025\n",
+        "measure.accepted_risk",
         "0.025",
         "leave it out",
     ),
     (
         RECIPE,
-        "[registration]",
-        "[measuring]\nmode = \"adaptive\"\naccepted_risk = 0.5\n\n[registration]",
-        "measuring.accepted_risk",
+        "probe_radius_mm = 1.5\n",
+        "probe_radius_mm = 1.5\nmode = \"adaptive\"\naccepted_risk = 0.5\n",
+        "measure.accepted_risk",
         "0.5",
         "0.1",
     ),
     (
         RECIPE,
-        "[registration]",
-        "[measuring]\nmode = \"clever\"\n\n[registration]",
-        "measuring.mode",
+        "probe_radius_mm = 1.5\n",
+        "probe_radius_mm = 1.5\nmode = \"clever\"\n",
+        "measure.mode",
         "\"clever\"",
         "\"adaptive\"",
     ),
@@ -397,7 +401,7 @@ const BAD_RECIPES: &[BadText] = &[
         RECIPE,
         "expanded_uncertainty = true",
         "probability = 0.95\n[measuring]\nmode = \"adaptive\"\naccepted_risk = 0.025",
-        "measuring.accepted_risk",
+        "measure.accepted_risk",
         "0.025",
         "raise it to 0.050, or the probability to 0.975",
     ),
@@ -425,7 +429,7 @@ const BAD_RECIPES: &[BadText] = &[
         RECIPE,
         "start = \"search\"",
         "start = \"fixture\"\nhold = [\"x\", \"u\"]",
-        "registration.hold[1]",
+        "registration.lock[1]",
         "\"u\"",
         "\"rz\"",
     ),
@@ -510,10 +514,10 @@ const BAD_CELLS: &[BadText] = &[
         "reference_sphere_mm",
         "did you mean",
     ),
-    (TILTING, "least_deg = -60.0", "least_deg = 70.0", "grinder.rotary.least_deg", "70.0", "interchanged"),
+    (TILTING, "min_deg = -60.0", "min_deg = 70.0", "grinder.rotary.min_deg", "70.0", "interchanged"),
     (TILTING, "axis = \"B\"", "axis = \"C\"", "grinder.rotary.axis", "\"C\"", "one of"),
     (TILTING, "reversed = false", "turns = \"table\"", "grinder.rotary.turns", "\"table\"", "stays upright"),
-    (TILTING, "largest_rate_deg_min = 3600.0\n", "", "grinder.rotary.largest_rate_deg_min", "rotary]", "add `largest"),
+    (TILTING, "max_rate_deg_min = 3600.0\n", "", "grinder.rotary.max_rate_deg_min", "rotary]", "add `max"),
     (SIM, "simulated = true ", "simulated = false ", "cmm.wire.port", "0                    #", "1 to 65535"),
     (SIM, "name = \"simulated cell\"\n", "", "cell.name", "cell]", "add `name"),
     (TCP, "port = 15021", "prot = 15021\nport = 1", "cmm.wire.prot", "prot", "did you mean `port`"),
@@ -542,7 +546,7 @@ const BAD_CELLS: &[BadText] = &[
         "[1, 0]",
         "interchange",
     ),
-    (TCP, "largest_depth_mm = 0.5\n", "", "grinder.limits.largest_depth_mm", "limits]", "add `largest_depth_mm"),
+    (TCP, "max_depth_mm = 0.5\n", "", "grinder.limits.max_depth_mm", "limits]", "add `max_depth_mm"),
     (
         RTU,
         "device = \"/tmp/regrind-grinder.tty\"\nbaud = 115200",
@@ -659,7 +663,7 @@ fn all_problems_are_told_at_once_and_in_order() {
         .replace("pv_um = 7.0", "pv_um = 0.5")
         .replace("depth_of_cut_um = 20.0", "depth_of_cut_um = 500.0")
         .replace("shape = \"sphere\"", "shape = \"spere\"")
-        .replace("most_cycles = 5", "most_cycles = \"five\"");
+        .replace("max_cycles = 5", "max_cycles = \"five\"");
     let problems = recipe(&text).unwrap_err();
     let keys: Vec<&str> = problems.problems.iter().map(|problem| problem.key.as_str()).collect();
     assert_eq!(
@@ -670,7 +674,7 @@ fn all_problems_are_told_at_once_and_in_order() {
             "acceptance.pv_um",
             "compensation.depth_of_cut_um",
             "grinding.wheel.shape",
-            "cycle.most_cycles"
+            "cycle.max_cycles"
         ]
     );
     let lines: Vec<usize> = problems.problems.iter().map(|problem| problems.place(problem).0).collect();
@@ -688,6 +692,32 @@ fn several_places_of_broken_syntax_are_told() {
     for needle in ["depth_of_cut_um 20.0", "track_mm = = 0.24"] {
         assert!(lines.contains(&place_of(&text, needle).0), "{problems}");
     }
+}
+
+#[test]
+fn old_names_of_keys_are_read_with_a_note() {
+    let new = changed(
+        RECIPE,
+        "probe_radius_mm = 1.5\n",
+        "probe_radius_mm = 1.5\nmode = \"adaptive\"\naccepted_risk = 0.025\n",
+    );
+    let text =
+        changed(RECIPE, "[registration]", "[measuring]\nmode = \"adaptive\"\naccepted_risk = 0.025\n\n[registration]");
+    let text = text.replace("min_coverage", "minimum_coverage").replace("max_shift_mm", "largest_shift_mm");
+    let text = text.replace("max_cycles", "most_cycles");
+    let [old, new] = [text, new].map(|text| Recipe::parse(Path::new("recipes/freeform-mirror.toml"), &text).unwrap());
+    assert_eq!((&old.measure, &old.registration, &old.cycle), (&new.measure, &new.registration, &new.cycle));
+    assert_eq!((old.notes().len(), new.notes().len()), (5, 0), "{:?}", old.notes());
+    assert!(old.notes().iter().any(|note| note.contains("`cycle.most_cycles`") && note.contains("`cycle.max_cycles`")));
+}
+
+#[test]
+fn both_names_of_a_key_are_refused() {
+    let text = changed(RECIPE, "max_cycles = 5", "max_cycles = 5\nmost_cycles = 4");
+    let problems = Recipe::parse(Path::new("recipes/freeform-mirror.toml"), &text).unwrap_err();
+    assert_eq!(problems.problems.len(), 1, "{problems}");
+    assert_eq!(problems.problems[0].key, "cycle.most_cycles");
+    assert_eq!(problems.place(&problems.problems[0]), place_of_byte(&text, text.find("most_cycles").unwrap()));
 }
 
 #[test]

@@ -8,18 +8,18 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use regrind::device::{
-    Cmm, DeviceError, Interrupt, Machine, MeasuredPoint, Measurement, ModbusCmm, ModbusSettings, Plan, Preliminary,
-    State,
+    Cmm, DeviceError, Interrupt, Machine, MeasuredPoint, Measurement, ModbusCmm, ModbusSettings, Plan,
+    PreliminaryPoints, State,
 };
 use regrind_sim::body::Kind;
 use regrind_sim::command::State as At;
 use regrind_sim::options::MachineOptions;
 use regrind_sim::wire::Serving;
-use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, Request, When};
+use regrind_sim::wire::faults::{Fault, FaultPlan, Request, SharedFaultPlan, When};
 use regrind_sim::wire::rtu::Line as SerialLine;
 use regrind_sim::{registers, words};
 
-use crate::modbus::{assert_exact, began, claimed, job_of, patient, plan, reaches, rtu, settings};
+use crate::modbus::{assert_exact, began, claimed, job_of, patient, plan, rtu, settings, wait_for_state};
 use crate::toy::Toy;
 
 const HEADER: u16 = 400;
@@ -31,9 +31,9 @@ const POINTS: u32 = 200;
 /// Number of pages of the whole result.
 const PAGES: u64 = 29;
 
-fn machine(toy: Toy, gives_ahead: bool) -> registers::Machine {
+fn machine(toy: Toy, gives_ahead: bool) -> registers::SimulatedMachine {
     let options = MachineOptions { speed: 0.0, gives_ahead, ..MachineOptions::default() };
-    registers::Machine::new(Box::new(toy), 0xb007, options)
+    registers::SimulatedMachine::new(Box::new(toy), 0xb007, options)
 }
 
 fn toy() -> Toy {
@@ -41,7 +41,7 @@ fn toy() -> Toy {
 }
 
 async fn serve(toy: Toy, gives_ahead: bool) -> Serving {
-    Serving::tcp_with("127.0.0.1:0", vec![(1, machine(toy, gives_ahead))], Faults::none()).await.unwrap()
+    Serving::tcp_with("127.0.0.1:0", vec![(1, machine(toy, gives_ahead))], SharedFaultPlan::none()).await.unwrap()
 }
 
 /// Lets the machine measure a thousand points a second for this time.
@@ -54,7 +54,7 @@ fn work(serving: &Serving, ms: u64) {
 }
 
 /// Begins a job.
-async fn begun(settings: ModbusSettings, plan: &Plan) -> ModbusCmm {
+async fn begin_job(settings: ModbusSettings, plan: &Plan) -> ModbusCmm {
     let mut cmm = claimed(settings).await;
     cmm.load_plan(plan, &Interrupt::new()).await.unwrap();
     let armed = cmm.prepare(job_of(plan, 1)).await.unwrap();
@@ -64,15 +64,15 @@ async fn begun(settings: ModbusSettings, plan: &Plan) -> ModbusCmm {
 
 /// Begins a job, and measures about half of it: more than 14 pages, fewer than 15.
 async fn half_done(serving: &Serving, settings: ModbusSettings, plan: &Plan) -> ModbusCmm {
-    let cmm = begun(settings, plan).await;
+    let cmm = begin_job(settings, plan).await;
     work(serving, 102);
     cmm
 }
 
 /// Polls this number of times, and takes one step of reading ahead after each.
-async fn look(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16, looks: usize) -> Vec<Preliminary> {
+async fn poll(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16, reads_since_select: usize) -> Vec<PreliminaryPoints> {
     let mut told = Vec::new();
-    for _ in 0..looks {
+    for _ in 0..reads_since_select {
         cmm.status().await.unwrap();
         told.extend(cmm.read_ahead(job_of(plan, cycle), &Interrupt::new()).await);
     }
@@ -81,7 +81,7 @@ async fn look(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16, looks: usize) -> Vec
 
 async fn finish(serving: &Serving, cmm: &mut ModbusCmm, plan: &Plan) -> Result<Measurement, DeviceError> {
     work(serving, 200);
-    reaches(cmm, State::Complete).await?;
+    wait_for_state(cmm, State::Complete).await?;
     cmm.collect(job_of(plan, 1), &Interrupt::new()).await
 }
 
@@ -97,7 +97,7 @@ fn counted(serving: &Serving, rules: FaultPlan, at: u16) -> Arc<AtomicU64> {
     count
 }
 
-fn of(count: &AtomicU64) -> u64 {
+fn read_count(count: &AtomicU64) -> u64 {
     count.load(Ordering::SeqCst)
 }
 
@@ -106,7 +106,7 @@ fn early(at: u16) -> When {
     When::Matching(Box::new(move |request| request.address == at && request.state == Some(At::Execute)))
 }
 
-fn points(told: &[Preliminary]) -> Vec<MeasuredPoint> {
+fn points(told: &[PreliminaryPoints]) -> Vec<MeasuredPoint> {
     told.iter().flat_map(|told| told.points.clone()).collect()
 }
 
@@ -118,13 +118,13 @@ async fn what_came_while_it_measured_is_not_read_again_and_the_points_are_those_
         let serving = serve(toy(), gives_ahead).await;
         let mut cmm = half_done(&serving, patient(settings(&serving)), &plan).await;
         let early = counted(&serving, FaultPlan::new(0), PAGE);
-        let told = look(&mut cmm, &plan, 1, 20).await;
+        let told = poll(&mut cmm, &plan, 1, 20).await;
         // Nothing requests a page that is not full.
-        assert_eq!(of(&early), came);
-        assert!(told.iter().enumerate().all(|(k, told)| told.from == FULL * k), "{told:?}");
+        assert_eq!(read_count(&early), came);
+        assert!(told.iter().enumerate().all(|(k, told)| told.first_index == FULL * k), "{told:?}");
         let late = counted(&serving, FaultPlan::new(0), PAGE);
         let measured = finish(&serving, &mut cmm, &plan).await.unwrap();
-        assert_eq!(of(&late), PAGES - came);
+        assert_eq!(read_count(&late), PAGES - came);
         assert_exact(&plan, &measured, "read ahead");
         assert_eq!(points(&told), measured.points[..FULL * came as usize]);
         assert_eq!(cmm.collect(job_of(&plan, 1), &Interrupt::new()).await.unwrap(), measured, "read twice");
@@ -137,12 +137,12 @@ async fn what_came_while_it_measured_is_not_read_again_and_the_points_are_those_
 async fn records_that_lie_across_pages_and_low_words_first_come_whole() {
     let plan = plan(POINTS);
     let options = MachineOptions { speed: 0.0, word_order: words::WordOrder::Little, ..MachineOptions::default() };
-    let machine = registers::Machine::new(Box::new(toy().in_counts()), 0xb007, options);
+    let machine = registers::SimulatedMachine::new(Box::new(toy().in_counts()), 0xb007, options);
     let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine)]).await.unwrap();
     let mut settings = patient(settings(&serving));
     settings.registers.word_order = regrind::device::WordOrder::Little;
     let mut cmm = half_done(&serving, settings, &plan).await;
-    let told = look(&mut cmm, &plan, 1, 20).await;
+    let told = poll(&mut cmm, &plan, 1, 20).await;
     let measured = finish(&serving, &mut cmm, &plan).await.unwrap();
     // Nine full pages of 112 registers, ten to a record.
     assert_eq!(points(&told), measured.points[..100]);
@@ -202,7 +202,7 @@ async fn whatever_is_said_ahead_the_points_are_right_in_the_end() {
                 false => rules.times(if at == HEADER { 1 } else { 2 }, 1, early(at), fault.clone()),
             });
             // No poll fails because of it: after a fault, reading ahead ends, and soon.
-            look(&mut cmm, &plan, 1, 8).await;
+            poll(&mut cmm, &plan, 1, 8).await;
             let measured = finish(&serving, &mut cmm, &plan).await;
             assert_exact(&plan, &measured.unwrap_or_else(|error| panic!("{hint}: {error}")), &hint);
             assert_eq!(began(&serving).len(), 1, "{hint}");
@@ -217,18 +217,18 @@ async fn a_machine_that_refuses_is_asked_once_and_one_that_does_not_answer_three
         let serving = serve(toy(), true).await;
         let mut cmm = half_done(&serving, patient(settings(&serving)), &plan).await;
         serving.faults().set(FaultPlan::new(1).always(early(HEADER), fault.clone()));
-        assert!(look(&mut cmm, &plan, 1, 8).await.is_empty());
+        assert!(poll(&mut cmm, &plan, 1, 8).await.is_empty());
         assert_eq!(serving.faults().fired().len(), times, "{fault:?}");
         // Another START is another job: reading ahead begins again.
         serving.faults().set(FaultPlan::new(1));
         cmm.stop().await.unwrap();
-        reaches(&mut cmm, State::Complete).await.unwrap();
+        wait_for_state(&mut cmm, State::Complete).await.unwrap();
         let done = cmm.status().await.unwrap().done;
         cmm.acknowledge(done).await.unwrap();
         let armed = cmm.prepare(job_of(&plan, 2)).await.unwrap();
         cmm.start(armed).await.unwrap();
         work(&serving, 20);
-        assert_eq!(look(&mut cmm, &plan, 2, 5).await.len(), 2, "{fault:?}");
+        assert_eq!(poll(&mut cmm, &plan, 2, 5).await.len(), 2, "{fault:?}");
     }
 }
 
@@ -240,18 +240,18 @@ async fn nothing_that_was_kept_outlives_its_line_or_its_job() {
         let mut cmm = half_done(&serving, settings(&serving), &plan).await;
         // A cached page with a flipped bit; only the check over its record prevents its use.
         serving.faults().set(FaultPlan::new(0).once(early(PAGE), Fault::FlipData));
-        assert_eq!(points(&look(&mut cmm, &plan, 1, 9).await).len(), 8 * FULL);
+        assert_eq!(points(&poll(&mut cmm, &plan, 1, 9).await).len(), 8 * FULL);
         serving.faults().set(FaultPlan::new(0).once(When::Reading(64), Fault::Disconnect(3)));
         match reconnects {
             true => drop(cmm.connect().await.unwrap()),
             false => drop(cmm.status().await.unwrap()),
         }
         cmm.claim().await.unwrap();
-        let again = look(&mut cmm, &plan, 1, 3).await;
-        assert_eq!(again.iter().map(|told| told.from).collect::<Vec<_>>(), [0, FULL], "it begins anew");
+        let again = poll(&mut cmm, &plan, 1, 3).await;
+        assert_eq!(again.iter().map(|told| told.first_index).collect::<Vec<_>>(), [0, FULL], "it begins anew");
         let late = counted(&serving, FaultPlan::new(0), PAGE);
         assert_exact(&plan, &finish(&serving, &mut cmm, &plan).await.unwrap(), "another line");
-        assert_eq!(of(&late), PAGES - 2, "read once");
+        assert_eq!(read_count(&late), PAGES - 2, "read once");
     }
 }
 
@@ -261,14 +261,14 @@ async fn a_page_that_changes_after_all_has_everything_read_anew() {
     let serving = serve(toy(), true).await;
     let mut cmm = half_done(&serving, settings(&serving), &plan).await;
     serving.faults().set(FaultPlan::new(0).once(early(PAGE), Fault::FlipData));
-    look(&mut cmm, &plan, 1, 20).await;
+    poll(&mut cmm, &plan, 1, 20).await;
     let late = counted(&serving, FaultPlan::new(0), PAGE);
     assert_exact(&plan, &finish(&serving, &mut cmm, &plan).await.unwrap(), "a page that changed");
-    assert_eq!(of(&late), PAGES - 14 + PAGES);
+    assert_eq!(read_count(&late), PAGES - 14 + PAGES);
     // A damaged result remains an error, as before.
     serving.faults().set(FaultPlan::new(0).always(When::Reading(PAGE), Fault::FlipData));
     let broken = cmm.collect(job_of(&plan, 1), &Interrupt::new()).await;
-    assert!(matches!(broken, Err(DeviceError::Corrupt { what: "check number of a result", .. })), "{broken:?}");
+    assert!(matches!(broken, Err(DeviceError::Corrupt { data: "check number of a result", .. })), "{broken:?}");
 }
 
 #[tokio::test]
@@ -285,10 +285,10 @@ async fn one_step_follows_a_look_and_none_an_order() {
     assert_eq!(cmm.read_ahead(job, &calm).await, None);
     assert_eq!(requests(&serving), before, "an order was on its way, and the look is used up");
     // The header, then one page per poll.
-    look(&mut cmm, &plan, 1, 2).await;
+    poll(&mut cmm, &plan, 1, 2).await;
     cmm.status().await.unwrap();
     let before = requests(&serving);
-    assert_eq!(cmm.read_ahead(job, &calm).await.unwrap().from, FULL);
+    assert_eq!(cmm.read_ahead(job, &calm).await.unwrap().first_index, FULL);
     assert_eq!(cmm.read_ahead(job, &calm).await, None);
     assert_eq!(requests(&serving), before + 2);
     // An order that arrives at the same time has priority over the page.
@@ -302,26 +302,27 @@ async fn one_step_follows_a_look_and_none_an_order() {
     let pages = counted(&serving, FaultPlan::new(0).always(raise, Fault::DropReply), PAGE);
     cmm.status().await.unwrap();
     assert_eq!(cmm.read_ahead(job, &flag).await, None);
-    assert_eq!(of(&pages), 0);
+    assert_eq!(read_count(&pages), 0);
     cmm.hold().await.unwrap();
-    reaches(&mut cmm, State::Held).await.unwrap();
+    wait_for_state(&mut cmm, State::Held).await.unwrap();
     // Reading of measured points continues during a hold, and ends after an abort.
-    assert_eq!(look(&mut cmm, &plan, 1, 1).await[0].from, 2 * FULL);
+    assert_eq!(poll(&mut cmm, &plan, 1, 1).await[0].first_index, 2 * FULL);
     cmm.abort().await.unwrap();
-    reaches(&mut cmm, State::Aborted).await.unwrap();
+    wait_for_state(&mut cmm, State::Aborted).await.unwrap();
     let none = counted(&serving, FaultPlan::new(0), PAGE);
-    assert!(look(&mut cmm, &plan, 1, 3).await.is_empty());
-    assert_eq!(of(&none), 0);
+    assert!(poll(&mut cmm, &plan, 1, 3).await.is_empty());
+    assert_eq!(read_count(&none), 0);
 }
 
 #[tokio::test]
 async fn on_a_line_on_which_an_order_would_wait_nothing_is_read_ahead() {
     let plan = plan(40);
     for (baud, told) in [(19_200, 0), (38_400, 2)] {
-        let (serving, settings) = rtu(vec![(1, machine(toy(), true))], SerialLine::unpaced(baud), Faults::none());
-        let mut cmm = begun(patient(settings), &plan).await;
+        let (serving, settings) =
+            rtu(vec![(1, machine(toy(), true))], SerialLine::unpaced(baud), SharedFaultPlan::none());
+        let mut cmm = begin_job(patient(settings), &plan).await;
         work(&serving, 20);
-        assert_eq!(look(&mut cmm, &plan, 1, 4).await.len(), told, "{baud}");
+        assert_eq!(poll(&mut cmm, &plan, 1, 4).await.len(), told, "{baud}");
     }
 }
 
@@ -332,11 +333,11 @@ async fn eighteen_hundred_points_over_a_serial_line() {
     let plan = plan(1800);
     for gives_ahead in [false, true] {
         let options = MachineOptions { gives_ahead, ..MachineOptions::default() };
-        let machine = registers::Machine::new(Box::new(Toy::new(Kind::Cmm, 50.0)), 0xb007, options);
-        let (_serving, settings) = rtu(vec![(1, machine)], SerialLine::paced(115_200), Faults::none());
+        let machine = registers::SimulatedMachine::new(Box::new(Toy::new(Kind::Cmm, 50.0)), 0xb007, options);
+        let (_serving, settings) = rtu(vec![(1, machine)], SerialLine::paced(115_200), SharedFaultPlan::none());
         let settings = ModbusSettings { request_timeout: Duration::from_secs(2), ..settings };
         let at_first = Instant::now();
-        let mut cmm = begun(settings, &plan).await;
+        let mut cmm = begin_job(settings, &plan).await;
         let loaded = at_first.elapsed();
         let mut came = 0;
         while cmm.status().await.unwrap().state != State::Complete {
@@ -351,6 +352,6 @@ async fn eighteen_hundred_points_over_a_serial_line() {
         println!(
             "gives ahead: {gives_ahead}; plan {loaded:.1?}; {came} points ahead; the whole result {collected:.2?} after the end"
         );
-        println!("{:?}", cmm.link().figures());
+        println!("{:?}", cmm.link().statistics());
     }
 }

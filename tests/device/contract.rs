@@ -7,16 +7,16 @@ use std::sync::{Arc, LazyLock, Mutex};
 use std::time::Duration;
 
 use regrind::device::{
-    Cmm, CorrectionMap, Grinder, Identified, Interrupt, Job, Line, Machine as Driver, ModbusCmm, ModbusGrinder,
-    ModbusSettings, Outcome, Plan, PointStatus, RANGES, Range, RegisterMap, State, Status, Target, TargetKind,
+    Cmm, CorrectionMap, Grinder, Identified, Interrupt, Job, LineAddress, Machine as Driver, ModbusCmm, ModbusGrinder,
+    ModbusSettings, Outcome, Plan, PointStatus, RANGES, RegisterMap, State, Status, Target, TargetKind, ValueRange,
     WordOrder, digest,
 };
 use regrind::geometry::Grid;
 use regrind_sim::body::Kind;
-use regrind_sim::command::{Command, Frame};
+use regrind_sim::command::{Command, CommandFrame};
 use regrind_sim::options::MachineOptions;
 use regrind_sim::payload::{self, PointRecord, encode_points};
-use regrind_sim::registers::Machine;
+use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::words::{self, bytes_of, crc16, registers_of, turn_payload};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -63,7 +63,7 @@ fn cells(line: &str) -> Vec<&str> {
 type Record = Arc<Mutex<Vec<Vec<u8>>>>;
 
 /// Serves a machine to one client and records the traffic.
-async fn record(machine: Machine, word_order: WordOrder) -> (ModbusSettings, Record) {
+async fn record(machine: SimulatedMachine, word_order: WordOrder) -> (ModbusSettings, Record) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = listener.local_addr().unwrap().port();
     let record = Record::default();
@@ -77,12 +77,12 @@ async fn record(machine: Machine, word_order: WordOrder) -> (ModbusSettings, Rec
         request_timeout: Duration::from_secs(30),
         owner: OWNER,
         epoch: 7,
-        ..ModbusSettings::new(Line::Tcp { host: "127.0.0.1".into(), port })
+        ..ModbusSettings::new(LineAddress::Tcp { host: "127.0.0.1".into(), port })
     };
     (settings, record)
 }
 
-async fn serve(mut client: TcpStream, mut machine: Machine, record: &Record) {
+async fn serve(mut client: TcpStream, mut machine: SimulatedMachine, record: &Record) {
     let mut head = [0; 7];
     while client.read_exact(&mut head).await.is_ok() {
         let mut asked = vec![0; usize::from(u16::from_be_bytes([head[4], head[5]])) - 1];
@@ -96,7 +96,7 @@ async fn serve(mut client: TcpStream, mut machine: Machine, record: &Record) {
     }
 }
 
-fn answer(machine: &mut Machine, asked: &[u8]) -> Vec<u8> {
+fn answer(machine: &mut SimulatedMachine, asked: &[u8]) -> Vec<u8> {
     let word = |at: usize| u16::from_be_bytes([asked[at], asked[at + 1]]);
     match asked[0] {
         3 => {
@@ -124,7 +124,7 @@ fn rtu(tcp: &[u8]) -> Vec<u8> {
 // ---- what is sent -------------------------------------------------------------------------------------------------------------------
 
 fn plan() -> Plan {
-    let target = Target { index: 70_000, what: TargetKind::Part, point_mm: [1.1, -2.3, 0.7], normal: [0.0, 0.0, 1.0] };
+    let target = Target { index: 70_000, kind: TargetKind::Part, point_mm: [1.1, -2.3, 0.7], normal: [0.0, 0.0, 1.0] };
     Plan {
         targets: vec![target],
         probe_radius_mm: 2.0,
@@ -132,7 +132,7 @@ fn plan() -> Plan {
         search_mm: 0.5,
         speed_mm_s: 4.0,
         safe_height_mm: 8.0,
-        careful: None,
+        careful_start: None,
     }
 }
 
@@ -146,10 +146,11 @@ fn map() -> CorrectionMap {
 
 /// Returns a machine that has already received a command of another client, so that the numbers of its client fill both
 /// words.
-fn machine(kind: Kind, word_order: words::WordOrder) -> Machine {
+fn machine(kind: Kind, word_order: words::WordOrder) -> SimulatedMachine {
     let options = MachineOptions { word_order, ..MachineOptions::default() };
-    let mut machine = Machine::new(Box::new(Toy::new(kind, 1e9)), BOOT_ID, options);
-    let stranger = Frame { sequence: NUMBER_BEFORE, command: Command::Release as u16, owner: 1, ..Frame::default() };
+    let mut machine = SimulatedMachine::new(Box::new(Toy::new(kind, 1e9)), BOOT_ID, options);
+    let stranger =
+        CommandFrame { sequence: NUMBER_BEFORE, command: Command::Release as u16, owner: 1, ..CommandFrame::default() };
     machine.write(40, &stranger.registers(word_order)).unwrap();
     machine
 }
@@ -171,14 +172,14 @@ async fn measured(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>>
     assert_eq!((status.temperature_c, status.boot_id), (Some(20.25), Some(BOOT_ID)));
     let points = cmm.collect(job, &calm).await.unwrap().points;
     assert_eq!((points.len(), points[0].index, points[0].status), (1, 70_000, PointStatus::Touched));
-    assert_eq!(points[0].at_mm, [1.1, -2.3, 2.7]);
+    assert_eq!(points[0].position_mm, [1.1, -2.3, 2.7]);
     record.lock().unwrap().clone()
 }
 
 /// Returns the traffic while seven of eight points are measured, and read.
 async fn measured_ahead(order: WordOrder, word_order: words::WordOrder) -> Vec<Vec<u8>> {
     let options = MachineOptions { word_order, ..MachineOptions::default() };
-    let machine = Machine::new(Box::new(Toy::new(Kind::Cmm, 1e9).up_to(7)), BOOT_ID, options);
+    let machine = SimulatedMachine::new(Box::new(Toy::new(Kind::Cmm, 1e9).up_to(7)), BOOT_ID, options);
     let (settings, record) = record(machine, order).await;
     let (mut cmm, one, calm) = (ModbusCmm::new(settings).unwrap(), plan(), Interrupt::new());
     let target = |k: u32| {
@@ -199,7 +200,7 @@ async fn measured_ahead(order: WordOrder, word_order: words::WordOrder) -> Vec<V
     }
     assert_eq!(told.len(), 1, "one page is full");
     assert_eq!(
-        (told[0].points.len(), told[0].points[6].index, told[0].points[6].at_mm),
+        (told[0].points.len(), told[0].points[6].index, told[0].points[6].position_mm),
         (7, 70_006, [1.1 + 6.0, -2.3, 2.7])
     );
     record.lock().unwrap().clone()
@@ -359,7 +360,7 @@ fn the_check_numbers_in_the_text_are_those_of_the_frames() {
 #[test]
 fn the_ranges_of_the_page_are_those_of_the_program() {
     let rows: Vec<_> = PAGE.lines().map(cells).filter(|cells| cells.len() == 4).collect();
-    for Range { figure, least, most, unit } in RANGES {
+    for ValueRange { name: figure, min: least, max: most, unit } in RANGES {
         let is_it = |cells: &&Vec<&str>| {
             cells[0] == figure
                 && cells[3].trim() == unit

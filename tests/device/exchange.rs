@@ -8,12 +8,12 @@ use std::sync::mpsc;
 use std::time::{Duration, Instant, SystemTime};
 
 use regrind::device::exchange::{
-    CmmExchange, CmmFolders, Confirmed, Exchange, ExchangeError, ExchangeMachine, GrindOrder, GrinderExchange,
-    GrinderFolders, HandOver, Look, MeasureOrder, Pattern, Permit, Standing, StationFiles, Stations,
+    CmmExchange, CmmFolders, ConfirmedStep, Exchange, ExchangeError, ExchangeMachine, GrindOrder, GrinderExchange,
+    GrinderFolders, HandOver, HandOverStatus, MeasureOrder, Pattern, Permit, PollResult, StationFiles, Stations,
 };
 use regrind::device::{
     Answer, Cmm, Coordinates, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Machine, MachineKind,
-    Measurement, Outcome, Plan, PointStatus, Reconciled, State, Target, TargetKind, Word, digest,
+    Measurement, OperatorConfirmation, Outcome, Plan, PointStatus, Reconciled, State, Target, TargetKind, digest,
 };
 use regrind::geometry::Grid;
 use tokio::sync::oneshot;
@@ -42,7 +42,7 @@ impl Shop {
     /// Returns settings with which a poll reports its findings, however busy the computer is.
     fn cmm(&self) -> CmmExchange {
         let read_within = Duration::from_secs(300);
-        CmmExchange { read_within, ..CmmExchange::new("SN 7", &self.outbox, &self.inbox) }
+        CmmExchange { read_timeout: read_within, ..CmmExchange::new("SN 7", &self.outbox, &self.inbox) }
     }
 
     fn grinder(&self, stable_for: Duration) -> GrinderFolders {
@@ -72,7 +72,7 @@ impl Shop {
 fn plan(count: u32) -> Plan {
     let target = |index| Target {
         index: 10 + index,
-        what: TargetKind::Part,
+        kind: TargetKind::Part,
         point_mm: [f64::from(index), 0.25, -1e-7],
         normal: [0.0, 0.6, 0.8],
     };
@@ -83,7 +83,7 @@ fn plan(count: u32) -> Plan {
         search_mm: 1.0,
         speed_mm_s: 5.0,
         safe_height_mm: 50.0,
-        careful: None,
+        careful_start: None,
     }
 }
 
@@ -109,17 +109,17 @@ impl Bench {
         Self { folders, job, now_s: 0 }
     }
 
-    fn look(&mut self) -> Look<Measurement> {
+    fn poll(&mut self) -> PollResult<Measurement> {
         self.now_s += 1;
-        self.folders.look(Duration::from_secs(self.now_s), self.job).unwrap()
+        self.folders.poll(Duration::from_secs(self.now_s), self.job).unwrap()
     }
 
     /// Polls until all files have settled.
-    fn settled(&mut self) -> Look<Measurement> {
+    fn settled(&mut self) -> PollResult<Measurement> {
         for _ in 0..2 {
-            self.look();
+            self.poll();
         }
-        self.look()
+        self.poll()
     }
 
     fn refused(&mut self, expected: &str) {
@@ -130,7 +130,7 @@ impl Bench {
 }
 
 /// Asserts that the notes of a poll contain these words.
-fn assert_says<A>(look: &Look<A>, words: &[&str]) {
+fn assert_says<A>(look: &PollResult<A>, words: &[&str]) {
     let said = look.notes.join("\n");
     for word in words {
         assert!(said.contains(word), "said\n{said}\nnot {word}");
@@ -172,25 +172,25 @@ fn the_plan_says_everything_and_reads_back_to_the_same_bits() {
 fn a_result_is_taken_when_it_has_settled_and_ended_and_not_before() {
     let shop = Shop::new();
     let mut bench = Bench::new(shop.cmm());
-    assert_says(&bench.look(), &["waiting for SN_7_c2.* in"]);
+    assert_says(&bench.poll(), &["waiting for SN_7_c2.* in"]);
     shop.put("SN_7_c2.csv", "# coordinates: centres\nx,y,z\n1,2,3\n");
-    assert!(bench.look().answer.is_none());
+    assert!(bench.poll().answer.is_none());
     // The file grows during the polls: the settling time begins again.
     shop.put("SN_7_c2.csv", "# coordinates: centres\nx,y,z\n1,2,3\n4,5,6\n7,8,9.1");
-    let look = bench.look();
+    let look = bench.poll();
     assert!(look.answer.is_none());
     assert_says(&look, &["still changing"]);
     // The last line has three numbers, but it is incomplete.
     bench.refused("cut in the middle of a line, found `7,8,9.1`");
     shop.put("SN_7_c2.csv", &three());
-    assert!(bench.look().answer.is_none());
-    assert!(bench.look().answer.is_none());
-    let found = bench.look().answer.unwrap();
+    assert!(bench.poll().answer.is_none());
+    assert!(bench.poll().answer.is_none());
+    let found = bench.poll().answer.unwrap();
     assert_eq!(found.points.iter().map(|p| p.index).collect::<Vec<_>>(), [10, 11, 12]);
-    assert_eq!((found.points[2].at_mm, found.coordinates), ([7.0, 8.0, 9.125], Coordinates::Centres));
+    assert_eq!((found.points[2].position_mm, found.coordinates), ([7.0, 8.0, 9.125], Coordinates::Centres));
     assert_eq!((found.job, found.cycle, found.plan_identity), (3, 2, plan(3).identity()));
     // A second poll returns the same.
-    assert_eq!(bench.look().answer.unwrap(), found);
+    assert_eq!(bench.poll().answer.unwrap(), found);
 }
 
 /// Returns the height of the part above the nominal surface at a point of a plan, in mm.
@@ -200,7 +200,7 @@ fn proud_mm(number: usize) -> f64 {
 
 /// Returns the result file of a machine that runs DMIS: every statement of the program, and every point touched by a
 /// ball of 1.5 mm, a little above its target.
-fn ran(program: &str) -> String {
+fn dmis_result(program: &str) -> String {
     // A `$` at the end of a line continues it on the next.
     let whole = program.replace("$\n", "");
     let mut output = String::from("UNITS/MM,ANGDEC\n");
@@ -232,7 +232,7 @@ fn a_dmis_program_is_handed_over_and_what_a_machine_makes_of_it_is_taken() {
     let settings = CmmExchange { dmis_sensor: Some("PROBE6".into()), content, ..shop.cmm() };
     let mut bench = Bench::new(settings);
     let program = fs::read_to_string(shop.outbox.join("SN_7_j3_c2/plan.dmi")).unwrap();
-    let output = ran(&program);
+    let output = dmis_result(&program);
     // A result of another plan, cycle or part is not accepted, whatever its name.
     for (from, to, expected) in [
         ("'cycle: 2'", "'cycle: 1'", "is of cycle 1, not 2; left alone"),
@@ -251,7 +251,7 @@ fn a_dmis_program_is_handed_over_and_what_a_machine_makes_of_it_is_taken() {
     for (number, (point, target)) in found.points.iter().zip(plan(3).targets).enumerate() {
         let away = 1.5 + proud_mm(number);
         for k in 0..3 {
-            assert!((point.at_mm[k] - target.point_mm[k] - away * target.normal[k]).abs() < 1e-6, "{point:?}");
+            assert!((point.position_mm[k] - target.point_mm[k] - away * target.normal[k]).abs() < 1e-6, "{point:?}");
         }
     }
 }
@@ -279,7 +279,7 @@ fn a_qif_result_is_taken_by_what_it_says_of_itself() {
     let found = bench.settled().answer.unwrap();
     assert_eq!(found.points.iter().map(|p| p.index).collect::<Vec<_>>(), [10, 11, 12]);
     let expected = [7.0, 8.0, 9.125].map(|inches| 25.4 * inches);
-    assert!((0..3).all(|k| (found.points[2].at_mm[k] - expected[k]).abs() < 1e-9), "{:?}", found.points[2]);
+    assert!((0..3).all(|k| (found.points[2].position_mm[k] - expected[k]).abs() < 1e-9), "{:?}", found.points[2]);
     assert_eq!(found.coordinates, Coordinates::Centres);
 }
 
@@ -338,7 +338,7 @@ fn what_is_wrong_with_a_result_is_said_with_the_remedy() {
     let found = bench.settled().answer.unwrap();
     let status: Vec<PointStatus> = found.points.iter().map(|p| p.status).collect();
     assert_eq!(status, [PointStatus::Touched, PointStatus::NotFound, PointStatus::Touched]);
-    assert_eq!(found.points[2].at_mm, [1.0, 2.0, 3.0]);
+    assert_eq!(found.points[2].position_mm, [1.0, 2.0, 3.0]);
 }
 
 #[test]
@@ -369,7 +369,7 @@ fn the_cell_may_say_what_the_file_does_not() {
     shop.put("SN_7_c2.csv", "1,000;2;3\n1.000,5;5;6\n7;8;9\n");
     let found = bench.settled().answer.unwrap();
     assert_eq!(found.coordinates, Coordinates::Contacts);
-    assert_eq!((found.points[0].at_mm[0], found.points[1].at_mm[0]), (25.4, 25.4 * 1000.5));
+    assert_eq!((found.points[0].position_mm[0], found.points[1].position_mm[0]), (25.4, 25.4 * 1000.5));
 }
 
 #[test]
@@ -383,14 +383,14 @@ fn a_job_and_cycle_is_handed_over_once_and_its_bytes_answer_no_other_cycle() {
     assert!(matches!(refused, Err(ExchangeError::HandedOver { job: 3, cycle: 2, .. })), "{refused:?}");
     shop.put("SN_7_c2.csv", &three());
     assert!(bench.settled().answer.is_some());
-    bench.folders.mark(bench.job, Standing::Closed).unwrap();
+    bench.folders.mark(bench.job, HandOverStatus::Closed).unwrap();
     assert_eq!(shop.handed(), ["SN_7_j3_c2.done"]);
     // Nor does another process accept it, nor after it was acknowledged.
     let mut other = CmmFolders::new(shop.cmm());
     let refused = again(&mut other);
     assert!(matches!(refused, Err(ExchangeError::HandedOver { job: 3, cycle: 2, .. })), "{refused:?}");
     let handed = other.open().unwrap();
-    assert_eq!((handed.len(), handed[0].sequence, handed[0].standing), (1, 1, Standing::Closed));
+    assert_eq!((handed.len(), handed[0].sequence, handed[0].status), (1, 1, HandOverStatus::Closed));
     let next = Job { job: 3, cycle: 3, digest };
     other.publish(next, 2, &order, &Permit::new()).unwrap();
     let mut bench = Bench { folders: other, job: next, now_s: 0 };
@@ -407,9 +407,9 @@ fn a_restart_finds_what_is_open() {
     let mut bench = Bench { folders: CmmFolders::new(shop.cmm()), job, now_s: 0 };
     shop.put("SN_7_c2.csv", &three());
     assert_eq!(bench.settled().answer.unwrap().points.len(), 3);
-    bench.folders.mark(job, Standing::Held).unwrap();
+    bench.folders.mark(job, HandOverStatus::Held).unwrap();
     assert_eq!(shop.handed(), ["SN_7_j3_c2.held"]);
-    bench.folders.mark(job, Standing::Open).unwrap();
+    bench.folders.mark(job, HandOverStatus::Open).unwrap();
     fs::rename(shop.outbox.join("SN_7_j3_c2"), shop.outbox.join("mine")).unwrap();
     let why = bench.folders.open().unwrap_err().to_string();
     assert!(why.contains("expected a folder with the name that was given to it"), "{why}");
@@ -438,7 +438,7 @@ fn station_shop(shop: &Shop) -> CmmExchange {
     fs::write(&nominal, NOMINAL).unwrap();
     let files = vec![StationFiles { points: Pattern::new("P_*.txt"), references: Pattern::new("ref_*.yaml") }];
     let stations = Stations { files, nominal, group: Some("primary".into()), limit_mm: 0.1 };
-    CmmExchange { stations: Some(stations), free_count: true, least_points: 4, ..shop.cmm() }
+    CmmExchange { stations: Some(stations), free_count: true, min_points: 4, ..shop.cmm() }
 }
 
 fn points(station: usize) -> String {
@@ -459,14 +459,14 @@ fn stations_are_merged_by_their_reference_points() {
     shop.put("P_2.txt", &points(2));
     shop.put("ref_2.yaml", &references([0, 2, 1, 3], 2));
     bench.refused("station 2 (ref_2.yaml): reference point right is off by");
-    assert_says(&bench.look(), &["right and upper seem exchanged"]);
+    assert_says(&bench.poll(), &["right and upper seem exchanged"]);
     shop.put("ref_2.yaml", &references([0, 1, 2, 3], 2));
     let look = bench.settled();
     assert_says(&look, &["left alone, no station's: ref_9.yaml"]);
     assert_says(&look, &["station 1 (ref_1.yaml): reference points fit to 0.000 mm rms (left 0.000, right 0.000"]);
     let found = look.answer.unwrap();
     for (k, expected) in [[10.0, 20.0, 30.0], [40.0, 50.0, 61.0]].iter().cycle().take(4).enumerate() {
-        let at = found.points[k].at_mm;
+        let at = found.points[k].position_mm;
         assert!(at.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9), "{at:?} not {expected:?}");
     }
 }
@@ -495,17 +495,17 @@ fn a_pass_is_confirmed_by_files_that_name_its_map() {
     let mut now = 0;
     let mut settled = |grinder: &mut GrinderFolders| {
         now += 10;
-        grinder.look(Duration::from_secs(now), job).unwrap();
-        grinder.look(Duration::from_secs(now + 2), job).unwrap()
+        grinder.poll(Duration::from_secs(now), job).unwrap();
+        grinder.poll(Duration::from_secs(now + 2), job).unwrap()
     };
     assert_says(&settled(&mut grinder), &["done.json lay there before", "waiting for the start to be confirmed"]);
     shop.put("started.json", r#"{"map": "0123456789abcdef"}"#);
     let look = settled(&mut grinder);
-    assert!(!look.begun);
+    assert!(!look.start_confirmed);
     assert_says(&look, &["confirms map `0123456789abcdef`, handed over was map"]);
     fs::copy(folder.join("started.json"), shop.inbox.join("started.json")).unwrap();
     let look = settled(&mut grinder);
-    assert!(look.begun && look.answer.is_none());
+    assert!(look.start_confirmed && look.answer.is_none());
     assert_says(&look, &["waiting for the end"]);
     let done = fs::read_to_string(folder.join("done.json")).unwrap();
     shop.put("done.json", &done.replace("\"cycle\": 2", "\"cycle\": 1"));
@@ -520,7 +520,7 @@ fn a_pass_is_confirmed_by_files_that_name_its_map() {
         grinder.publish(job, 5, &GrindOrder { map: map(), pass: pass(), map_identity }, &Permit::new()),
         Err(ExchangeError::HandedOver { .. })
     ));
-    match grinder.confirm(job, Confirmed::Done, [1; 32]) {
+    match grinder.confirm(job, ConfirmedStep::Done, [1; 32]) {
         Err(ExchangeError::OtherMap { expected, found }) => assert_eq!((expected, found), (map_identity, [1; 32])),
         other => panic!("{other:?}"),
     }
@@ -590,7 +590,7 @@ async fn a_measuring_machine_goes_through_the_states_of_a_wire() {
 #[tokio::test]
 async fn while_a_large_file_is_read_the_job_is_held_and_let_go_on_and_then_it_is_told() {
     let shop = Shop::new();
-    let folders = CmmFolders::new(CmmExchange { read_within: Duration::ZERO, ..at_once(shop.cmm()) });
+    let folders = CmmFolders::new(CmmExchange { read_timeout: Duration::ZERO, ..at_once(shop.cmm()) });
     let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, folders, ANSWERS_WITHIN);
     cmm.connect().await.unwrap();
     cmm.claim().await.unwrap();
@@ -669,8 +669,8 @@ async fn a_grinder_is_begun_and_ended_by_a_persons_word() {
     assert_eq!(answer_of(grinder.prepare(job).await), Answer::NotOwner);
     grinder.claim().await.unwrap();
     let armed = grinder.prepare(job).await.unwrap();
-    let started = |map_identity| Word::Started { map_identity: Some(map_identity) };
-    let done = Word::Done { map_identity: Some(map.identity()), file: None };
+    let started = |map_identity| OperatorConfirmation::Started { map_identity: Some(map_identity) };
+    let done = OperatorConfirmation::Done { map_identity: Some(map.identity()), file: None };
     assert_eq!(answer_of(grinder.confirm(done.clone()).await), Answer::WrongState);
     grinder.start(armed).await.unwrap();
     assert!(matches!(grinder.confirm(started([9; 32])).await, Err(DeviceError::Mismatch { .. })));
@@ -730,12 +730,12 @@ impl Exchange for Hanging {
         published
     }
 
-    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), ExchangeError> {
+    fn mark(&mut self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError> {
         self.folders.mark(job, standing)
     }
 
-    fn look(&mut self, now: Duration, job: Job) -> Result<Look<Measurement>, ExchangeError> {
-        self.folders.look(now, job)
+    fn poll(&mut self, now: Duration, job: Job) -> Result<PollResult<Measurement>, ExchangeError> {
+        self.folders.poll(now, job)
     }
 }
 
@@ -821,8 +821,9 @@ async fn every_combination_of_wires_makes_two_machines() {
         // A person can take a week; a network connection cannot. Only files accept a person's confirmation.
         let (_, plan) = setup::prepare(&recipe, &cell).unwrap();
         assert_eq!(plan.deadlines.progress.map(|limit| limit > Duration::from_secs(86_400)), wires);
-        let told = { grinder }.confirm(Word::Started { map_identity: Some([0; 32]) }).await.unwrap_err();
-        assert_eq!(matches!(told, DeviceError::TellsItself { .. }), !wires[1], "{told}");
+        let told =
+            { grinder }.confirm(OperatorConfirmation::Started { map_identity: Some([0; 32]) }).await.unwrap_err();
+        assert_eq!(matches!(told, DeviceError::ConfirmationNotNeeded { .. }), !wires[1], "{told}");
     }
     let cell = cell_of([true, true], &shops);
     fs::remove_dir(&shops[0].outbox).unwrap();

@@ -7,10 +7,10 @@
 use std::path::Path;
 use std::time::Duration;
 
-use regrind::device::hit_lines::{HitLine, HitLinesCmm, HitLinesSettings, LineFormat, Reading, Repeated};
+use regrind::device::hit_lines::{HitLinesCmm, HitLinesSettings, HitSource, LineFormat, LineParser, Repeated};
 use regrind::device::{
-    Cmm as _, Coordinates, Identified, Interrupt, Job, Machine, Measurement, Outcome, Parity, Plan, PointStatus, State,
-    Target, TargetKind, Word, digest,
+    Cmm as _, Coordinates, Identified, Interrupt, Job, Machine, Measurement, OperatorConfirmation, Outcome, Parity,
+    Plan, PointStatus, State, Target, TargetKind, digest,
 };
 use regrind_sim::hits::faults::Fault;
 use regrind_sim::hits::print::Style;
@@ -23,7 +23,7 @@ const LONG: Duration = Duration::from_secs(600);
 fn plan(targets: u32) -> Plan {
     let point_mm = |k: u32| [100.0 + 50.0 * f64::from(k), 200.0, 298.5];
     let what = TargetKind::Part;
-    let target = |k| Target { index: 7 + k, what, point_mm: point_mm(k), normal: [0.0, 0.0, 1.0] };
+    let target = |k| Target { index: 7 + k, kind: what, point_mm: point_mm(k), normal: [0.0, 0.0, 1.0] };
     Plan {
         targets: (0..targets).map(target).collect(),
         probe_radius_mm: 1.5,
@@ -31,35 +31,35 @@ fn plan(targets: u32) -> Plan {
         search_mm: 2.0,
         speed_mm_s: 5.0,
         safe_height_mm: 50.0,
-        careful: None,
+        careful_start: None,
     }
 }
 
-fn settings(folder: &Path, line: HitLine) -> HitLinesSettings {
+fn settings(folder: &Path, line: HitSource) -> HitLinesSettings {
     HitLinesSettings {
         part: "SN-7".into(),
         run_folder: folder.to_owned(),
         plan_folder: None,
-        line,
-        reading: Reading::default(),
-        what: Coordinates::Centres,
+        source: line,
+        parser: LineParser::default(),
+        coordinates: Coordinates::Centres,
         rotary_deg: [245.5, 0.05],
         limit_mm: 1.0,
         double_within: LONG,
         repeated: Repeated::Refuse,
-        line_within: LONG,
+        line_timeout: LONG,
         passed_over: vec!["PROBE".into()],
         clear_after: None,
-        free_points: None,
-        connect_within: LONG,
+        min_free_points: None,
+        connect_timeout: LONG,
         silence: Duration::from_millis(1),
         simulated: true,
     }
 }
 
-fn serial(serving: &ServingHits) -> HitLine {
+fn serial(serving: &ServingHits) -> HitSource {
     let device = serving.path().unwrap().display().to_string();
-    HitLine::Serial { device, baud: 9600, data_bits: 8, parity: Parity::None, stop_bits: 1 }
+    HitSource::Serial { device, baud: 9600, data_bits: 8, parity: Parity::None, stop_bits: 1 }
 }
 
 struct Bench {
@@ -74,7 +74,7 @@ impl Bench {
     async fn new(
         targets: u32,
         serving: ServingHits,
-        line: HitLine,
+        line: HitSource,
         change: impl FnOnce(&mut HitLinesSettings),
     ) -> Self {
         let folder = tempfile::tempdir().unwrap();
@@ -114,7 +114,7 @@ impl Bench {
     }
 
     async fn done(&mut self) -> Measurement {
-        let kept = self.cmm.confirm(Word::Done { map_identity: None, file: None }).await.unwrap();
+        let kept = self.cmm.confirm(OperatorConfirmation::Done { map_identity: None, file: None }).await.unwrap();
         assert_eq!(kept, ["cycle-1/plan.csv", "cycle-1/hits.jsonl"]);
         assert!(kept.iter().all(|file| self.folder.path().join(file).is_file()));
         let status = self.cmm.status().await.unwrap();
@@ -146,14 +146,14 @@ async fn the_eight_formats_come_over_a_serial_line_byte_for_byte() {
             ..Style::default()
         };
         assert_eq!(style.line([100.0, 200.0, 300.0]), line, "the simulated machine prints it alike");
-        let mut bench = Bench::on_serial(1, |settings| settings.reading.format = format).await;
+        let mut bench = Bench::on_serial(1, |settings| settings.parser.format = format).await;
         // The line arrives in two pieces.
         let (begin, rest) = line.split_at(line.len() / 2);
         bench.serving.send(begin).await;
         bench.serving.send(rest).await;
         bench.until(1, State::Execute).await;
         let measured = bench.done().await;
-        assert_eq!(measured.points[0].at_mm, [100.0, 200.0, 300.0], "{format:?}");
+        assert_eq!(measured.points[0].position_mm, [100.0, 200.0, 300.0], "{format:?}");
         assert_eq!((measured.points[0].index, measured.points[0].status), (7, PointStatus::Touched));
         assert_eq!((measured.coordinates, measured.probe_radius_mm), (Coordinates::Centres, None));
         bench.cmm.acknowledge(measured.done).await.unwrap();
@@ -186,7 +186,7 @@ async fn a_line_that_is_not_whole_becomes_no_point_and_what_it_told_is_touched_a
             notes.contains(why) && notes.contains("then: regrind confirm still --machine cmm"),
             "{fault:?}: {notes}"
         );
-        bench.cmm.confirm(Word::Still).await.unwrap();
+        bench.cmm.confirm(OperatorConfirmation::Still).await.unwrap();
         bench.until(touched, State::Held).await;
         bench.cmm.resume().await.unwrap();
         // The person looks at the remaining targets, and touches them.
@@ -198,7 +198,7 @@ async fn a_line_that_is_not_whole_becomes_no_point_and_what_it_told_is_touched_a
         }
         let measured = bench.done().await;
         for (k, point) in measured.points.iter().enumerate() {
-            assert_eq!(point.at_mm, [100.0 + 50.0 * k as f64, 200.0, 300.0], "{fault:?}");
+            assert_eq!(point.position_mm, [100.0 + 50.0 * k as f64, 200.0, 300.0], "{fault:?}");
         }
     }
 }
@@ -218,7 +218,7 @@ async fn a_line_that_was_lost_leaves_its_target_open_and_a_person_may_end_withou
     let mut bench = Bench::on_serial(4, |_| {}).await;
     bench.serving.send(&with_fault(&Fault::Dropped)).await;
     bench.until(3, State::Execute).await;
-    let named = Word::Done { map_identity: None, file: Some("x.csv".into()) };
+    let named = OperatorConfirmation::Done { map_identity: None, file: Some("x.csv".into()) };
     assert!(bench.cmm.confirm(named).await.unwrap_err().to_string().contains("leave --file out"));
     let measured = bench.done().await;
     let status: Vec<PointStatus> = measured.points.iter().map(|point| point.status).collect();
@@ -232,7 +232,7 @@ async fn another_touch_of_a_target_takes_the_place_of_the_first_only_where_the_c
         bench.serving.send(b"100.000,200.000,300.000\r\n100.010,200.000,300.000\r\n150.000,200.000,300.000\r\n").await;
         bench.until(2, if first { State::Holding } else { State::Execute }).await;
         let measured = bench.done().await;
-        assert_eq!(measured.points[0].at_mm[0], if first { 100.0 } else { 100.01 });
+        assert_eq!(measured.points[0].position_mm[0], if first { 100.0 } else { 100.01 });
     }
 }
 
@@ -240,7 +240,7 @@ async fn another_touch_of_a_target_takes_the_place_of_the_first_only_where_the_c
 async fn a_line_of_a_terminal_server_that_breaks_off_loses_no_point_that_there_is() {
     let serving = ServingHits::tcp("127.0.0.1:0").await.unwrap();
     let port = serving.local_addr().unwrap().port();
-    let mut bench = Bench::new(3, serving, HitLine::Tcp { host: "127.0.0.1".into(), port }, |_| {}).await;
+    let mut bench = Bench::new(3, serving, HitSource::Tcp { host: "127.0.0.1".into(), port }, |_| {}).await;
     bench.serving.send(b"100.000,200.000,300.000\r\n150.000,200.0").await;
     bench.until(1, State::Execute).await;
     bench.serving.hang_up().await;
@@ -261,7 +261,7 @@ async fn a_line_of_a_terminal_server_that_breaks_off_loses_no_point_that_there_i
             && notes.contains("2 targets are left"),
         "{notes}"
     );
-    bench.cmm.confirm(Word::Still).await.unwrap();
+    bench.cmm.confirm(OperatorConfirmation::Still).await.unwrap();
     bench.cmm.resume().await.unwrap();
     bench.serving.send(b"150.000,200.000,300.000\r\n200.000,200.000,300.000\r\n").await;
     bench.until(3, State::Execute).await;
@@ -292,7 +292,7 @@ async fn hold_stop_and_abort_are_asked_of_the_person() {
     bench.serving.send(b"100.000,200.000,300.000\r\n").await;
     bench.until(1, State::Holding).await;
     assert!(bench.notes().contains("HOLD it at its own panel; 1 targets are left: 8"), "{}", bench.notes());
-    bench.cmm.confirm(Word::Still).await.unwrap();
+    bench.cmm.confirm(OperatorConfirmation::Still).await.unwrap();
     assert_eq!(bench.cmm.stop().await.unwrap().outcome, Outcome::Stopped);
     let mut bench = Bench::on_serial(2, |_| {}).await;
     assert_eq!(bench.cmm.abort().await.unwrap().state, State::Aborting);

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use regrind::compensation::ErrorMap;
 use regrind::device::{
-    Cmm, Coordinates, CorrectionMap, Grinder, Identified, Interrupt, Job, Line, Machine, MachineKind, ModbusCmm,
+    Cmm, Coordinates, CorrectionMap, Grinder, Identified, Interrupt, Job, LineAddress, Machine, MachineKind, ModbusCmm,
     ModbusGrinder, ModbusSettings, Outcome, Pass, Plan, PointStatus, State, Status, Target, TargetKind, digest,
 };
 use regrind::formats::write_error_map_x3p;
@@ -75,7 +75,7 @@ struct Process {
 }
 
 impl Process {
-    fn of(python: &Path, script: &str, arguments: &[&str]) -> Self {
+    fn start(python: &Path, script: &str, arguments: &[&str]) -> Self {
         let mut command = Command::new(python);
         let mut child = command.arg(scripts().join(script)).args(arguments).stdout(Stdio::piped()).spawn().unwrap();
         let mut line = String::new();
@@ -84,7 +84,7 @@ impl Process {
         let port = port.unwrap_or_else(|| panic!("{script} said {line:?}"));
         let settings = ModbusSettings {
             request_timeout: Duration::from_secs(5),
-            ..ModbusSettings::new(Line::Tcp { host: "127.0.0.1".into(), port })
+            ..ModbusSettings::new(LineAddress::Tcp { host: "127.0.0.1".into(), port })
         };
         Self { child, settings }
     }
@@ -114,7 +114,7 @@ async fn until_complete<M: Machine>(machine: &mut M) -> Status {
 fn plan() -> Plan {
     let target = |index: u32| Target {
         index,
-        what: TargetKind::Part,
+        kind: TargetKind::Part,
         point_mm: [f64::from(index), -0.25 * f64::from(index), 3.0],
         normal: [0.6, 0.0, 0.8],
     };
@@ -125,7 +125,7 @@ fn plan() -> Plan {
         search_mm: 1.0,
         speed_mm_s: 2.0,
         safe_height_mm: 20.0,
-        careful: None,
+        careful_start: None,
     }
 }
 
@@ -133,7 +133,7 @@ fn plan() -> Plan {
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
 async fn our_driver_has_a_pymodbus_cmm_measure() {
     let python = python();
-    let process = Process::of(python, "cmm.py", &[]);
+    let process = Process::start(python, "cmm.py", &[]);
     let mut cmm = ModbusCmm::new(process.settings.clone()).unwrap();
     let identity = cmm.connect().await.unwrap();
     assert_eq!((identity.kind, identity.name.as_str()), (MachineKind::Cmm, "pymodbus CMM 1"));
@@ -151,19 +151,19 @@ async fn our_driver_has_a_pymodbus_cmm_measure() {
         for (target, point) in plan.targets.iter().zip(&measured.points) {
             // The machine's own known error: 0.1 um along x at every odd index.
             let x_mm = target.point_mm[0] + 1e-4 * f64::from(target.index % 2) + 2.5 * target.normal[0];
-            assert_eq!((point.index, point.status, point.at_mm[0]), (target.index, PointStatus::Touched, x_mm));
+            assert_eq!((point.index, point.status, point.position_mm[0]), (target.index, PointStatus::Touched, x_mm));
         }
         assert_eq!(measured.points.len(), 200);
         cmm.acknowledge(measured.done).await.unwrap();
     }
-    let figures = cmm.link().figures();
+    let figures = cmm.link().statistics();
     println!("{} answers, {:.0} us each", figures.answers, figures.answer_ns as f64 / 1e3 / figures.answers as f64);
 }
 
 #[tokio::test]
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
 async fn a_pymodbus_cmm_gives_pages_while_it_measures() {
-    let process = Process::of(python(), "cmm.py", &["--ahead", "--seconds", "3"]);
+    let process = Process::start(python(), "cmm.py", &["--ahead", "--seconds", "3"]);
     let mut cmm = ModbusCmm::new(process.settings.clone()).unwrap();
     cmm.connect().await.unwrap();
     cmm.claim().await.unwrap();
@@ -187,7 +187,7 @@ async fn a_pymodbus_cmm_gives_pages_while_it_measures() {
 async fn our_driver_has_a_pymodbus_grinder_grind() {
     let python = python();
     // Long enough for a hold to arrive before its end on any computer.
-    let process = Process::of(python, "grinder.py", &["--seconds", "3"]);
+    let process = Process::start(python, "grinder.py", &["--seconds", "3"]);
     let mut grinder = ModbusGrinder::new(process.settings.clone()).unwrap();
     grinder.connect().await.unwrap();
     grinder.claim().await.unwrap();
@@ -222,11 +222,11 @@ fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
     let home = tempfile::tempdir().unwrap();
     let part = home.path().join("part.bin");
     let part = part.to_str().unwrap();
-    let cmm = Process::of(python, "cmm.py", &["--part", part]);
-    let grinder = Process::of(python, "grinder.py", &["--part", part, "--unit", "2"]);
+    let cmm = Process::start(python, "cmm.py", &["--part", part]);
+    let grinder = Process::start(python, "grinder.py", &["--part", part, "--unit", "2"]);
     let port = |process: &Process| match &process.settings.line {
-        Line::Tcp { port, .. } => format!("port = {port}"),
-        Line::Rtu { .. } => unreachable!("both serve TCP"),
+        LineAddress::Tcp { port, .. } => format!("port = {port}"),
+        LineAddress::Rtu { .. } => unreachable!("both serve TCP"),
     };
     let recipe = crate::program::small_recipe(home.path(), 1.0);
     let named = "# expected_name = \"CMM 7, serial 12345\"";
@@ -287,8 +287,11 @@ fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
 async fn a_pymodbus_client_has_our_simulated_cmm_measure() {
     let python = python();
-    let machine =
-        registers::Machine::new(Box::new(crate::toy::Toy::new(Kind::Cmm, 100.0)), 77, MachineOptions::default());
+    let machine = registers::SimulatedMachine::new(
+        Box::new(crate::toy::Toy::new(Kind::Cmm, 100.0)),
+        77,
+        MachineOptions::default(),
+    );
     let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine)]).await.unwrap();
     let port = serving.local_addr().unwrap().port().to_string();
     let mut client = Command::new(python);

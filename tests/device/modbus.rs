@@ -7,16 +7,16 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use regrind::device::{
-    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Line, Link, Machine,
-    MachineKind, Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity, Pass, Plan, PointStatus,
-    Reconciled, RegisterMap, Signal, SignalType, State, Target, TargetKind, WordOrder, digest,
+    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, LineAddress, Link,
+    Machine, MachineKind, Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity, Pass, Plan,
+    PointStatus, Reconciled, RegisterMap, Signal, SignalType, State, Target, TargetKind, WordOrder, digest,
 };
 use regrind::geometry::Grid;
 use regrind_sim::body::Kind;
-use regrind_sim::command::{Command as SimCommand, Frame as SimFrame};
-use regrind_sim::options::{Layout, MachineOptions};
+use regrind_sim::command::{Command as SimCommand, CommandFrame as SimFrame};
+use regrind_sim::options::{MachineOptions, RegisterLayout};
 use regrind_sim::wire::Serving;
-use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, Request, When};
+use regrind_sim::wire::faults::{Fault, FaultPlan, Request, SharedFaultPlan, When};
 use regrind_sim::wire::rtu::Line as SerialLine;
 use regrind_sim::{registers, words};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -26,14 +26,14 @@ use crate::toy::{Toy, pass};
 
 // ---- machines to talk to ------------------------------------------------------------------------------------------------------------
 
-fn toy(kind: Kind, points_a_second: f64, options: MachineOptions) -> registers::Machine {
-    registers::Machine::new(Box::new(Toy::new(kind, points_a_second)), 0xb007, options)
+fn toy(kind: Kind, points_a_second: f64, options: MachineOptions) -> registers::SimulatedMachine {
+    registers::SimulatedMachine::new(Box::new(Toy::new(kind, points_a_second)), 0xb007, options)
 }
 
 /// Speed that finishes a job between two polls.
 const AT_ONCE: f64 = 1e9;
 
-async fn serve(kind: Kind, points_a_second: f64, faults: Faults) -> Serving {
+async fn serve(kind: Kind, points_a_second: f64, faults: SharedFaultPlan) -> Serving {
     let machine = toy(kind, points_a_second, MachineOptions::default());
     Serving::tcp_with("127.0.0.1:0", vec![(1, machine)], faults).await.unwrap()
 }
@@ -45,7 +45,7 @@ pub fn settings(serving: &Serving) -> ModbusSettings {
         quarantine: Duration::from_millis(20),
         retries: 6,
         lost_after: Duration::from_secs(20),
-        ..ModbusSettings::new(Line::Tcp { host: "127.0.0.1".into(), port })
+        ..ModbusSettings::new(LineAddress::Tcp { host: "127.0.0.1".into(), port })
     }
 }
 
@@ -67,7 +67,7 @@ pub fn plan(points: u32) -> Plan {
         let length = (1.0 + 0.01 * x * x).sqrt();
         Target {
             index,
-            what: if index < 5 { TargetKind::ReferenceSphere } else { TargetKind::Part },
+            kind: if index < 5 { TargetKind::ReferenceSphere } else { TargetKind::Part },
             point_mm: [x, y, -0.05 * x * x],
             normal: [0.1 * x / length, 0.0, 1.0 / length],
         }
@@ -79,7 +79,7 @@ pub fn plan(points: u32) -> Plan {
         search_mm: 1.0,
         speed_mm_s: 2.0,
         safe_height_mm: 20.0,
-        careful: None,
+        careful_start: None,
     }
 }
 
@@ -104,7 +104,7 @@ pub fn assert_exact(plan: &Plan, measured: &Measurement, hint: &str) {
         assert_eq!((point.index, point.status), (target.index, PointStatus::Touched), "{hint}");
         let centre_mm: [f64; 3] =
             std::array::from_fn(|axis| target.point_mm[axis] + plan.probe_radius_mm * target.normal[axis]);
-        assert_eq!(point.at_mm, centre_mm, "{hint}");
+        assert_eq!(point.position_mm, centre_mm, "{hint}");
     }
 }
 
@@ -121,7 +121,7 @@ async fn connected(settings: ModbusSettings) -> ModbusCmm {
     cmm
 }
 
-pub async fn reaches<M: Machine>(machine: &mut M, state: State) -> Result<(), DeviceError> {
+pub async fn wait_for_state<M: Machine>(machine: &mut M, state: State) -> Result<(), DeviceError> {
     let began = Instant::now();
     loop {
         let status = machine.status().await?;
@@ -140,7 +140,7 @@ async fn measure(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16) -> Result<Measure
     let armed = cmm.prepare(job).await?;
     let started = cmm.start(armed).await?;
     assert_eq!(started.job, job);
-    reaches(cmm, State::Complete).await?;
+    wait_for_state(cmm, State::Complete).await?;
     let measured = cmm.collect(job, &calm).await?;
     assert_eq!(cmm.collect(job, &calm).await?, measured);
     cmm.acknowledge(measured.done).await?;
@@ -151,7 +151,7 @@ async fn measure(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16) -> Result<Measure
 
 #[tokio::test]
 async fn a_plan_is_measured_and_comes_back_to_the_last_bit() {
-    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let mut cmm = ModbusCmm::new(patient(settings(&serving))).unwrap();
     let identity = cmm.connect().await.unwrap();
     assert_eq!((identity.kind, identity.name.as_str(), identity.simulation), (MachineKind::Cmm, "Toy 1", true));
@@ -163,14 +163,14 @@ async fn a_plan_is_measured_and_comes_back_to_the_last_bit() {
     }
     assert_eq!(cmm.status().await.unwrap().state, State::Idle);
     assert_eq!(began(&serving).len(), 2);
-    let figures = cmm.link().figures();
+    let figures = cmm.link().statistics();
     assert_eq!((figures.opened, figures.timeouts, figures.corrupt, figures.retries), (1, 0, 0, 0));
     println!("{} requests, {:.0} us each", figures.answers, figures.answer_ns as f64 / 1e3 / figures.answers as f64);
 }
 
 #[tokio::test]
 async fn a_pass_is_ground_and_recorded() {
-    let serving = serve(Kind::Grinder, AT_ONCE, Faults::none()).await;
+    let serving = serve(Kind::Grinder, AT_ONCE, SharedFaultPlan::none()).await;
     let mut grinder = ModbusGrinder::new(settings(&serving)).unwrap();
     grinder.connect().await.unwrap();
     grinder.claim().await.unwrap();
@@ -179,7 +179,7 @@ async fn a_pass_is_ground_and_recorded() {
     let job = Job { job: 9, cycle: 3, digest: digest(&[map.identity(), pass.identity()]) };
     let armed = grinder.prepare(job).await.unwrap();
     grinder.start(armed).await.unwrap();
-    reaches(&mut grinder, State::Complete).await.unwrap();
+    wait_for_state(&mut grinder, State::Complete).await.unwrap();
     let record = grinder.collect(job, &calm).await.unwrap();
     assert_eq!((record.outcome, record.path_mm, record.removed_mm3), (Outcome::Complete, Some(1234.5), Some(67.8)));
     assert_eq!((record.map_identity, record.wheel_radius_mm), (map.identity(), Some(25.0)));
@@ -194,7 +194,7 @@ async fn a_pass_is_ground_and_recorded() {
 #[tokio::test]
 async fn low_words_first_and_other_addresses_are_as_good() {
     for word_order in [WordOrder::Little, WordOrder::Badc, WordOrder::Dcba] {
-        let layout = Layout { status: 1064, command: 1040, outbox_page: 2462, ..Layout::default() };
+        let layout = RegisterLayout { status: 1064, command: 1040, outbox_page: 2462, ..RegisterLayout::default() };
         let of_sim = if word_order.is_low_first() { words::WordOrder::Little } else { words::WordOrder::Big };
         let swaps_bytes = word_order.swaps_bytes();
         let options = MachineOptions { word_order: of_sim, swaps_bytes, layout, ..MachineOptions::default() };
@@ -206,7 +206,11 @@ async fn low_words_first_and_other_addresses_are_as_good() {
         let plan = plan(50);
         assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), word_order.name());
         // With another word order, the error names the right one.
-        for other in [word_order.other(), word_order.with_other_bytes(), word_order.with_other_bytes().other()] {
+        for other in [
+            word_order.with_words_swapped(),
+            word_order.with_bytes_swapped(),
+            word_order.with_bytes_swapped().with_words_swapped(),
+        ] {
             let registers = RegisterMap { word_order: other, ..registers };
             let wrong = ModbusCmm::new(ModbusSettings { registers, ..settings.clone() }).unwrap().connect().await;
             let told = wrong.unwrap_err().to_string();
@@ -217,27 +221,27 @@ async fn low_words_first_and_other_addresses_are_as_good() {
 
 #[tokio::test]
 async fn hold_resume_stop_abort_and_clear_are_obeyed() {
-    let serving = serve(Kind::Cmm, 20.0, Faults::none()).await;
+    let serving = serve(Kind::Cmm, 20.0, SharedFaultPlan::none()).await;
     let mut cmm = claimed(settings(&serving)).await;
     let (plan, calm) = (plan(200), Interrupt::new());
     cmm.load_plan(&plan, &calm).await.unwrap();
     let armed = cmm.prepare(job_of(&plan, 1)).await.unwrap();
     cmm.start(armed.clone()).await.unwrap();
     cmm.hold().await.unwrap();
-    reaches(&mut cmm, State::Held).await.unwrap();
+    wait_for_state(&mut cmm, State::Held).await.unwrap();
     cmm.resume().await.unwrap();
-    reaches(&mut cmm, State::Execute).await.unwrap();
+    wait_for_state(&mut cmm, State::Execute).await.unwrap();
     cmm.stop().await.unwrap();
-    reaches(&mut cmm, State::Complete).await.unwrap();
+    wait_for_state(&mut cmm, State::Complete).await.unwrap();
     let status = cmm.status().await.unwrap();
     assert_eq!((status.outcome, status.done), (Outcome::Stopped, armed.start_sequence));
     cmm.acknowledge(status.done).await.unwrap();
     let armed = cmm.prepare(job_of(&plan, 2)).await.unwrap();
     cmm.start(armed).await.unwrap();
     cmm.abort().await.unwrap();
-    reaches(&mut cmm, State::Aborted).await.unwrap();
+    wait_for_state(&mut cmm, State::Aborted).await.unwrap();
     cmm.clear().await.unwrap();
-    reaches(&mut cmm, State::Idle).await.unwrap();
+    wait_for_state(&mut cmm, State::Idle).await.unwrap();
     let refused = cmm.hold().await;
     assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::WrongState, .. })), "{refused:?}");
     cmm.release().await.unwrap();
@@ -246,7 +250,7 @@ async fn hold_resume_stop_abort_and_clear_are_obeyed() {
 
 #[tokio::test]
 async fn another_client_is_refused_and_an_abort_is_not() {
-    let serving = serve(Kind::Cmm, 20.0, Faults::none()).await;
+    let serving = serve(Kind::Cmm, 20.0, SharedFaultPlan::none()).await;
     let mut first = ModbusCmm::new(settings(&serving)).unwrap();
     let mut second = ModbusCmm::new(ModbusSettings { owner: 2, ..settings(&serving) }).unwrap();
     first.connect().await.unwrap();
@@ -260,7 +264,7 @@ async fn another_client_is_refused_and_an_abort_is_not() {
 }
 
 /// Writes a command of another client directly into the machine's registers; returns the answer.
-fn put(serving: &Serving, frame: SimFrame) -> u16 {
+fn write_command(serving: &Serving, frame: SimFrame) -> u16 {
     serving.machine(1).unwrap().with(|machine| {
         machine.write(40, &frame.registers(words::WordOrder::Big)).unwrap();
         machine.read(70, 1).unwrap()[0]
@@ -273,32 +277,32 @@ fn of_first(command: SimCommand) -> SimFrame {
 
 #[tokio::test]
 async fn an_abort_gets_through_a_line_that_broke_and_past_the_number_of_a_second_master() {
-    let (serving, plan) = (serve(Kind::Cmm, 1.0, Faults::none()).await, plan(100));
+    let (serving, plan) = (serve(Kind::Cmm, 1.0, SharedFaultPlan::none()).await, plan(100));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     cmm.start(armed).await.unwrap();
     // The machine refuses a second master, but its counter is then far ahead of its owner's.
     let stranger = SimFrame { sequence: 0x7000_0000, owner: 2, ..of_first(SimCommand::Claim) };
-    assert_eq!(put(&serving, stranger), 2, "not the owner");
+    assert_eq!(write_command(&serving, stranger), 2, "not the owner");
     serving.faults().set(FaultPlan::new(0).once(When::Any, Fault::Disconnect(0)));
     assert!(cmm.hold().await.is_err(), "the number of an owner's HOLD counts");
     serving.faults().set(FaultPlan::new(0).once(When::Any, Fault::Disconnect(0)));
     let aborting = cmm.abort().await.unwrap().state;
     assert!(matches!(aborting, State::Aborting | State::Aborted), "{aborting}");
     // The second master takes the machine over: the driver sees the end of the abort anyway.
-    assert_eq!(put(&serving, SimFrame { sequence: 0x7000_0001, ..of_first(SimCommand::Release) }), 1);
-    assert_eq!(put(&serving, SimFrame { sequence: 0x7000_0002, ..stranger }), 1);
-    reaches(&mut cmm, State::Aborted).await.unwrap();
+    assert_eq!(write_command(&serving, SimFrame { sequence: 0x7000_0001, ..of_first(SimCommand::Release) }), 1);
+    assert_eq!(write_command(&serving, SimFrame { sequence: 0x7000_0002, ..stranger }), 1);
+    wait_for_state(&mut cmm, State::Aborted).await.unwrap();
 }
 
 #[tokio::test]
 async fn a_machine_that_another_client_has_taken_is_lost_in_these_words() {
-    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let mut first = claimed(settings(&serving)).await;
     first.status().await.unwrap();
-    assert_eq!(put(&serving, SimFrame { sequence: 1000, ..of_first(SimCommand::Release) }), 1);
+    assert_eq!(write_command(&serving, SimFrame { sequence: 1000, ..of_first(SimCommand::Release) }), 1);
     claimed(ModbusSettings { owner: 0xbeef, ..settings(&serving) }).await;
     let taken = first.status().await.unwrap_err();
-    assert!(matches!(taken, DeviceError::Taken { ours: 1, owner: 0xbeef, .. }) && taken.is_link(), "{taken}");
+    assert!(matches!(taken, DeviceError::OwnedByOther { ours: 1, owner: 0xbeef, .. }) && taken.is_link(), "{taken}");
     assert!(taken.to_string().contains("belongs to another client now (owner 0000beef"), "{taken}");
 }
 
@@ -307,7 +311,7 @@ async fn a_machine_that_is_busy_is_waited_for_and_one_that_stays_so_is_not() {
     let few =
         |serving: &Serving| ModbusSettings { retries: 3, lost_after: Duration::from_secs(2), ..settings(serving) };
     // A controller that is still starting reports busy for more requests than a silent one has retries.
-    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     serving.faults().set(FaultPlan::new(0).times(1, 12, When::Any, Fault::Exception(6)));
     let began = Instant::now();
     let mut cmm = connected(few(&serving)).await;
@@ -329,14 +333,14 @@ async fn a_machine_that_is_busy_is_waited_for_and_one_that_stays_so_is_not() {
 
 #[tokio::test]
 async fn a_clock_that_was_set_back_makes_nobody_a_stranger_to_his_own_machine() {
-    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
-    assert_eq!(put(&serving, SimFrame { sequence: 5, epoch: 50, ..of_first(SimCommand::Claim) }), 1);
+    let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
+    assert_eq!(write_command(&serving, SimFrame { sequence: 5, epoch: 50, ..of_first(SimCommand::Claim) }), 1);
     let mut after = connected(ModbusSettings { epoch: 7, ..settings(&serving) }).await;
     after.claim().await.unwrap();
     let epoch = |serving: &Serving| serving.machine(1).unwrap().with(|machine| machine.read(90, 2).unwrap());
     assert_eq!(epoch(&serving), [0, 51]);
     // A client that sees a higher epoch than its own has been replaced, and does not outbid it.
-    assert_eq!(put(&serving, SimFrame { sequence: 500, epoch: 60, ..of_first(SimCommand::Claim) }), 1);
+    assert_eq!(write_command(&serving, SimFrame { sequence: 500, epoch: 60, ..of_first(SimCommand::Claim) }), 1);
     after.connect().await.unwrap();
     let refused = after.claim().await;
     assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::NotOwner, .. })), "{refused:?}");
@@ -360,13 +364,13 @@ fn interrupt_at_page(serving: &Serving, number: u32) -> (Interrupt, Arc<AtomicU3
 
 #[tokio::test]
 async fn a_transfer_breaks_off_between_two_pages_and_leaves_nothing_in_force() {
-    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let mut cmm = ModbusCmm::new(patient(settings(&serving))).unwrap();
     cmm.connect().await.unwrap();
     cmm.claim().await.unwrap();
     let ((interrupt, _), plan) = (interrupt_at_page(&serving, 100), plan(20_000));
     let broken = cmm.load_plan(&plan, &interrupt).await;
-    assert!(matches!(broken, Err(DeviceError::Interrupted { done: 101, of: 5001, .. })), "{broken:?}");
+    assert!(matches!(broken, Err(DeviceError::Interrupted { done: 101, total: 5001, .. })), "{broken:?}");
     let asked = Instant::now();
     cmm.abort().await.unwrap();
     println!("abort acknowledged after {:.1} ms", asked.elapsed().as_secs_f64() * 1e3);
@@ -376,7 +380,7 @@ async fn a_transfer_breaks_off_between_two_pages_and_leaves_nothing_in_force() {
 
 #[tokio::test]
 async fn further_signals_are_read_scaled_and_held_against_their_range() {
-    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let temperature = Signal {
         name: "part_temperature".into(),
         address: 97,
@@ -390,11 +394,11 @@ async fn further_signals_are_read_scaled_and_held_against_their_range() {
     let mut cmm = connected(ModbusSettings { signals: vec![temperature.clone()], ..settings(&serving) }).await;
     let status = cmm.status().await.unwrap();
     assert_eq!((status.signals[0].value, status.temperature_c), (Some(20.25), Some(20.25)));
-    assert_eq!(status.signals[0].flaw(), None);
+    assert_eq!(status.signals[0].problem(), None);
     let mut cmm = connected(ModbusSettings { signals: vec![narrow], ..settings(&serving) }).await;
     // A bad signal hides no other part of the status.
     let status = cmm.status().await.unwrap();
-    let flaw = status.signals[0].flaw().unwrap();
+    let flaw = status.signals[0].problem().unwrap();
     assert_eq!(flaw, "part_temperature is 20.25 C, and 15 to 19 C are wanted");
     assert_eq!((status.state, status.temperature_c), (State::Idle, Some(20.25)));
     // A register that does not exist, and one that holds no number.
@@ -410,7 +414,7 @@ async fn further_signals_are_read_scaled_and_held_against_their_range() {
     for (address, kind, scale, words) in cases {
         let absent = Signal { address, kind, scale, ..temperature.clone() };
         let mut cmm = connected(ModbusSettings { signals: vec![absent], ..settings(&serving) }).await;
-        let flaw = cmm.status().await.unwrap().signals[0].flaw().unwrap();
+        let flaw = cmm.status().await.unwrap().signals[0].problem().unwrap();
         assert!(flaw.starts_with("part_temperature: the machine gives no number: ") && flaw.contains(words), "{flaw}");
     }
 }
@@ -441,7 +445,7 @@ async fn impostor(image: Vec<u16>) -> (ModbusSettings, Arc<AtomicU32>) {
             }
         }
     });
-    (ModbusSettings::new(Line::Tcp { host: "127.0.0.1".into(), port }), writes)
+    (ModbusSettings::new(LineAddress::Tcp { host: "127.0.0.1".into(), port }), writes)
 }
 
 fn true_identity() -> Vec<u16> {
@@ -467,20 +471,32 @@ async fn what_is_not_the_machine_is_told_apart_and_never_written_to() {
     let e = refusal(|image| image[1] = 0x4432).await;
     assert!(matches!(e, DeviceError::WrongDevice { address: 1, .. }), "{e}");
     let e = refusal(|image| image.iter_mut().for_each(|word| *word = word.swap_bytes())).await;
-    assert!(matches!(&e, DeviceError::OtherLayout { how, .. } if how.contains("write word_order = \"badc\"")), "{e}");
+    assert!(
+        matches!(&e, DeviceError::WrongLayout { description: how, .. } if how.contains("write word_order = \"badc\"")),
+        "{e}"
+    );
     let e = refusal(|image| {
         (image[4], image[5]) = (image[5], image[4]);
         image.iter_mut().for_each(|word| *word = word.swap_bytes());
     })
     .await;
-    assert!(matches!(&e, DeviceError::OtherLayout { how, .. } if how.contains("write word_order = \"dcba\"")), "{e}");
+    assert!(
+        matches!(&e, DeviceError::WrongLayout { description: how, .. } if how.contains("write word_order = \"dcba\"")),
+        "{e}"
+    );
     let e = refusal(|image| image.insert(0, 7)).await;
-    assert!(matches!(e, DeviceError::OtherLayout { ref how, .. } if how.contains("one register later")), "{e}");
+    assert!(
+        matches!(e, DeviceError::WrongLayout { ref description, .. } if description.contains("one register later")),
+        "{e}"
+    );
     let e = refusal(|image| {
         image.remove(0);
     })
     .await;
-    assert!(matches!(e, DeviceError::OtherLayout { ref how, .. } if how.contains("one register earlier")), "{e}");
+    assert!(
+        matches!(e, DeviceError::WrongLayout { ref description, .. } if description.contains("one register earlier")),
+        "{e}"
+    );
     let e = refusal(|image| image[2] = 1).await;
     assert!(matches!(e, DeviceError::WrongVersion { required: 2, found: 1, .. }), "{e}");
     let said = e.to_string();
@@ -495,15 +511,15 @@ async fn what_is_not_the_machine_is_told_apart_and_never_written_to() {
     let e = refusal(|image| image[3] = 2).await;
     assert!(matches!(e, DeviceError::WrongKind { found: MachineKind::Grinder, .. }), "{e}");
     let e = refusal(|image| image[13] = 2).await;
-    assert!(matches!(e, DeviceError::Inches { unit: 2, .. }), "{e}");
+    assert!(matches!(e, DeviceError::WrongLengthUnit { unit: 2, .. }), "{e}");
     let e = refusal(|image| {
         image[4..6].reverse();
         image[6..10].reverse();
     })
     .await;
-    assert!(matches!(e, DeviceError::WrongWordOrder { fits: Some("little"), .. }), "{e}");
+    assert!(matches!(e, DeviceError::WrongWordOrder { matching: Some("little"), .. }), "{e}");
     let e = refusal(|image| image[4..6].reverse()).await;
-    assert!(matches!(e, DeviceError::WrongWordOrder { fits: None, .. }), "{e}");
+    assert!(matches!(e, DeviceError::WrongWordOrder { matching: None, .. }), "{e}");
 }
 
 #[tokio::test]
@@ -521,10 +537,10 @@ async fn nobody_there_is_said_so() {
     let taken = TcpSocket::new_v4().unwrap();
     taken.bind("127.0.0.1:0".parse().unwrap()).unwrap();
     let port = taken.local_addr().unwrap().port();
-    let wire = Line::Tcp { host: "127.0.0.1".into(), port };
+    let wire = LineAddress::Tcp { host: "127.0.0.1".into(), port };
     let absent = ModbusCmm::new(ModbusSettings { retries: 1, ..ModbusSettings::new(wire) }).unwrap().connect().await;
     assert!(matches!(absent, Err(DeviceError::Unreachable { .. })), "{absent:?}");
-    let wire = Line::Rtu { device: "/dev/no-such-port".into(), baud: 9600, parity: Parity::Even, stop_bits: 1 };
+    let wire = LineAddress::Rtu { device: "/dev/no-such-port".into(), baud: 9600, parity: Parity::Even, stop_bits: 1 };
     let absent = ModbusCmm::new(ModbusSettings { retries: 1, ..ModbusSettings::new(wire) }).unwrap().connect().await;
     assert!(matches!(absent, Err(DeviceError::Unreachable { .. })), "{absent:?}");
 }
@@ -603,11 +619,11 @@ async fn a_bit_that_every_check_sum_of_the_wire_passes_is_still_found() {
     let mut cmm = connected(settings(&serving)).await;
     let plan = plan(40);
     assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "a flipped bit");
-    assert_eq!((serving.faults().fired().len(), cmm.link().figures().corrupt), (1, 1));
+    assert_eq!((serving.faults().fired().len(), cmm.link().statistics().corrupt), (1, 1));
     // Permanently: an error, no points.
     serving.faults().set(FaultPlan::new(1).always(When::Reading(462), Fault::FlipData));
     let refused = measure(&mut cmm, &plan, 2).await;
-    assert!(matches!(refused, Err(DeviceError::Corrupt { what: "check number of a result", .. })), "{refused:?}");
+    assert!(matches!(refused, Err(DeviceError::Corrupt { data: "check number of a result", .. })), "{refused:?}");
 }
 
 async fn armed(serving: &Serving, plan: &Plan) -> (ModbusCmm, Armed) {
@@ -620,7 +636,7 @@ async fn armed(serving: &Serving, plan: &Plan) -> (ModbusCmm, Armed) {
 
 #[tokio::test]
 async fn a_start_whose_answer_is_lost_is_the_same_start_when_it_is_written_again() {
-    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     serving.faults().set(FaultPlan::new(0).times(1, 2, When::Commanding(3), Fault::DropReply));
     let sequence = armed.start_sequence;
@@ -641,7 +657,7 @@ fn silent_from_start(lost: bool) -> FaultPlan {
 
 #[tokio::test]
 async fn a_start_that_is_lost_with_the_line_is_unknown_and_then_found_to_run() {
-    let (serving, plan) = (serve(Kind::Cmm, 1.0, Faults::none()).await, plan(100));
+    let (serving, plan) = (serve(Kind::Cmm, 1.0, SharedFaultPlan::none()).await, plan(100));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     // The START is carried out, and from then on nothing answers.
     serving.faults().set(silent_from_start(false).once(When::Commanding(3), Fault::DropReply));
@@ -656,7 +672,7 @@ async fn a_start_that_is_lost_with_the_line_is_unknown_and_then_found_to_run() {
 
 #[tokio::test]
 async fn a_start_that_never_arrived_is_seen_twice_not_to_have() {
-    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     serving.faults().set(silent_from_start(true));
     let unknown = cmm.start(armed.clone()).await;
@@ -679,7 +695,7 @@ fn delayed(armed: &Armed) -> SimFrame {
 
 #[tokio::test]
 async fn a_start_that_arrives_after_it_was_found_not_started_moves_nothing() {
-    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await, plan(10));
     let (mut cmm, lost) = armed(&serving, &plan).await;
     serving.faults().set(FaultPlan::new(0).always(When::Commanding(3), Fault::DropRequest));
     let unknown = cmm.start(lost.clone()).await;
@@ -688,13 +704,13 @@ async fn a_start_that_arrives_after_it_was_found_not_started_moves_nothing() {
     cmm.connect().await.unwrap();
     let found = cmm.reconcile(&lost).await.unwrap();
     assert!(matches!(found, Reconciled::NotStarted(_)), "{found:?}");
-    put(&serving, delayed(&lost));
+    write_command(&serving, delayed(&lost));
     assert!(began(&serving).is_empty(), "the CLAIM has fenced it off");
     // After another prepare the same job starts, and the old frame is too old again.
     cmm.stop().await.unwrap();
     cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
     let again = cmm.prepare(job_of(&plan, 1)).await.unwrap();
-    put(&serving, delayed(&lost));
+    write_command(&serving, delayed(&lost));
     let sequence = again.start_sequence;
     cmm.start(again).await.unwrap();
     assert_eq!(began(&serving), [(sequence, 42, 1)]);
@@ -702,11 +718,11 @@ async fn a_start_that_arrives_after_it_was_found_not_started_moves_nothing() {
 
 #[tokio::test]
 async fn a_start_that_arrives_while_it_is_asked_about_is_found_to_run() {
-    let (serving, plan) = (serve(Kind::Cmm, 1.0, Faults::none()).await, plan(100));
+    let (serving, plan) = (serve(Kind::Cmm, 1.0, SharedFaultPlan::none()).await, plan(100));
     let (mut cmm, late) = armed(&serving, &plan).await;
     serving.faults().set(FaultPlan::new(0).always(When::Commanding(3), Fault::DropRequest));
     assert!(cmm.start(late.clone()).await.is_err());
-    put(&serving, delayed(&late));
+    write_command(&serving, delayed(&late));
     let found = cmm.reconcile(&late).await.unwrap();
     assert!(matches!(found, Reconciled::Running(_)), "{found:?}");
     assert_eq!(began(&serving).len(), 1);
@@ -714,13 +730,13 @@ async fn a_start_that_arrives_while_it_is_asked_about_is_found_to_run() {
 
 #[tokio::test]
 async fn a_finished_start_is_found_and_a_restarted_machine_is_not_trusted() {
-    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     cmm.start(armed.clone()).await.unwrap();
-    reaches(&mut cmm, State::Complete).await.unwrap();
+    wait_for_state(&mut cmm, State::Complete).await.unwrap();
     let found = cmm.reconcile(&armed).await.unwrap();
     assert!(matches!(found, Reconciled::Finished(_)), "{found:?}");
-    serving.machine(1).unwrap().with(registers::Machine::reboot);
+    serving.machine(1).unwrap().with(registers::SimulatedMachine::reboot);
     let restarted = cmm.status().await;
     assert!(matches!(restarted, Err(DeviceError::Restarted { .. })), "{restarted:?}");
     cmm.connect().await.unwrap();
@@ -733,7 +749,7 @@ async fn a_finished_start_is_found_and_a_restarted_machine_is_not_trusted() {
 
 #[tokio::test]
 async fn a_frozen_application_behind_a_living_wire_is_found() {
-    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let mut cmm = connected(settings(&serving)).await;
     serving.machine(1).unwrap().with(|machine| machine.freeze(true));
     let began = Instant::now();
@@ -755,10 +771,14 @@ async fn a_frozen_application_behind_a_living_wire_is_found() {
 
 // ---- serial lines -------------------------------------------------------------------------------------------------------------------
 
-pub fn rtu(units: Vec<(u8, registers::Machine)>, line: SerialLine, faults: Faults) -> (Serving, ModbusSettings) {
+pub fn rtu(
+    units: Vec<(u8, registers::SimulatedMachine)>,
+    line: SerialLine,
+    faults: SharedFaultPlan,
+) -> (Serving, ModbusSettings) {
     let serving = Serving::rtu(units, line, faults).unwrap();
     let device = serving.path().unwrap().to_string_lossy().into_owned();
-    let wire = Line::Rtu { device, baud: line.baud, parity: Parity::None, stop_bits: 1 };
+    let wire = LineAddress::Rtu { device, baud: line.baud, parity: Parity::None, stop_bits: 1 };
     let settings = ModbusSettings {
         request_timeout: Duration::from_millis(300),
         quarantine: Duration::from_millis(200),
@@ -773,7 +793,7 @@ pub fn rtu(units: Vec<(u8, registers::Machine)>, line: SerialLine, faults: Fault
 async fn two_machines_share_a_serial_line() {
     let options = MachineOptions::default;
     let units = vec![(1, toy(Kind::Cmm, AT_ONCE, options())), (2, toy(Kind::Grinder, AT_ONCE, options()))];
-    let (_serving, settings) = rtu(units, SerialLine::unpaced(115_200), Faults::none());
+    let (_serving, settings) = rtu(units, SerialLine::unpaced(115_200), SharedFaultPlan::none());
     let settings = patient(settings);
     let link = Link::new(settings.line.clone(), settings.request_timeout, settings.quarantine).unwrap();
     let mut cmm = ModbusCmm::on(link.clone(), settings.clone());
@@ -785,7 +805,7 @@ async fn two_machines_share_a_serial_line() {
     let (measured, loaded) = tokio::join!(measure(&mut cmm, &plan, 1), grinder.load_pass(&map, &pass, &calm));
     assert_exact(&plan, &measured.unwrap(), "two on a line");
     loaded.unwrap();
-    assert_eq!(link.figures().opened, 1);
+    assert_eq!(link.statistics().opened, 1);
 }
 
 #[tokio::test]
@@ -821,12 +841,12 @@ async fn an_answer_that_comes_after_the_quarantine_is_not_taken_for_the_next_one
     let mut cmm = connected(settings).await;
     assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "late");
     assert_eq!((serving.faults().fired().len(), began(&serving).len()), (4, 1));
-    assert!(cmm.link().figures().timeouts >= 4, "{:?}", cmm.link().figures());
+    assert!(cmm.link().statistics().timeouts >= 4, "{:?}", cmm.link().statistics());
 }
 
 #[tokio::test]
 async fn a_prepared_job_that_has_died_is_not_started() {
-    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     serving.machine(1).unwrap().with(|machine| machine.open_interlocks(1));
     let refused = cmm.start(armed).await;
@@ -836,7 +856,7 @@ async fn a_prepared_job_that_has_died_is_not_started() {
 
 #[tokio::test]
 async fn a_hold_comes_before_the_next_page_of_whatever_is_being_transferred() {
-    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let serving = serve(Kind::Cmm, AT_ONCE, SharedFaultPlan::none()).await;
     let mut cmm = claimed(settings(&serving)).await;
     let (interrupt, pages) = interrupt_at_page(&serving, 30);
     let broken = cmm.load_plan(&plan(4000), &interrupt).await;

@@ -1,7 +1,7 @@
 //! Machine that does exactly what a command says, for tests of the protocol, and a pass for it.
 
 use regrind::device::Pass;
-use regrind_sim::body::{self, Body, Kind, Payload, Payloads, Progress, Refusal};
+use regrind_sim::body::{self, Kind, Payload, Payloads, Physics, Progress, Refusal};
 
 /// Returns a pass for a small part.
 pub fn pass() -> Pass {
@@ -29,7 +29,7 @@ pub struct Toy {
     /// True if the machine gives its points in counts of a nanometre.
     in_counts: bool,
     /// Maximum number of points that it reaches.
-    most: u32,
+    max_points: u32,
 }
 
 impl Toy {
@@ -43,7 +43,7 @@ impl Toy {
             points_a_second,
             moved_s: 0.0,
             in_counts: false,
-            most: u32::MAX,
+            max_points: u32::MAX,
         }
     }
 
@@ -54,7 +54,7 @@ impl Toy {
 
     /// Returns the same machine, which stops after this number of points.
     pub fn up_to(self, most: u32) -> Self {
-        Self { most, ..self }
+        Self { max_points: most, ..self }
     }
 
     fn total(&self) -> u32 {
@@ -87,10 +87,10 @@ impl Toy {
     }
 
     /// Returns the content of the outbox, with these records.
-    fn left(&self, bytes: Vec<u8>) -> body::Outcome {
+    fn job_result(&self, bytes: Vec<u8>) -> body::ResultData {
         let cmm = self.kind == Kind::Cmm;
         let (format, scale_mm) = if self.in_counts { (2, 1e-6) } else { (1, 1.0) };
-        body::Outcome {
+        body::ResultData {
             kind: if cmm { 4 } else { 5 },
             format,
             records: if cmm { (bytes.len() / self.size()) as u32 } else { 1 },
@@ -115,7 +115,7 @@ impl Toy {
     }
 }
 
-impl Body for Toy {
+impl Physics for Toy {
     fn kind(&self) -> Kind {
         self.kind
     }
@@ -136,21 +136,21 @@ impl Body for Toy {
     fn advance(&mut self, seconds: f64) -> Progress {
         self.moved_s += seconds;
         let total = self.total();
-        self.done = ((self.moved_s * self.points_a_second) as u32).min(total).min(self.most);
+        self.done = ((self.moved_s * self.points_a_second) as u32).min(total).min(self.max_points);
         Progress { done: self.done, total, finished: self.done == total, fault: 0 }
     }
     fn retract(&mut self) {}
-    fn tells_so_far(&self) -> bool {
+    fn has_partial_result(&self) -> bool {
         self.kind == Kind::Cmm
     }
-    fn so_far(&self) -> Option<body::Outcome> {
+    fn partial_result(&self) -> Option<body::ResultData> {
         let bytes = self.points().into_iter().take(self.size() * self.done as usize).collect();
-        (self.kind == Kind::Cmm).then(|| self.left(bytes))
+        (self.kind == Kind::Cmm).then(|| self.job_result(bytes))
     }
-    fn outcome(&mut self, result: u16) -> body::Outcome {
+    fn end_job(&mut self, result: u16) -> body::ResultData {
         let cmm = self.kind == Kind::Cmm;
         let bytes = if cmm { self.points() } else { self.record(result) };
-        self.left(bytes)
+        self.job_result(bytes)
     }
     fn interlocks(&self) -> u16 {
         15

@@ -32,7 +32,7 @@ fn a_cell_is_held_gone_on_with_and_aborted_and_every_tab_shows_it() {
     let mut shown = Shown::begin(home.path(), 20.0);
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&shown.url, SCREEN);
-    tab.until(&mut browser, &banner("RUNNING"));
+    tab.until(&mut browser, &banner("EXECUTE"));
     // A second tab is harmless.
     let second = browser.open(&shown.url, [390, 844]);
     tab.click(&mut browser, "[data-order=hold]");
@@ -40,7 +40,7 @@ fn a_cell_is_held_gone_on_with_and_aborted_and_every_tab_shows_it() {
     assert!(tab.read(&mut browser, "document.querySelector('#next').innerText").as_str().unwrap().contains("RESUME"));
     second.until(&mut browser, &banner("HELD"));
     tab.click(&mut browser, "[data-order=resume]");
-    second.until(&mut browser, &banner("RUNNING"));
+    second.until(&mut browser, &banner("EXECUTE"));
     // On a phone too, all of it is on the screen.
     let ends = second.read(&mut browser, "document.querySelector('.simulation').getBoundingClientRect().right");
     assert!(ends.as_f64().unwrap() <= 390.0, "{ends}");
@@ -123,7 +123,7 @@ fn a_page_whose_cell_is_killed_says_so_and_offers_no_order() {
     let shown = Shown::begin(home.path(), 20.0);
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&shown.url, SCREEN);
-    tab.until(&mut browser, &banner("RUNNING"));
+    tab.until(&mut browser, &banner("EXECUTE"));
     shown.run.signal("KILL");
     tab.until(&mut browser, "document.body.classList.contains('old')");
     let words = tab.read(&mut browser, "document.querySelector('#old').innerText");
@@ -151,7 +151,7 @@ fn the_keyboard_alone_aborts_a_run() {
     let mut shown = Shown::begin(home.path(), 20.0);
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&shown.url, SCREEN);
-    tab.until(&mut browser, &banner("RUNNING"));
+    tab.until(&mut browser, &banner("EXECUTE"));
     tab.until(&mut browser, "!document.querySelector('[data-order=abort]').disabled");
     tab.send(&mut browser, "Page.bringToFront", json!({}));
     // On a computer at full load, a window can come to the front late. The page receives the keys anyway.
@@ -200,12 +200,12 @@ fn somebody_signs_in_over_tls_and_sees_what_their_role_may_order() {
     sign_in(&mut browser, "V. Guest", "not this one");
     tab.until(&mut browser, "document.querySelector('.no')?.innerText.includes('do not belong together')");
     sign_in(&mut browser, "V. Guest", users::PASSWORD);
-    tab.until(&mut browser, &banner("RUNNING"));
+    tab.until(&mut browser, &banner("EXECUTE"));
     let orders = "[...document.querySelectorAll('.orders [data-order]')]";
     assert_eq!(tab.read(&mut browser, &format!("{orders}.every((button) => button.disabled)")), true);
     tab.click(&mut browser, "#sign-out");
     sign_in(&mut browser, "A. Smith", users::PASSWORD);
-    tab.until(&mut browser, &banner("RUNNING"));
+    tab.until(&mut browser, &banner("EXECUTE"));
     assert!(tab.read(&mut browser, "document.querySelector('nav').innerText").as_str().unwrap().contains("A. Smith"));
     tab.click(&mut browser, "[data-order=abort]");
     tab.until(&mut browser, &banner("ABORTED"));
@@ -271,7 +271,7 @@ fn pictures_are_made() {
     };
     picture(&tab, &mut browser, "page.png");
     let phone = browser.open(&shown.url, [390, 844]);
-    phone.until(&mut browser, &banner("RUNNING"));
+    phone.until(&mut browser, &banner("EXECUTE"));
     picture(&phone, &mut browser, "page-phone.png");
     tab.until(&mut browser, &banner("ACCEPTED"));
     tab.click(&mut browser, "[data-view=relief]");

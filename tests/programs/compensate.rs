@@ -330,8 +330,8 @@ fn a_foreign_map_is_used_where_it_is_valid_and_within_reason() {
     assert!(points.iter().all(|point| (point[2] + 0.004).abs() < 1e-6 || point[2] > 0.5), "{points:?}");
     map(&|_| "5.0,1".into());
     let said = bench.compensate(&[]).unwrap_err();
-    assert!(said.contains("5000") && said.contains("--largest-correction-um"), "{said}");
-    bench.compensate(&["--largest-correction-um", "6000"]).unwrap();
+    assert!(said.contains("5000") && said.contains("--max-correction-um"), "{said}");
+    bench.compensate(&["--max-correction-um", "6000"]).unwrap();
     map(&|_| "0.004,0".into());
     assert!(bench.compensate(&[]).unwrap_err().contains("valid"));
     map(&|_| "0.004,x".into());
@@ -497,13 +497,13 @@ fn a_program_that_was_written_in_arcs_keeps_them_where_the_correction_is_the_sam
     bench.save_error(|_, _| 0.004, Some([9; 32]));
     let corrected = Control::Linuxcnc.read(&bench.compensate(&[]).unwrap()).unwrap();
     let base = Control::Linuxcnc.read(&fs::read_to_string(bench.path("base.ngc")).unwrap()).unwrap();
-    assert_eq!(base.stops.len(), corrected.stops.len());
+    assert_eq!(base.waypoints.len(), corrected.waypoints.len());
     let mut turns = 0;
-    for (pair, same) in base.stops.windows(2).zip(corrected.stops.windows(2)) {
-        let Some(feed) = pair[1].feed_mm_min.filter(|_| pair[1].turn.is_some()) else { continue };
+    for (pair, same) in base.waypoints.windows(2).zip(corrected.waypoints.windows(2)) {
+        let Some(feed) = pair[1].feed_mm_min.filter(|_| pair[1].arc.is_some()) else { continue };
         assert_eq!(same[1].feed_mm_min, Some(feed));
         for share in [0.3, 1.0] {
-            let [was, is] = [pair, same].map(|pair| pair[1].on_the_way(pair[0].at_mm, share));
+            let [was, is] = [pair, same].map(|pair| pair[1].position_at(pair[0].at_mm, share));
             let off = [is[0] - was[0], is[1] - was[1], is[2] - was[2] + 0.004];
             assert!(off.iter().all(|v| v.abs() < 3e-6), "{off:?}");
         }

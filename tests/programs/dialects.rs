@@ -8,7 +8,7 @@ use crate::sweep::{Swept, clearance, places};
 use regrind::compensation::path::{Move, PathMode, Wheel};
 use regrind::config::read_dialect;
 use regrind::formats::gcode::Dialect;
-use regrind_sim::program::{Control, Program, Stop};
+use regrind_sim::program::{Control, Program, Waypoint};
 
 const DIALECTS: [&str; 4] = ["linuxcnc", "fanuc", "sinumerik", "heidenhain"];
 /// Tolerance of a touching place in a program with unrounded points, in millimetres.
@@ -46,11 +46,11 @@ fn every_control_reads_the_path_of_the_plan_to_half_of_the_last_digit() {
         part.programs.options = with(&part.programs.options, Wheel::Sphere { radius_mm: 12.5 }, 4.0);
         let (program, text) = read_back(&mut part, name);
         let (path, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
-        assert_eq!(program.stops.len() as u64, summary.moves, "{name}");
+        assert_eq!(program.waypoints.len() as u64, summary.moves, "{name}");
         // Read both from the dialect's file once, not for each of a hundred thousand lines.
         let (within_mm, longest_line) = (half_a_step_mm(name) * (1.0 + 1e-6), dialect(name).text.longest_line);
         let mut at = [f64::NAN; 3];
-        for (planned, stop) in path.moves().zip(&program.stops) {
+        for (planned, stop) in path.moves().zip(&program.waypoints) {
             let feed = match planned {
                 Move::RapidZ(z) => {
                     at[2] = z;
@@ -77,9 +77,9 @@ fn every_control_reads_the_path_of_the_plan_to_half_of_the_last_digit() {
 }
 
 /// Returns the distance of a place from the path between two stops.
-fn off_the_way(stop: &Stop, from: [f64; 3], place: [f64; 3]) -> f64 {
+fn off_the_way(stop: &Waypoint, from: [f64; 3], place: [f64; 3]) -> f64 {
     let off = |share: f64| {
-        let at = stop.on_the_way(from, share);
+        let at = stop.position_at(from, share);
         (0..3).map(|k| (at[k] - place[k]).powi(2)).sum::<f64>().sqrt()
     };
     // On such a short path there is only one nearest place.
@@ -106,8 +106,8 @@ fn along_its_arcs_every_control_passes_all_points_of_the_plan_within_the_toleran
         let (program, text) = read_back(&mut part, name);
         let (path, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
         let told = part.programs.arcs(&path).unwrap().unwrap();
-        assert_eq!(program.stops.len() as u64, told.moves, "{name}");
-        assert_eq!(program.stops.iter().filter(|stop| stop.turn.is_some()).count() as u64, told.arcs, "{name}");
+        assert_eq!(program.waypoints.len() as u64, told.moves, "{name}");
+        assert_eq!(program.waypoints.iter().filter(|stop| stop.arc.is_some()).count() as u64, told.arcs, "{name}");
         assert!(told.arcs > 50 && fewer * (told.arcs + told.lines) < summary.points, "{name}: {told:?}");
         let counted = format!("lines: {}", text.lines().count());
         assert!(program.comments.iter().any(|comment| comment.to_ascii_lowercase() == counted), "{name}");
@@ -117,13 +117,13 @@ fn along_its_arcs_every_control_passes_all_points_of_the_plan_within_the_toleran
             .moves()
             .filter_map(|one| if let Move::Feed { at, feed_mm_min } = one { Some((at, feed_mm_min)) } else { None });
         let mut last = [f64::NAN; 3];
-        for stop in &program.stops {
+        for stop in &program.waypoints {
             let mut ended = stop.feed_mm_min.is_none();
             while !ended {
                 let (at, feed) = points.next().unwrap_or_else(|| panic!("{name}: {stop:?} is no point"));
                 assert_eq!(stop.feed_mm_min, Some(feed), "{name}");
                 ended = (0..3).all(|k| (at[k] - stop.at_mm[k]).abs() <= 0.51 * step_mm);
-                if stop.turn.is_some() {
+                if stop.arc.is_some() {
                     let off = off_the_way(stop, last, at.into());
                     // The behaviour of controls between two different radii is their own.
                     assert!(off < ARCS_WITHIN_MM + 2.0 * step_mm, "{name}: {off} at {at}");
@@ -151,9 +151,9 @@ fn the_wheel_that_goes_along_arcs_leaves_the_corrected_surface() {
             part.programs.options = with(&part.programs.options, wheel, 4.0);
             part.programs.arcs_within_mm = Some(ARCS_WITHIN_MM);
             let (program, _) = read_back(&mut part, name);
-            assert!(program.stops.iter().any(|stop| stop.turn.is_some()), "{name}, {wheel_name}");
+            assert!(program.waypoints.iter().any(|stop| stop.arc.is_some()), "{name}, {wheel_name}");
             let mut steps: Vec<ProgramStep> = Vec::new();
-            for stop in &program.stops {
+            for stop in &program.waypoints {
                 let from = steps.last().map_or(stop.at_mm, |step| step.at);
                 let feed = stop.feed_mm_min.is_some();
                 steps.extend(stop.in_chords(from, 1e-6).into_iter().map(|at| ProgramStep { at, feed }));
@@ -177,7 +177,7 @@ fn the_wheel_that_follows_what_a_control_has_read_leaves_the_corrected_surface()
         part.programs.options = with(&part.programs.options, wheel, 4.0);
         let (program, _) = read_back(&mut part, name);
         let steps: Vec<ProgramStep> =
-            program.stops.iter().map(|s| ProgramStep { at: s.at_mm, feed: s.feed_mm_min.is_some() }).collect();
+            program.waypoints.iter().map(|s| ProgramStep { at: s.at_mm, feed: s.feed_mm_min.is_some() }).collect();
         let swept = Swept::new(steps);
         let track_mm = part.programs.path(&correction(part.half_mm)).unwrap().0.track_mm();
         for place in places(&part, track_mm, 0.0) {
@@ -197,7 +197,7 @@ fn every_path_mode_of_every_dialect_is_one_that_its_control_keeps_to_the_path_in
             part.programs.dialect = dialect(name);
             part.programs.controller_tolerance_mm = Some(part.programs.path_tolerance_mm);
             if part.programs.check_dialect().is_ok() {
-                assert!(!read_back(&mut part, name).0.stops.is_empty());
+                assert!(!read_back(&mut part, name).0.waypoints.is_empty());
             } else {
                 assert!(mode == PathMode::ExactPath && name != "linuxcnc" || name == "heidenhain", "{name} {mode:?}");
             }

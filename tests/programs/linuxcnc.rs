@@ -110,7 +110,7 @@ fn the_interpreter_turns_where_the_simulated_control_does() {
         let ours = Control::Linuxcnc.read(&fs::read_to_string(&file).unwrap()).unwrap();
         let said = interpret(&file).unwrap_or_else(|said| panic!("{name}: {said}"));
         let theirs = arcs(&said);
-        let turns: Vec<_> = ours.stops.windows(2).filter(|pair| pair[1].turn.is_some()).collect();
+        let turns: Vec<_> = ours.waypoints.windows(2).filter(|pair| pair[1].arc.is_some()).collect();
         assert!(turns.len() == theirs.len() && turns.len() > 100, "{name}: {} {}", turns.len(), theirs.len());
         for (pair, ([a, b, c], arc)) in turns.iter().zip(&theirs) {
             let (from, to) = (pair[0].at_mm, pair[1].at_mm);
@@ -118,7 +118,7 @@ fn the_interpreter_turns_where_the_simulated_control_does() {
             // positive) and the third axis.
             let near = |x: f64, y: f64| (x - y).abs() < 0.6e-4;
             assert!(near(arc[0], to[*a]) && near(arc[1], to[*b]) && near(arc[5], to[*c]), "{name}: {arc:?} {to:?}");
-            let middle = pair[1].on_the_way(from, 0.5);
+            let middle = pair[1].position_at(from, 0.5);
             let arm = |at: [f64; 3]| [at[*a] - arc[2], at[*b] - arc[3]];
             let [[x, y], [u, v]] = [arm(from), arm(middle)];
             assert!((x.hypot(y) - u.hypot(v)).abs() < 1e-4, "{name}: {arc:?}");
@@ -160,13 +160,13 @@ fn programs_of_a_wheel_that_tilts_are_read_point_by_point_with_their_angles() {
             .map(|(_, rest)| rest.trim_end_matches(')').split(',').map(|n| n.trim().parse::<f64>().unwrap()).collect())
             .map(|numbers: Vec<f64>| [numbers[0], numbers[1], numbers[2], numbers[if letter == 'A' { 3 } else { 4 }]])
             .collect();
-        let ours = Control::Linuxcnc.read(&fs::read_to_string(&file).unwrap()).unwrap().stops;
+        let ours = Control::Linuxcnc.read(&fs::read_to_string(&file).unwrap()).unwrap().waypoints;
         assert_eq!(theirs.len(), ours.len(), "{letter}");
-        for (theirs, stop) in theirs.iter().zip(&ours).filter(|(_, stop)| stop.turn_deg.is_some()) {
+        for (theirs, stop) in theirs.iter().zip(&ours).filter(|(_, stop)| stop.rotary_deg.is_some()) {
             // The interpreter prints four decimals.
             let [x, y, z] = stop.at_mm;
             let off =
-                [x, y, z, stop.turn_deg.unwrap()].iter().zip(theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                [x, y, z, stop.rotary_deg.unwrap()].iter().zip(theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
             assert!(off < 0.6e-4, "{letter}: {theirs:?} {stop:?}");
         }
     }

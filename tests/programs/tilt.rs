@@ -8,7 +8,7 @@ use crate::sweep::{distance, places};
 use regrind::compensation::path::{Field, Lean, PathOptions, Rotary, TurnAxis, Wheel};
 use regrind::config::read_dialect;
 use regrind::geometry::{Aperture, Grid, Vector};
-use regrind_sim::program::{Control, Program, Stop};
+use regrind_sim::program::{Control, Program, Waypoint};
 
 /// Tolerance of a touching place, in millimetres.
 const WITHIN_MM: f64 = 2e-4;
@@ -53,13 +53,13 @@ fn off_mm(
     wheel: &Wheel,
     pivot_mm: Option<[f64; 3]>,
     letter: char,
-    [from, to]: [&Stop; 2],
+    [from, to]: [&Waypoint; 2],
     share: f64,
     q: [f64; 3],
 ) -> f64 {
     // The A axis counts left-handed here.
     let hand = if letter == 'A' { -1.0 } else { 1.0 };
-    let [a, b] = [from, to].map(|stop| hand * stop.turn_deg.unwrap_or(0.0).to_radians());
+    let [a, b] = [from, to].map(|stop| hand * stop.rotary_deg.unwrap_or(0.0).to_radians());
     let angle = a + share * (b - a);
     let arm = pivot_mm.unwrap_or_default();
     let arm_turned = turned(letter, arm, angle);
@@ -74,7 +74,7 @@ fn off_mm(
 fn clearance(wheel: &Wheel, pivot_mm: Option<[f64; 3]>, program: &Program, q: [f64; 3]) -> f64 {
     let letter = program.axis.expect("a head that turns");
     let mut nearest = f64::INFINITY;
-    for pair in program.stops.windows(2).filter(|pair| pair[1].feed_mm_min.is_some()) {
+    for pair in program.waypoints.windows(2).filter(|pair| pair[1].feed_mm_min.is_some()) {
         let at = |share: f64| off_mm(wheel, pivot_mm, letter, [&pair[0], &pair[1]], share, q);
         // No step goes farther than a few millimetres.
         if at(0.5) > nearest.min(4.0) + 4.0 {
@@ -170,7 +170,7 @@ fn a_flank_too_steep_for_an_upright_wheel_is_ground_by_one_that_follows() {
             part.programs.options = plain;
             part.programs.options = leaning(&part, wheel, head(TurnAxis::X, pivot_mm, 6), lean, 2.0);
             let (program, _) = written(&mut part, "linuxcnc");
-            let turns: Vec<f64> = program.stops.iter().filter_map(|stop| stop.turn_deg).collect();
+            let turns: Vec<f64> = program.waypoints.iter().filter_map(|stop| stop.rotary_deg).collect();
             assert!(turns.iter().copied().fold(0.0, f64::max) > 45.0, "{wheel:?}");
             let track_mm = part.programs.path(&correction(part.half_mm)).unwrap().0.track_mm();
             for k in 0..24 {
@@ -237,15 +237,15 @@ fn a_program_that_turns_is_no_program_for_a_machine_that_does_not() {
     part.programs.options = leaning(&part, wheel, head(TurnAxis::Y, Some(PIVOT_MM), 6), lean, 20.0);
     let (program, text) = written(&mut part, "linuxcnc");
     assert!(text.contains("(tilt: constant by 17.18") && text.contains("G93"), "{}", &text[..2000]);
-    assert!(program.clone().on(None).unwrap_err().contains("no rotary axis"));
+    assert!(program.clone().with_head(None).unwrap_err().contains("no rotary axis"));
     let head =
         regrind_sim::head::Head { letter: 'B', left_handed: false, range_deg: [-20.0, 20.0], pivot_mm: Some(PIVOT_MM) };
-    assert!(program.clone().on(Some(head)).is_ok());
+    assert!(program.clone().with_head(Some(head)).is_ok());
     for (head, what) in [
         (regrind_sim::head::Head { letter: 'A', ..head }, "turns B"),
         (regrind_sim::head::Head { range_deg: [-10.0, 10.0], ..head }, "beyond -10"),
     ] {
-        assert!(program.clone().on(Some(head)).unwrap_err().contains(what));
+        assert!(program.clone().with_head(Some(head)).unwrap_err().contains(what));
     }
     // Arcs are for wheels without tilt.
     assert!(part.programs.check_dialect().is_ok());
@@ -266,11 +266,13 @@ fn a_feed_by_time_takes_as_long_as_the_wheel_at_its_feed() {
     let (wheel, lean) = (Wheel::Sphere { radius_mm: 12.5 }, Lean::Following { lead_rad: 0.35 });
     part.programs.options = leaning(&part, wheel, head(TurnAxis::Y, Some(PIVOT_MM), 6), lean, 8.0);
     let (program, _) = written(&mut part, "linuxcnc");
-    let minutes: f64 = program.stops.iter().filter_map(|stop| stop.minutes).sum();
+    let minutes: f64 = program.waypoints.iter().filter_map(|stop| stop.minutes).sum();
     let (_, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
     // The header has the time without the descent, a millimetre for each track.
     let down = part.programs.path(&correction(part.half_mm)).unwrap().0.tracks() as f64 / summary.feed_mm_min;
     assert!((minutes - down - summary.seconds / 60.0).abs() < 1e-6 * minutes, "{minutes} {}", summary.seconds / 60.0);
     // The slides themselves travel far while the head turns.
-    assert!(program.stops.iter().filter_map(|stop| stop.feed_mm_min).fold(0.0, f64::max) > 1.2 * summary.feed_mm_min);
+    assert!(
+        program.waypoints.iter().filter_map(|stop| stop.feed_mm_min).fold(0.0, f64::max) > 1.2 * summary.feed_mm_min
+    );
 }

@@ -298,21 +298,21 @@ fn a_recipe_for_another_cell() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 1e4);
     let cells = [
-        ("depth", "config/modbus-tcp.toml", "largest_depth_mm = 0.5", "largest_depth_mm = 0.001", "depth_of_cut"),
-        ("feed", "config/modbus-tcp.toml", "largest_feed_mm_min = 20000.0", "largest_feed_mm_min = 100.0", "feed"),
-        ("wheel", "config/modbus-tcp.toml", "least_wheel_radius_mm = 1.0", "least_wheel_radius_mm = 100.0", "wheel"),
+        ("depth", "config/modbus-tcp.toml", "max_depth_mm = 0.5", "max_depth_mm = 0.001", "depth_of_cut"),
+        ("feed", "config/modbus-tcp.toml", "max_feed_mm_min = 20000.0", "max_feed_mm_min = 100.0", "feed"),
+        ("wheel", "config/modbus-tcp.toml", "min_wheel_radius_mm = 1.0", "min_wheel_radius_mm = 100.0", "wheel"),
         (
             "travel",
             "config/modbus-tcp.toml",
-            "most_mm = [500.0, 500.0, 400.0]",
-            "most_mm = [20.0, 500.0, 400.0]",
+            "max_mm = [500.0, 500.0, 400.0]",
+            "max_mm = [20.0, 500.0, 400.0]",
             "travel",
         ),
         (
             "travel-of-the-grinder",
             "config/modbus-tcp.toml",
             "[grinder.limits]",
-            "[grinder.travel]\nleast_mm = [-10.0, -500.0, -400.0]\nmost_mm = [10.0, 500.0, 400.0]\n\n[grinder.limits]",
+            "[grinder.travel]\nmin_mm = [-10.0, -500.0, -400.0]\nmax_mm = [10.0, 500.0, 400.0]\n\n[grinder.limits]",
             "beyond the travel of -10 to 10 mm",
         ),
     ];
@@ -336,7 +336,7 @@ fn a_part_that_is_measured_first_is_judged_and_a_pass_that_cannot_be_ground_is_n
     fs::write(home.path().join("first.toml"), text.replace("[cycle]\n", "[cycle]\nbegin_with = \"measure\"\n"))
         .unwrap();
     let narrow =
-        "[grinder.travel]\nleast_mm = [-10.0, -500.0, -400.0]\nmost_mm = [10.0, 500.0, 400.0]\n\n[grinder.limits]";
+        "[grinder.travel]\nmin_mm = [-10.0, -500.0, -400.0]\nmax_mm = [10.0, 500.0, 400.0]\n\n[grinder.limits]";
     fs::write(home.path().join("narrow.toml"), changed("config/sim.toml", &[("[grinder.limits]", narrow)])).unwrap();
     let (code, said, errors) = in_time(&["run", "first.toml", "--cell", "narrow.toml"], home.path());
     assert_eq!(code, 1, "{said}\n{errors}");

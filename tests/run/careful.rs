@@ -41,7 +41,7 @@ impl Cmm for Odd {
 
 /// Returns the positions of the part's targets, exact to the last bit.
 fn places(plan: &Plan) -> BTreeSet<[u64; 3]> {
-    let part = plan.targets.iter().filter(|target| target.what == TargetKind::Part);
+    let part = plan.targets.iter().filter(|target| target.kind == TargetKind::Part);
     part.map(|target| target.point_mm.map(f64::to_bits)).collect()
 }
 
@@ -75,10 +75,10 @@ async fn after_a_measurement_that_was_refused_the_first_touches_are_few_and_slow
     running.await.unwrap();
     let plans: Vec<Plan> = plans.lock().unwrap().clone();
     let [first, again, later] = &plans[..3] else { unreachable!() };
-    assert_eq!((first.careful, later.careful), (None, None), "where the part lies as it was found");
-    let careful = again.careful.expect("the part may lie elsewhere");
-    assert_eq!((careful.targets, careful.speed_mm_s), (9, 0.2 * again.speed_mm_s));
-    assert!(again.targets[..9].iter().all(|target| target.what == TargetKind::Part));
+    assert_eq!((first.careful_start, later.careful_start), (None, None), "where the part lies as it was found");
+    let careful = again.careful_start.expect("the part may lie elsewhere");
+    assert_eq!((careful.target_count, careful.speed_mm_s), (9, 0.2 * again.speed_mm_s));
+    assert!(again.targets[..9].iter().all(|target| target.kind == TargetKind::Part));
     assert!(again.targets.iter().enumerate().all(|(k, target)| target.index as usize == k));
     // The same positions, with the first of them far apart.
     assert_eq!((places(again), again.targets.len()), (places(first), first.targets.len()));

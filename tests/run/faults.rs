@@ -6,7 +6,7 @@
 use crate::sample::all;
 use crate::worlds::{JOB, Ran, Setup, run, table};
 use regrind::cell::{AlarmId, Ending};
-use regrind_sim::spec::{Faults, Mirrored, Misreported};
+use regrind_sim::spec::{Mirrored, Misreported, WorldFaults};
 
 const RECIPE: &str = "freeform-mirror";
 
@@ -16,7 +16,7 @@ fn usual() -> Setup {
     Setup { coarse: !all(), ..Setup::new(RECIPE, 1) }
 }
 
-fn broken(faults: Faults) -> Setup {
+fn broken(faults: WorldFaults) -> Setup {
     usual().with(move |world| world.faults = faults.clone())
 }
 
@@ -44,7 +44,7 @@ fn caught(what: &str, setup: Setup, alarm: AlarmId, words: &[&str], passes: usiz
 }
 
 /// Name of the fault, the fault of the world, the first alarm, and the words that it contains.
-type Case = (&'static str, Faults, AlarmId, &'static [&'static str]);
+type Case = (&'static str, WorldFaults, AlarmId, &'static [&'static str]);
 
 fn each_is_caught<const N: usize>(cases: [Case; N], passes: usize) {
     for (what, faults, alarm, words) in cases {
@@ -73,16 +73,16 @@ fn machines_that_answer_wrongly_are_told_before_anything_is_written() {
 
 #[test]
 fn a_map_of_another_part_is_not_ground() {
-    let faults = Faults { wrong_part: true, ..Faults::default() };
+    let faults = WorldFaults { wrong_part: true, ..WorldFaults::default() };
     each_is_caught([("a map of another part", faults, AlarmId::MachineRefused, &["grinder", "another part"])], 0);
 }
 
 #[test]
 fn what_is_done_to_a_map_is_told_at_the_first_pass_with_one() {
-    let none = Faults::default;
-    let mirrored = |map_mirrored| Faults { map_mirrored, ..none() };
+    let none = WorldFaults::default;
+    let mirrored = |map_mirrored| WorldFaults { map_mirrored, ..none() };
     let turned = &["turned map", "how the part is turned"];
-    let flipped = Faults { map_sign_flipped: true, ..none() };
+    let flipped = WorldFaults { map_sign_flipped: true, ..none() };
     each_is_caught(
         [
             ("sign flipped", flipped, AlarmId::SignFlipped, &["the other way round", "sign"]),
@@ -90,8 +90,13 @@ fn what_is_done_to_a_map_is_told_at_the_first_pass_with_one() {
             ("y mirrored", mirrored(Mirrored::Y), AlarmId::Mirrored, &["mirrored", "direction of x and y"]),
             ("half a turn", mirrored(Mirrored::HalfTurn), AlarmId::Mirrored, turned),
             ("a quarter", mirrored(Mirrored::QuarterTurn), AlarmId::Mirrored, turned),
-            ("twice", Faults { map_doubled: true, ..none() }, AlarmId::Doubled, &["two times", "in one place only"]),
-            ("ignored", Faults { map_ignored: true, ..none() }, AlarmId::NoEffect, &["did not answer to the map"]),
+            (
+                "twice",
+                WorldFaults { map_doubled: true, ..none() },
+                AlarmId::Doubled,
+                &["two times", "in one place only"],
+            ),
+            ("ignored", WorldFaults { map_ignored: true, ..none() }, AlarmId::NoEffect, &["did not answer to the map"]),
         ],
         2,
     );
@@ -99,7 +104,7 @@ fn what_is_done_to_a_map_is_told_at_the_first_pass_with_one() {
 
 #[test]
 fn what_a_grinder_says_of_its_pass_is_held_against_what_it_was_told() {
-    let says = |misreported| Faults { misreported, ..Faults::default() };
+    let says = |misreported| WorldFaults { misreported, ..WorldFaults::default() };
     let alarm = AlarmId::PassRecord;
     each_is_caught(
         [
@@ -116,18 +121,23 @@ fn what_a_grinder_says_of_its_pass_is_held_against_what_it_was_told() {
 
 #[test]
 fn what_is_wrong_with_a_measurement_is_told_from_it() {
-    let none = Faults::default;
-    let contacts = Faults { returns_contact_points: true, ..none() };
-    let declared = Faults { contact_points_declared: true, ..contacts.clone() };
+    let none = WorldFaults::default;
+    let contacts = WorldFaults { returns_contact_points: true, ..none() };
+    let declared = WorldFaults { contact_points_declared: true, ..contacts.clone() };
     let nothing_there = &["No part was found", "loaded and clamped"];
     each_is_caught(
         [
             ("contacts, by the sphere", contacts, AlarmId::Contacts, &["contact points", "radius compensation"]),
             ("contacts, by the header", declared, AlarmId::Contacts, &["contact points", "radius compensation"]),
-            ("inches, by the sphere", Faults { inches: true, ..none() }, AlarmId::Inches, &["inches", "millimetres"]),
-            ("no part", Faults { no_part: true, ..none() }, AlarmId::NoPart, nothing_there),
-            ("no number", Faults { non_finite_point: true, ..none() }, AlarmId::BrokenResult, &["broken", "not"]),
-            ("missing records", Faults { missing_records: 3, ..none() }, AlarmId::BrokenResult, &["broken"]),
+            (
+                "inches, by the sphere",
+                WorldFaults { inches: true, ..none() },
+                AlarmId::Inches,
+                &["inches", "millimetres"],
+            ),
+            ("no part", WorldFaults { no_part: true, ..none() }, AlarmId::NoPart, nothing_there),
+            ("no number", WorldFaults { non_finite_point: true, ..none() }, AlarmId::BrokenResult, &["broken", "not"]),
+            ("missing records", WorldFaults { missing_records: 3, ..none() }, AlarmId::BrokenResult, &["broken"]),
         ],
         1,
     );
@@ -183,7 +193,7 @@ fn a_probe_that_is_10_um_off_is_told_from_the_reference_sphere() {
 
 #[test]
 fn a_part_that_lies_turned_round_is_told() {
-    let faults = Faults { part_turned_180: true, ..Faults::default() };
+    let faults = WorldFaults { part_turned_180: true, ..WorldFaults::default() };
     // The probe meets the steep part during a free move, and the machine stops by itself. The alarm must still send a
     // person to the part.
     let words = ["see how the part lies", "turned round"];

@@ -106,7 +106,7 @@ pub(crate) fn file_cell(home: &Path) {
             ("stable_for_s = 2.0", "stable_for_s = 0.05"),
             ("[0.0, 0.0, 3600.0]", "[0.0, 0.0, 0.0]"),
             ("[-26.56505117707799, 0.0, 0.0]", "[0.0, 0.0, 0.0]"),
-            ("largest_feed_mm_min = 6000.0", "largest_feed_mm_min = 20000.0"),
+            ("max_feed_mm_min = 6000.0", "max_feed_mm_min = 20000.0"),
             (
                 "[grinder.wire]",
                 "[cmm.reference_sphere]\ncentre_mm = [0.0, 120.0, 20.0]\nradius_mm = 12.5\npoints = 25\n\n[grinder.wire]",

@@ -51,7 +51,7 @@ impl Cmm for Generous {
             let proud_mm = if (t.index as usize) < FEW { 0.0 } else { 0.01 * (x / 9.0).sin() * (y / 7.0).cos() };
             let out_mm = plan.probe_radius_mm + proud_mm;
             let at_mm = std::array::from_fn(|k| t.point_mm[k] + out_mm * t.normal[k]);
-            MeasuredPoint { index: t.index, status: PointStatus::Touched, at_mm, ..sample }
+            MeasuredPoint { index: t.index, status: PointStatus::Touched, position_mm: at_mm, ..sample }
         });
         Ok(Measurement { points: points.collect(), plan_identity: plan.identity(), ..measured })
     }

@@ -23,7 +23,7 @@ use regrind::recipe::Recipe;
 use regrind::setup;
 use regrind_sim::Vec3;
 use regrind_sim::options::MachineOptions;
-use regrind_sim::registers::Machine;
+use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::shape::{FreeForm, Shape};
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::Serving;
@@ -213,7 +213,7 @@ async fn run(seed: u64) -> Ran {
     let world = World::new(spec).unwrap();
     let acting = Duration::from_millis(10);
     let options = MachineOptions { speed: SPEED, seed, lost_after_ms: 30_000, acting, ..MachineOptions::default() };
-    let grinder = Machine::new(Box::new(world.grinder()), 0x9, options);
+    let grinder = SimulatedMachine::new(Box::new(world.grinder()), 0x9, options);
     let serving = Serving::tcp("127.0.0.1:0", vec![(2, grinder)]).await.unwrap();
     let cell = cell(&shop, serving.local_addr().unwrap().port());
     let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
@@ -402,13 +402,13 @@ fn exchanged(map: &Path, content: Content) -> (Option<Measurement>, Vec<String>)
         search_mm: 0.0,
         speed_mm_s: 0.0,
         safe_height_mm: 0.0,
-        careful: None,
+        careful_start: None,
     };
     let plan_identity = plan.identity();
     let job = Job { job: 1, cycle: 0, digest: digest(&[plan_identity]) };
     folders.publish(job, 1, &MeasureOrder { plan, plan_identity }, &Permit::new()).unwrap();
     fs::copy(map, inbox.join("P_c0").with_extension(map.extension().unwrap())).unwrap();
-    let look = folders.look(Duration::from_secs(1), job).unwrap();
+    let look = folders.poll(Duration::from_secs(1), job).unwrap();
     (look.answer, look.notes)
 }
 

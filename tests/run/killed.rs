@@ -14,7 +14,7 @@ use crate::sample::seeds;
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
 use regrind::journal::{Kind, Reader, verify};
-use regrind_sim::seen::What;
+use regrind_sim::seen::HandshakeEvent;
 
 /// Maximum number of kills of a part's program.
 const MOST_KILLS: usize = 3;
@@ -91,7 +91,7 @@ fn hold_against(rig: &Rig, folder: &Path, seed: u64) {
         let mut began: BTreeMap<u16, u32> = BTreeMap::new();
         rig.servings[machine].machines()[0].1.with(|m| {
             for seen in m.log() {
-                if let What::Began { job: of, cycle, .. } = seen.what
+                if let HandshakeEvent::Began { job: of, cycle, .. } = seen.what
                     && of == job
                 {
                     *began.entry(cycle).or_default() += 1;

@@ -19,7 +19,7 @@ impl Shop {
         let recipe = fs::read_to_string(root().join("recipes/shallow-wave.toml")).unwrap();
         let recipe = replaced(&recipe, "columns = 50\nrows = 40", "columns = 25\nrows = 20");
         let recipe = replaced(&recipe, "cutoff_mm = 5.0", "cutoff_mm = 11.0\nlearn = true");
-        let recipe = replaced(&recipe, "most_cycles = 5", "most_cycles = 2");
+        let recipe = replaced(&recipe, "max_cycles = 5", "max_cycles = 2");
         Self { home: tempfile::tempdir().unwrap(), recipe }
     }
 
@@ -97,9 +97,9 @@ fn what_cannot_be_begun_with_is_refused() {
         assert!(words.iter().all(|word| said.contains(word)), "{said}");
         assert_eq!(shop.folders().len(), runs, "a refused run leaves no folder");
     };
-    let small = replaced(&shop.recipe, "largest_correction_um = 60.0", "largest_correction_um = 0.5");
-    refused(&small, &["more than the 0.50 um", "raise largest_correction_um", "learn = false"]);
-    let measured_first = replaced(&shop.recipe, "most_cycles = 2", "most_cycles = 2\nbegin_with = \"measure\"");
+    let small = replaced(&shop.recipe, "max_correction_um = 60.0", "max_correction_um = 0.5");
+    refused(&small, &["more than the 0.50 um", "raise max_correction_um", "learn = false"]);
+    let measured_first = replaced(&shop.recipe, "max_cycles = 2", "max_cycles = 2\nbegin_with = \"measure\"");
     refused(&measured_first, &["compensation.learn", "leave one of the two out"]);
     // A damaged file is reported, and blocks nothing.
     fs::write(first.join("learned.json"), "{").unwrap();

@@ -45,7 +45,11 @@ impl Machine for Told {
             return Ok(armed);
         }
         self.lost -= 1;
-        Err(DeviceError::TimedOut { machine: "the grinder".into(), what: "status", limit: Duration::from_millis(500) })
+        Err(DeviceError::TimedOut {
+            machine: "the grinder".into(),
+            operation: "status",
+            limit: Duration::from_millis(500),
+        })
     }
 }
 
@@ -244,7 +248,7 @@ async fn figures_of_a_measurement_that_cannot_be_make_nothing_of_it() {
         (Box::new(|of| of.duration_s = Some(-5.0)), AlarmId::BrokenResult, "the duration is -5 s"),
         (Box::new(|of| of.probe_radius_mm = Some(0.0)), AlarmId::BrokenResult, "the probe's radius is 0 mm"),
         (Box::new(|of| of.points[3].quality = 101), AlarmId::BrokenResult, "the quality of a point is 101"),
-        (Box::new(|of| of.points[40].at_mm[2] = 1e30), AlarmId::BrokenResult, "a coordinate is 1000000"),
+        (Box::new(|of| of.points[40].position_mm[2] = 1e30), AlarmId::BrokenResult, "a coordinate is 1000000"),
     ];
     let told: Vec<_> = fates.iter().map(|(_, id, words)| (*id, *words)).collect();
     let mut fates: VecDeque<Fate> = fates.into_iter().map(|(fate, ..)| fate).collect();

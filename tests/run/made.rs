@@ -7,7 +7,7 @@ use regrind::drive::Adaptive;
 use regrind::geometry::{Point, Sample, Vector};
 use regrind::model::{self, FIRST_BATCH, Form, FormFigures, FormPoint, MIN_TOUCHES, ModelInputs, PartialMeasurement};
 use regrind::registration::Registration;
-use regrind_sim::body::Body;
+use regrind_sim::body::Physics;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
 
@@ -124,7 +124,7 @@ impl Line<'_> {
         grinder.prepare(self.job, cycle, &payloads).unwrap();
         grinder.begin();
         while !grinder.advance(1000.0).finished {}
-        grinder.outcome(1).duration_s
+        grinder.end_job(1).duration_s
     }
 
     fn measured(&self, level_mm: f64, measured: Measured, seed: u64, cycle: u32) -> Took {
@@ -151,9 +151,9 @@ impl Line<'_> {
 
     fn chosen(&self, level_mm: f64, seed: u64, cycle: u32) -> Took {
         let targets: &[(Point, Vector)] = &self.bench.plan_of;
-        let (tolerance, most_cycles) = (self.bench.plan.tolerance, self.bench.plan.max_cycles);
-        let adaptive = Adaptive { tolerance, accepted_risk: 0.025, most_cycles };
-        let purpose = adaptive.purpose(cycle < most_cycles);
+        let (tolerance, max_cycles) = (self.bench.plan.tolerance, self.bench.plan.max_cycles);
+        let adaptive = Adaptive { tolerance, accepted_risk: 0.025, max_cycles };
+        let purpose = adaptive.purpose(cycle < max_cycles);
         let given = ModelInputs { look_risk: adaptive.look_risk(), ..self.given() };
         let mut tried = vec![None; targets.len()];
         let (mut all, mut seconds, mut path) = (Vec::new(), 0.0, Vec::new());

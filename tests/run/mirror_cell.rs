@@ -31,8 +31,8 @@ fn cell(data: &Path, session: &str, outbox: &Path) -> CmmExchange {
         content: Content { coordinates: Some(Said::Centres), ..Content::default() },
         stations: Some(Stations { files, nominal, group: Some("primary".into()), limit_mm: 1.0 }),
         free_count: true,
-        least_points: 500,
-        take_earlier: true,
+        min_points: 500,
+        accept_earlier_files: true,
         ..CmmExchange::new("M1", outbox, data.join(session))
     }
 }
@@ -45,7 +45,7 @@ fn plan(radius_mm: f64) -> MeasureOrder {
         search_mm: 0.0,
         speed_mm_s: 0.0,
         safe_height_mm: 0.0,
-        careful: None,
+        careful_start: None,
     };
     let plan_identity = plan.identity();
     MeasureOrder { plan, plan_identity }
@@ -60,7 +60,7 @@ fn measured(settings: CmmExchange, radius_mm: f64) -> (Option<Measurement>, Vec<
     // A poll does not wait for files that take long to read.
     let began = std::time::Instant::now();
     loop {
-        let look = folders.look(Duration::from_secs(1), job).unwrap();
+        let look = folders.poll(Duration::from_secs(1), job).unwrap();
         if !look.notes.iter().any(|note| note.starts_with("reading ")) {
             return (look.answer, look.notes);
         }
@@ -116,7 +116,7 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
         println!("{session}\n{}", said.join("\n"));
         assert_eq!((found.points.len(), found.coordinates), (points, Coordinates::Centres));
         assert_eq!(found.probe_radius_mm, Some(REFLECTOR_MM));
-        let cloud: Vec<Point> = found.points.iter().map(|p| Point::from(p.at_mm)).collect();
+        let cloud: Vec<Point> = found.points.iter().map(|p| Point::from(p.position_mm)).collect();
         let free = registered(&nominal, &cloud, [false; 6]);
         let v = &free.verdict;
         let said: Vec<&str> = v.weak_directions.iter().map(|w| w.words.as_str()).collect();
@@ -177,7 +177,7 @@ fn session(data: &Path, nominal: &Nominal, name: &str) -> (Vec<Point>, Registrat
     let home = tempfile::tempdir().unwrap();
     let (found, said) = measured(cell(data, name, home.path()), REFLECTOR_MM);
     let found = found.unwrap_or_else(|| panic!("{said:#?}"));
-    let cloud: Vec<Point> = found.points.iter().map(|p| Point::from(p.at_mm)).collect();
+    let cloud: Vec<Point> = found.points.iter().map(|p| Point::from(p.position_mm)).collect();
     let registration = registered(nominal, &cloud, [false; 6]);
     (cloud, registration)
 }

@@ -137,7 +137,7 @@ fn a_real_mirror_is_measured_and_judged_and_its_correction_refused_in_words() {
     let alarm = notices(&said, "alarm").into_iter().find(|a| a["id"] == "weak_directions").expect("an alarm");
     let what = alarm["what"].as_str().unwrap();
     println!("{what}");
-    for words in ["x and y shift: found again to 3.", "rotation about z", "registration.hold", "beside its place"] {
+    for words in ["x and y shift: found again to 3.", "rotation about z", "registration.lock", "beside its place"] {
         assert!(what.contains(words), "{words}: {what}");
     }
     let folder = shop.run_folder();

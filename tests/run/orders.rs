@@ -12,8 +12,8 @@ use crate::tries::{MOMENTS, attempt, attempt_with};
 use regrind::cell::Ending;
 use regrind::drive::{Drive, Orders, Request};
 use regrind::journal::{Kind, Reader, verify};
-use regrind_sim::command::Frame;
-use regrind_sim::seen::What;
+use regrind_sim::command::CommandFrame;
+use regrind_sim::seen::HandshakeEvent;
 use serde_json::Value;
 
 const DEVICES: [&str; 2] = ["cmm", "grinder"];
@@ -44,11 +44,13 @@ fn intents(folder: &Path, machine: usize) -> Vec<(u16, Value)> {
     of_it.filter_map(|value| Some((command_of(&value)?, value))).collect()
 }
 
-fn frames(rig: &Rig, machine: usize, from: usize) -> Vec<Frame> {
+fn frames(rig: &Rig, machine: usize, from: usize) -> Vec<CommandFrame> {
     rig.servings[machine].machines()[0].1.with(|m| {
         let seen = m.log()[from..].iter();
-        seen.filter_map(|seen| if let What::Commanded { frame, .. } = &seen.what { Some(*frame) } else { None })
-            .collect()
+        seen.filter_map(
+            |seen| if let HandshakeEvent::Commanded { frame, .. } = &seen.what { Some(*frame) } else { None },
+        )
+        .collect()
     })
 }
 
@@ -57,7 +59,7 @@ fn seen_so_far(rig: &Rig, machine: usize) -> usize {
 }
 
 /// Checks that every frame has its intent, in order, and that every intent has its frame unless an abort made it void.
-fn compare(name: &str, frames: &[Frame], intents: &[(u16, Value)]) {
+fn compare(name: &str, frames: &[CommandFrame], intents: &[(u16, Value)]) {
     let mut next = 0;
     let commands: Vec<u16> = frames.iter().map(|f| f.command).collect();
     let intended: Vec<u16> = intents.iter().map(|(command, _)| *command).collect();

@@ -26,7 +26,7 @@ fn recipe(parameters: &str, accepted_um: f64) -> String {
         ("rows = 30", "rows = 9"),
         ("accuracy_nm = 0.5", "spacing_mm = 0.5"),
         ("cutoff_mm = 5.0", "cutoff_mm = 22.0\nrepeatability_um = 0.4"),
-        ("largest_correction_um = 60.0", "largest_correction_um = 120.0"),
+        ("max_correction_um = 60.0", "max_correction_um = 120.0"),
         ("pv_um = 7.0\n", ""),
         ("rms_um = 1.0", &accepted),
         ("[grinding]\n", &grinding),

@@ -246,7 +246,7 @@ impl Production {
         let (task, plan) = setup::prepare(recipe, cell).unwrap();
         let folder = self.home.join("runs").join(part.to_string());
         let take = |kind: MachineKind, link: &Link| {
-            let (line, unit) = link.wire.line().unwrap();
+            let (line, unit) = link.wire.modbus_line().unwrap();
             MachineLock::take(&format!("{kind} at {line}, unit {unit}"), &folder).unwrap()
         };
         let taken = [take(MachineKind::Cmm, &cell.cmm.link), take(MachineKind::Grinder, &cell.grinder.link)];

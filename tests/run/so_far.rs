@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 use crate::rig::{CMM, PATIENCE, Ready, Rig, order, small, until};
 use regrind::cell::Ending;
 use regrind::drive::{Drive, Request, Snapshot, SoFar};
-use regrind_sim::registers::Machine;
+use regrind_sim::registers::SimulatedMachine;
 
-fn cmm(rig: &Rig, what: impl FnOnce(&mut Machine)) {
+fn cmm(rig: &Rig, what: impl FnOnce(&mut SimulatedMachine)) {
     rig.servings[CMM].machines()[0].1.with(what);
 }
 
@@ -35,8 +35,8 @@ async fn touches_are_shown_while_they_are_measured_and_are_gone_with_the_end() {
     let running = tokio::spawn(drive.run());
     until(&folder, |words| words.starts_with("Execute (Measure, Run)")).await;
     assert_eq!(orders.status().borrow().so_far, None);
-    let half = |machine: &mut Machine| {
-        let progress = |machine: &mut Machine| machine.read(84, 4).unwrap()[1];
+    let half = |machine: &mut SimulatedMachine| {
+        let progress = |machine: &mut SimulatedMachine| machine.read(84, 4).unwrap()[1];
         machine.set_speed(100.0);
         while progress(machine) < 60 {
             machine.tick(Duration::from_millis(10));

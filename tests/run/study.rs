@@ -22,7 +22,7 @@ use regrind::geometry::{Grid, Point, Sample, Vector};
 use regrind::recipe::Recipe;
 use regrind::registration::{Deviation, PointStatus, Registration};
 use regrind::setup;
-use regrind_sim::body::{Body, Payload, Payloads};
+use regrind_sim::body::{Payload, Payloads, Physics};
 use regrind_sim::payload::{Feature, Map, Pass, Plan, PointRecord, Status, Target, decode_points};
 use regrind_sim::process::Grinder;
 use regrind_sim::spec::GrinderSpec;
@@ -370,7 +370,7 @@ fn touched_in(world: &World, job: u32, plan: &Plan) -> (Vec<PointRecord>, f64) {
     cmm.prepare(job, 0, &Payloads { plan: Some(payload), ..Payloads::default() }).unwrap();
     cmm.begin();
     while !cmm.advance(1000.0).finished {}
-    let outcome = cmm.outcome(1);
+    let outcome = cmm.end_job(1);
     let records = decode_points(&outcome.bytes, (outcome.format == 2).then_some(outcome.scale_mm)).unwrap();
     (records, outcome.duration_s)
 }
@@ -388,7 +388,7 @@ pub fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass
             break;
         }
     }
-    grinder.outcome(1);
+    grinder.end_job(1);
 }
 
 /// Returns the measured deviations as a map, by the nearest point.

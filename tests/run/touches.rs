@@ -13,7 +13,7 @@ use regrind::cell::AlarmId;
 use regrind::drive::Notice;
 use regrind::journal::{Kind, Reader, verify};
 use regrind_sim::part::ShapeSpec;
-use regrind_sim::spec::Faults;
+use regrind_sim::spec::WorldFaults;
 use serde_json::Value;
 
 fn chosen(recipe: &'static str, seed: u64) -> Setup {
@@ -90,11 +90,11 @@ fn is_true(ran: &Ran, recipe: &str) {
 
 #[test]
 fn what_is_wrong_is_seen_at_the_first_ten_touches() {
-    let faults = |faults: Faults| chosen("freeform-mirror", 1).with(move |world| world.faults = faults.clone());
-    let mirrored = faults(Faults { cmm_mirrored: true, ..Faults::default() });
-    let inches = faults(Faults { inches: true, ..Faults::default() });
+    let faults = |faults: WorldFaults| chosen("freeform-mirror", 1).with(move |world| world.faults = faults.clone());
+    let mirrored = faults(WorldFaults { cmm_mirrored: true, ..WorldFaults::default() });
+    let inches = faults(WorldFaults { inches: true, ..WorldFaults::default() });
     let radius = chosen("freeform-mirror", 1).with(|world| world.cmm.probe_radius_error_um = 50.0);
-    let contacts = faults(Faults { returns_contact_points: true, ..Faults::default() });
+    let contacts = faults(WorldFaults { returns_contact_points: true, ..WorldFaults::default() });
     let other = chosen("freeform-mirror", 1).with(|world| {
         let ShapeSpec::XyPolynomial { coefficients, .. } = &mut world.part.shape else { panic!("another shape") };
         coefficients.iter_mut().filter(|term| term.i + term.j == 3).for_each(|term| term.value_mm *= 1.3);

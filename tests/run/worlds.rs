@@ -15,13 +15,13 @@ use regrind::device::Wire;
 use regrind::device::{ModbusCmm, ModbusGrinder, ModbusSettings};
 use regrind::drive::{Beside, CycleRow, Drive, Ledger, Notice, Request, Run, ask};
 use regrind::journal::{Header, Journal};
-use regrind::recipe::{Measuring, Mode, Recipe};
+use regrind::recipe::{Mode, Recipe};
 use regrind::setup;
 use regrind_sim::Vec3;
-use regrind_sim::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
+use regrind_sim::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
 use regrind_sim::options::MachineOptions;
 use regrind_sim::probe::Placement;
-use regrind_sim::registers::Machine;
+use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::Serving;
 use regrind_sim::words;
@@ -162,7 +162,7 @@ struct Watched<B> {
     before: Box<dyn FnMut() + Send>,
 }
 
-impl<B: Body> Body for Watched<B> {
+impl<B: Physics> Physics for Watched<B> {
     fn kind(&self) -> Kind {
         self.body.kind()
     }
@@ -185,8 +185,8 @@ impl<B: Body> Body for Watched<B> {
     fn retract(&mut self) {
         self.body.retract();
     }
-    fn outcome(&mut self, result: u16) -> Outcome {
-        self.body.outcome(result)
+    fn end_job(&mut self, result: u16) -> ResultData {
+        self.body.end_job(result)
     }
     fn interlocks(&self) -> u16 {
         self.body.interlocks()
@@ -222,7 +222,7 @@ impl Eye {
         let centres = measured.iter().map(|row| back(&placement, [row[0], row[1], row[2]]));
         let places_mm: Vec<[f64; 2]> = centres.map(|centre| foot(world, centre).0).collect();
         // A touch at the very edge of the part may have its projection beyond the edge.
-        let touched = world.touched_mm(&places_mm, *radius_mm);
+        let touched = world.ball_heights_mm(&places_mm, *radius_mm);
         let without_ball = touched.iter().map(Option::is_none).collect();
         let touched = touched.into_iter().zip(&places_mm);
         let heights_mm = touched.map(|(height, &[x, y])| height.unwrap_or_else(|| world.deviation_mm(x, y))).collect();
@@ -285,7 +285,7 @@ async fn go(setup: Setup) -> Ran {
     recipe.measure.temperature_c = setup.temperature_c;
     recipe.part.expansion_um_m_k = setup.expansion_um_m_k;
     if setup.adaptive {
-        recipe.measuring = Measuring { mode: Mode::Adaptive, accepted_risk: Some(0.025) };
+        (recipe.measure.mode, recipe.measure.accepted_risk) = (Mode::Adaptive, Some(0.025));
     }
     let cell = CellConfig::read(&root().join("config/sim.toml")).unwrap();
     let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
@@ -388,8 +388,8 @@ async fn serve(setup: &Setup, cell: &CellConfig, eye: &Arc<Eye>) -> ([Serving; 2
     let (world, eye) = (&eye.world, eye.clone());
     let before: Box<dyn FnMut() + Send> = Box::new(move || eye.look());
     let grinder = Watched { body: world.grinder(), before };
-    let cmm = Machine::new(Box::new(world.cmm()), 0xc, options(setup.seed));
-    let grinder = Machine::new(Box::new(grinder), 0x9, options(setup.seed + 1));
+    let cmm = SimulatedMachine::new(Box::new(world.cmm()), 0xc, options(setup.seed));
+    let grinder = SimulatedMachine::new(Box::new(grinder), 0x9, options(setup.seed + 1));
     let mut links = [cell.cmm.link.clone(), cell.grinder.link.clone()];
     let [cmm_unit, grinder_unit] = if setup.exchanged { [2, 1] } else { [1, 2] };
     let cmm = Serving::tcp("127.0.0.1:0", vec![(cmm_unit, cmm)]).await.unwrap();

@@ -8,9 +8,9 @@ use std::time::Duration;
 use regrind::cell::{Phase, StateName};
 use regrind::journal::{Reader, verify};
 use regrind_sim::command::{Command, State};
-use regrind_sim::dme::deed::Deed;
-use regrind_sim::rsh::deed::Deed as OfRsh;
-use regrind_sim::seen::What;
+use regrind_sim::dme::deed::MachineEvent;
+use regrind_sim::rsh::deed::ControllerEvent;
+use regrind_sim::seen::HandshakeEvent;
 use serde_json::Value;
 use tokio::time::Instant;
 
@@ -55,9 +55,9 @@ pub struct Evidence {
     pub folder: PathBuf,
     pub log: Vec<Moment>,
     /// Actions of the CMM, if it is one by I++ DME.
-    pub deeds: Vec<(Instant, Deed)>,
+    pub deeds: Vec<(Instant, MachineEvent)>,
     /// Actions of the grinder, if it is one by LinuxCNC.
-    pub rsh_deeds: Vec<(Instant, OfRsh)>,
+    pub rsh_deeds: Vec<(Instant, ControllerEvent)>,
     pub given: Vec<Given>,
     pub written: Vec<Recorded>,
     pub shown: Vec<Shown>,
@@ -197,7 +197,7 @@ fn sound_record(evidence: &Evidence) -> Result<(Vec<Value>, bool), String> {
 /// it began.
 fn was_forgotten_unseen(evidence: &Evidence, began: &Moment) -> bool {
     let of_it = || evidence.log.iter().filter(|moment| moment.machine == began.machine && moment.at >= began.at);
-    let forgot = of_it().find(|moment| matches!(moment.what, What::Forgot));
+    let forgot = of_it().find(|moment| matches!(moment.what, HandshakeEvent::Forgot));
     let Some(forgot) = forgot else { return false };
     let seen = |w: &Recorded| {
         let event = &w.payload;
@@ -208,7 +208,7 @@ fn was_forgotten_unseen(evidence: &Evidence, began: &Moment) -> bool {
                 || event["event"] == "reconciled" && at_work)
     };
     // A status that was in transit when the machine forgot arrives a moment later.
-    let next_start = of_it().find(|moment| moment.at > began.at && matches!(moment.what, What::Began { .. }));
+    let next_start = of_it().find(|moment| moment.at > began.at && matches!(moment.what, HandshakeEvent::Began { .. }));
     let until = next_start.map_or(forgot.at + Duration::from_secs(1), |next| next.at);
     !evidence.written.iter().any(|w| w.at >= began.at && w.at <= until && seen(w))
 }
@@ -219,10 +219,10 @@ fn began_once(evidence: &Evidence) -> Result<(), String> {
     let mut passes = BTreeSet::new();
     for moment in &evidence.log {
         // A machine that was restarted counts from the beginning.
-        if let What::Rebooted { .. } | What::Forgot = moment.what {
+        if let HandshakeEvent::Rebooted { .. } | HandshakeEvent::Forgot = moment.what {
             starts.retain(|(machine, ..)| *machine != moment.machine);
         }
-        let What::Began { start, job, cycle } = moment.what else { continue };
+        let HandshakeEvent::Began { start, job, cycle } = moment.what else { continue };
         let (machine, at) = (NAMES[moment.machine], evidence.seconds(moment.at));
         // Numbers repeat after the counter has wrapped; the job identifies a START as well.
         if !starts.insert((moment.machine, start, job, cycle)) {
@@ -241,7 +241,7 @@ fn began_once(evidence: &Evidence) -> Result<(), String> {
 /// Checks that every job that a machine begins was on record before.
 fn intended_before(evidence: &Evidence) -> Result<(), String> {
     for moment in &evidence.log {
-        let What::Began { start, job, cycle } = moment.what else { continue };
+        let HandshakeEvent::Began { start, job, cycle } = moment.what else { continue };
         let is_intent = |w: &&Recorded| {
             w.payload["command"] == "start_machine"
                 && w.payload["device"] == NAMES[moment.machine]
@@ -263,9 +263,9 @@ fn map_of_record(evidence: &Evidence, records: &[Value]) -> Result<(), String> {
     let mut in_force: [BTreeMap<u16, [u8; 32]>; 2] = Default::default();
     for moment in &evidence.log {
         match &moment.what {
-            What::Taken { kind, identity } => drop(in_force[moment.machine].insert(*kind, *identity)),
-            What::Rebooted { .. } | What::Forgot => in_force[moment.machine].clear(),
-            What::Began { job, cycle, .. } if *job == evidence.job => {
+            HandshakeEvent::Taken { kind, identity } => drop(in_force[moment.machine].insert(*kind, *identity)),
+            HandshakeEvent::Rebooted { .. } | HandshakeEvent::Forgot => in_force[moment.machine].clear(),
+            HandshakeEvent::Began { job, cycle, .. } if *job == evidence.job => {
                 let bytes: Vec<u8> = in_force[moment.machine].values().flatten().copied().collect();
                 let digest = u64::from(crc32fast::hash(&bytes));
                 let named = records.iter().rev().find(|r| {
@@ -290,7 +290,7 @@ fn states(evidence: &Evidence) -> Vec<(Instant, [State; 2])> {
     let mut now = [State::Idle; 2];
     let mut states = vec![(evidence.began, now)];
     for moment in &evidence.log {
-        if let What::Changed { to, .. } = moment.what {
+        if let HandshakeEvent::Changed { to, .. } = moment.what {
             now[moment.machine] = to;
             states.push((moment.at, now));
         }
@@ -303,8 +303,8 @@ fn never_both(evidence: &Evidence) -> Result<(), String> {
     let (mut now, mut strays) = ([State::Idle; 2], [false; 2]);
     for moment in &evidence.log {
         match moment.what {
-            What::Strayed => strays[moment.machine] = true,
-            What::Changed { to, .. } => {
+            HandshakeEvent::Strayed => strays[moment.machine] = true,
+            HandshakeEvent::Changed { to, .. } => {
                 now[moment.machine] = to;
                 strays[moment.machine] &= to == State::Execute;
             }
@@ -332,11 +332,11 @@ fn motions(evidence: &Evidence) -> Vec<Motion> {
     for moment in &evidence.log {
         let (machine, from) = (moment.machine, moment.at);
         match moment.what {
-            What::Strayed => strayed[machine] = true,
-            What::Changed { to: State::Execute, .. } => {
+            HandshakeEvent::Strayed => strayed[machine] = true,
+            HandshakeEvent::Changed { to: State::Execute, .. } => {
                 motions.push(Motion { machine, from, to: last, strayed: std::mem::take(&mut strayed[machine]) });
             }
-            What::Changed { from: State::Execute, .. } => {
+            HandshakeEvent::Changed { from: State::Execute, .. } => {
                 let open = motions.iter_mut().rfind(|motion| motion.machine == machine);
                 open.expect("it moved").to = moment.at;
             }
@@ -454,11 +454,15 @@ fn told_to_hold(evidence: &Evidence) -> Result<(), String> {
 /// if the machine is reachable and visible.
 fn strays_are_told_to_hold(evidence: &Evidence) -> Result<(), String> {
     let Some(hindered) = evidence.hindered.as_ref().filter(|_| !evidence.freezes) else { return Ok(()) };
-    for (number, moment) in evidence.log.iter().enumerate().filter(|(_, moment)| matches!(moment.what, What::Strayed)) {
+    for (number, moment) in
+        evidence.log.iter().enumerate().filter(|(_, moment)| matches!(moment.what, HandshakeEvent::Strayed))
+    {
         let (machine, by) = (moment.machine, moment.at + FOUND_WITHIN);
         let is_hindered = hindered.iter().any(|(from, to)| *from <= by && moment.at <= *to + RECOVERS_WITHIN);
         let goes_on = !evidence.log[number..].iter().any(|next| {
-            next.machine == machine && next.at <= by && matches!(&next.what, What::Changed { from: State::Execute, .. })
+            next.machine == machine
+                && next.at <= by
+                && matches!(&next.what, HandshakeEvent::Changed { from: State::Execute, .. })
         });
         let from = evidence.shown.partition_point(|shown| shown.at <= moment.at).saturating_sub(1);
         let stands = |shown: &Shown| shown.state == Some(StateName::Held);
@@ -487,9 +491,9 @@ fn aborted_at_once(evidence: &Evidence) -> Result<(), String> {
                 moment.machine == k
                     && moment.at <= abort.at
                     && match &moment.what {
-                        What::Began { .. } | What::Strayed => true,
+                        HandshakeEvent::Began { .. } | HandshakeEvent::Strayed => true,
                         // For a machine without jobs, the change of state shows the motion.
-                        What::Changed { to, .. } => by_lines[k] && *to == State::Execute,
+                        HandshakeEvent::Changed { to, .. } => by_lines[k] && *to == State::Execute,
                         _ => false,
                     }
             });
@@ -510,7 +514,7 @@ fn aborted_at_once(evidence: &Evidence) -> Result<(), String> {
 /// refuse it.
 fn begun_is_not_intended_again(evidence: &Evidence) -> Result<(), String> {
     for began in evidence.log.iter().filter(|moment| moment.machine == 1) {
-        let What::Began { start, job, cycle } = began.what else { continue };
+        let HandshakeEvent::Began { start, job, cycle } = began.what else { continue };
         if was_forgotten_unseen(evidence, began) {
             continue;
         }
@@ -548,7 +552,7 @@ fn said_of_starts_is_so(evidence: &Evidence) -> Result<(), String> {
         let meant = &intended.payload["intent"];
         let moved = evidence.log.iter().filter(|moment| moment.machine == machine && moment.at >= intended.at);
         for moment in moved {
-            let What::Began { start, job, cycle } = moment.what else { continue };
+            let HandshakeEvent::Began { start, job, cycle } = moment.what else { continue };
             let is_it = meant["start_sequence"] == start && meant["job"] == job && intended.payload["cycle"] == cycle;
             // A machine that was restarted counts from the beginning: a later START can have the same number.
             let is_later = || {
@@ -558,7 +562,7 @@ fn said_of_starts_is_so(evidence: &Evidence) -> Result<(), String> {
             };
             // A machine that has forgotten its job reports that it never began. The record contains that report, and no
             // conclusion follows from it.
-            let forgot = |then: &&Moment| matches!(then.what, What::Forgot) && then.machine == machine;
+            let forgot = |then: &&Moment| matches!(then.what, HandshakeEvent::Forgot) && then.machine == machine;
             let is_a_lie = evidence.log.iter().filter(forgot).any(|then| moment.at <= then.at && then.at <= said.at);
             if is_it && !is_later() && !is_a_lie {
                 let [at, told] = [moment.at, said.at].map(|at| evidence.seconds(at));

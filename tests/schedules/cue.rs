@@ -7,7 +7,7 @@ use std::time::Duration;
 use rand::RngExt as _;
 use rand::rngs::StdRng;
 use regrind_sim::command::State;
-use regrind_sim::seen::What;
+use regrind_sim::seen::HandshakeEvent;
 use serde_json::Value;
 use tokio::sync::watch;
 
@@ -61,12 +61,12 @@ impl Cue {
     }
 
     /// Returns the cue of a machine's action, if it is one.
-    fn done(what: &What) -> Option<Self> {
+    fn done(what: &HandshakeEvent) -> Option<Self> {
         Some(match what {
-            What::Began { .. } => Self::Begins,
-            What::Changed { to: State::Holding, .. } => Self::Holding,
-            What::Changed { to: State::Held, .. } => Self::Held,
-            What::Changed { to: State::Complete, .. } => Self::Complete,
+            HandshakeEvent::Began { .. } => Self::Begins,
+            HandshakeEvent::Changed { to: State::Holding, .. } => Self::Holding,
+            HandshakeEvent::Changed { to: State::Held, .. } => Self::Held,
+            HandshakeEvent::Changed { to: State::Complete, .. } => Self::Complete,
             _ => return None,
         })
     }
@@ -118,7 +118,7 @@ impl Cues {
         self.give(Cue::recorded(payload));
     }
 
-    pub fn see_machine(&self, what: &What) {
+    pub fn see_machine(&self, what: &HandshakeEvent) {
         self.give(Cue::done(what));
     }
 

@@ -17,8 +17,8 @@ use regrind::device::{
 use regrind::drive::{Beside, Blocking, Drive, Interrupted, Orders, Run};
 use regrind::journal::{AuditKey, Header, Journal, Kind, Reader, RunLock, verify};
 use regrind::setup;
-use regrind_sim::seen::What;
-use regrind_sim::wire::faults::{FaultPlan, Faults};
+use regrind_sim::seen::HandshakeEvent;
+use regrind_sim::wire::faults::{FaultPlan, SharedFaultPlan};
 use serde_json::json;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -52,7 +52,7 @@ pub struct Happening<'s> {
     home: &'s Path,
     began: Instant,
     machines: Machines,
-    faults: [Faults; 2],
+    faults: [SharedFaultPlan; 2],
     nets: [Net; 2],
     disk: SharedDisk,
     person: Person,
@@ -85,7 +85,7 @@ impl<'s> Happening<'s> {
         let machines = Machines::new(schedule, &cues);
         let faults = [1, 2].map(|k| {
             let plan = FaultPlan::seeded(seed ^ k, schedule.fault_share, schedule.faults.clone());
-            Faults::from(plan)
+            SharedFaultPlan::from(plan)
         });
         let nets = match schedule.baud {
             // Both machines are on one line.
@@ -266,9 +266,9 @@ impl<'s> Happening<'s> {
             programs_at_controller: programs.display().to_string(),
             programs,
             joints: wire.joints.into(),
-            answer_within: ms(wire.answer_timeout_ms),
-            settle_within: ms(wire.settle_timeout_ms),
-            record_within: ms(wire.record_timeout_ms),
+            answer_timeout: ms(wire.answer_timeout_ms),
+            settle_timeout: ms(wire.settle_timeout_ms),
+            record_timeout: ms(wire.record_timeout_ms),
             expected_name: None,
             simulated: true,
         }
@@ -283,14 +283,14 @@ impl<'s> Happening<'s> {
             Some(_) => {
                 let dial = self.nets[1].dial(life, Some(&wires));
                 let seed = self.schedule.seed ^ 0x70 ^ (self.lives << 8);
-                AnyGrinder::Linuxcnc(LinuxcncGrinder::over(self.rsh_settings(folder), dial, seed))
+                AnyGrinder::Linuxcnc(LinuxcncGrinder::with_connector(self.rsh_settings(folder), dial, seed))
             }
         };
         let cmm = match self.schedule.dme {
             None => AnyCmm::ModbusTcp(ModbusCmm::on(of_cmm, self.settings(0))),
             Some(_) => {
                 let dial = self.nets[0].dial(life, Some(&wires));
-                AnyCmm::Ippdme(IppdmeCmm::over(dme_settings(), dial))
+                AnyCmm::Ippdme(IppdmeCmm::with_connector(dme_settings(), dial))
             }
         };
         (cmm, grinder)
@@ -301,10 +301,10 @@ impl<'s> Happening<'s> {
             let mut settings = self.settings(which);
             if let Some(baud) = self.schedule.baud {
                 let parity = regrind::device::Parity::Even;
-                settings.line = regrind::device::Line::Rtu { device: "line".into(), baud, parity, stop_bits: 1 };
+                settings.line = regrind::device::LineAddress::Rtu { device: "line".into(), baud, parity, stop_bits: 1 };
             }
             let seed = self.schedule.seed ^ (0x60 + which as u64) ^ (self.lives << 8);
-            Link::over(
+            Link::with_connector(
                 settings.line,
                 settings.request_timeout,
                 settings.quarantine,
@@ -366,7 +366,7 @@ impl<'s> Happening<'s> {
         let given: Vec<Given> = self.person.given.lock().unwrap().clone();
         let written = self.written.lock().unwrap().clone();
         let fired = self.faults.iter().map(|faults| faults.fired().len() as u64).sum();
-        let passes = log.iter().filter(|m| matches!(m.what, What::Began { .. })).count() as u64;
+        let passes = log.iter().filter(|m| matches!(m.what, HandshakeEvent::Began { .. })).count() as u64;
         let accepted = u64::from(matches!(&ending, Some(Ending::Accepted { .. })));
         let tally = Tally {
             runs: 1,
@@ -431,7 +431,7 @@ fn dme_settings() -> IppdmeSettings {
         travel_speed_mm_s: wire.travel_speed_mm_s,
         scan: None,
         part_frame: None,
-        retries: wire.tries_again,
+        retries: wire.retries,
         volume_mm: VOLUME_MM,
         limits: Limits {
             answer: ms(wire.answer_timeout_ms),

@@ -4,15 +4,15 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use regrind_sim::command::State;
-use regrind_sim::dme::deed::Deed;
-use regrind_sim::dme::faults::Faults as DmeFaults;
+use regrind_sim::dme::deed::MachineEvent;
+use regrind_sim::dme::faults::CommandFaults as DmeFaults;
 use regrind_sim::dme::{Server, machine as probe};
 use regrind_sim::options::MachineOptions;
-use regrind_sim::registers::Machine;
+use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::rsh::Controller;
-use regrind_sim::rsh::deed::Deed as OfRsh;
-use regrind_sim::rsh::faults::Faults as RshFaults;
-use regrind_sim::seen::What;
+use regrind_sim::rsh::deed::ControllerEvent;
+use regrind_sim::rsh::faults::LineFaults as RshFaults;
+use regrind_sim::seen::HandshakeEvent;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::SharedMachine;
 use regrind_sim::wire::dme::SharedServer;
@@ -35,17 +35,17 @@ pub struct Moment {
     pub at: Instant,
     /// Index of the machine: 0 is the CMM, 1 the grinder.
     pub machine: usize,
-    pub what: What,
+    pub what: HandshakeEvent,
 }
 
 /// Actions of both machines, in order.
 pub type Log = Arc<Mutex<Vec<Moment>>>;
 
 /// Actions of a measuring machine by I++ DME, in order.
-pub type Deeds = Arc<Mutex<Vec<(Instant, Deed)>>>;
+pub type Deeds = Arc<Mutex<Vec<(Instant, MachineEvent)>>>;
 
 /// Actions of a grinder by LinuxCNC, in order.
-pub type RshDeeds = Arc<Mutex<Vec<(Instant, OfRsh)>>>;
+pub type RshDeeds = Arc<Mutex<Vec<(Instant, ControllerEvent)>>>;
 
 /// Speed of a program, relative to a pass of a register machine, which does its strokes within the pass.
 const OF_PROGRAMS: f64 = 0.25;
@@ -63,8 +63,8 @@ impl Plant {
     pub fn moves(&self) -> bool {
         match self {
             Self::Registers(machine) => moves(machine.with(|machine| machine.state())),
-            Self::Dme(server) => server.with(|server| server.moves()),
-            Self::Rsh(controller) => controller.with(|controller| controller.moves()),
+            Self::Dme(server) => server.with(|server| server.is_moving()),
+            Self::Rsh(controller) => controller.with(|controller| controller.is_moving()),
         }
     }
 
@@ -75,7 +75,7 @@ impl Plant {
                 let state = machine.with(|machine| machine.state());
                 matches!(state, State::Idle | State::Complete | State::Aborted | State::Faulted)
             }
-            Self::Dme(server) => !server.with(|server| server.moves()),
+            Self::Dme(server) => !server.with(|server| server.is_moving()),
             Self::Rsh(controller) => !controller.with(|controller| controller.is_busy()),
         }
     }
@@ -99,9 +99,9 @@ impl Plant {
             Self::Registers(machine) => machine.with(|machine| machine.tick(TICK)),
             Self::Dme(server) => {
                 let now = server.now();
-                server.with(|server| server.pass(now));
+                server.with(|server| server.advance_time(now));
             }
-            Self::Rsh(controller) => controller.live(),
+            Self::Rsh(controller) => controller.advance_time(),
         }
     }
 }
@@ -130,16 +130,16 @@ impl Machines {
         let world = World::new(spec).unwrap();
         let (log, deeds, dme_faults) = (Log::default(), Deeds::default(), DmeFaults::none());
         let options = |seed| MachineOptions { speed, seed, trusting, ..MachineOptions::default() };
-        let by_registers = |number: usize, mut machine: Machine| {
+        let by_registers = |number: usize, mut machine: SimulatedMachine| {
             let (log, cues) = (log.clone(), cues.clone());
-            machine.witness(Box::new(move |seen| {
+            machine.set_observer(Box::new(move |seen| {
                 cues.see_machine(&seen.what);
                 log.lock().unwrap().push(Moment { at: Instant::now(), machine: number, what: seen.what.clone() });
             }));
             Plant::Registers(SharedMachine::from(machine))
         };
         let cmm = match &schedule.dme {
-            None => by_registers(0, Machine::new(Box::new(world.cmm()), 71, options(seed ^ 0xC))),
+            None => by_registers(0, SimulatedMachine::new(Box::new(world.cmm()), 71, options(seed ^ 0xC))),
             Some(faults) => {
                 for (method, skip, fault) in faults {
                     dme_faults.add(*method, *skip, fault.clone());
@@ -149,7 +149,7 @@ impl Machines {
         };
         let (rsh_deeds, rsh_faults) = (RshDeeds::default(), RshFaults::none());
         let grinder = match &schedule.rsh {
-            None => by_registers(1, Machine::new(Box::new(world.grinder()), 72, options(seed ^ 0x6))),
+            None => by_registers(1, SimulatedMachine::new(Box::new(world.grinder()), 72, options(seed ^ 0x6))),
             Some(faults) => {
                 for (begins, skip, fault) in faults {
                     rsh_faults.add(*begins, *skip, fault.clone());
@@ -188,22 +188,22 @@ impl Machines {
 
 /// Returns a measuring machine with a server of I++ DME.
 fn by_lines(world: &World, speed: f64, faults: DmeFaults, (log, deeds, cues): (&Log, &Deeds, &Cues)) -> SharedServer {
-    let mut server = Server::new(probe::Machine::new(world.led(), probe::Options::default()), speed, faults);
+    let mut server = Server::new(probe::DmeMachine::new(world.touch_probe(), probe::Options::default()), speed, faults);
     let (log, deeds, cues) = (log.clone(), deeds.clone(), cues.clone());
-    server.witness(Box::new(move |deed| {
+    server.set_observer(Box::new(move |deed| {
         let at = Instant::now();
         deeds.lock().unwrap().push((at, deed.clone()));
         let (from, to) = match deed {
-            Deed::Moves { command, .. } => {
+            MachineEvent::MotionStarted { command, .. } => {
                 if command == "ChangeTool" {
                     cues.begin();
                 }
                 (State::Idle, State::Execute)
             }
-            Deed::Stands { .. } => (State::Execute, State::Idle),
+            MachineEvent::MotionEnded { .. } => (State::Execute, State::Idle),
             _ => return,
         };
-        log.lock().unwrap().push(Moment { at, machine: 0, what: What::Changed { from, to } });
+        log.lock().unwrap().push(Moment { at, machine: 0, what: HandshakeEvent::Changed { from, to } });
     }));
     SharedServer::from(server)
 }
@@ -218,16 +218,16 @@ fn by_programs(
     let radius_mm = setting(Wanted::Good).recipe.grinding.wheel.radius_mm();
     let mut controller = Controller::new(world.plain_wheel(radius_mm), speed, faults);
     let (log, deeds, cues) = (log.clone(), deeds.clone(), cues.clone());
-    controller.witness(Box::new(move |deed| {
+    controller.set_observer(Box::new(move |deed| {
         let at = Instant::now();
         deeds.lock().unwrap().push((at, deed.clone()));
         let (from, to) = match deed {
-            OfRsh::Began { .. } => return cues.begin(),
-            OfRsh::Moves => (State::Idle, State::Execute),
-            OfRsh::Stands => (State::Execute, State::Idle),
+            ControllerEvent::Began { .. } => return cues.begin(),
+            ControllerEvent::MotionStarted => (State::Idle, State::Execute),
+            ControllerEvent::MotionEnded => (State::Execute, State::Idle),
             _ => return,
         };
-        log.lock().unwrap().push(Moment { at, machine: 1, what: What::Changed { from, to } });
+        log.lock().unwrap().push(Moment { at, machine: 1, what: HandshakeEvent::Changed { from, to } });
     }));
     SharedController::from(controller)
 }

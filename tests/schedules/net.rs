@@ -11,10 +11,10 @@ use std::time::Duration;
 
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
-use regrind::device::{Dial, Dialled, Line, LineStream};
+use regrind::device::{ConnectFuture, Connector, LineAddress, LineStream};
 use regrind_sim::wire::Units;
 use regrind_sim::wire::dme::SharedServer;
-use regrind_sim::wire::faults::Faults;
+use regrind_sim::wire::faults::SharedFaultPlan;
 use regrind_sim::wire::rsh::SharedController;
 use regrind_sim::wire::rtu::{Line as Pace, serve_rtu};
 use regrind_sim::wire::tcp::serve_client;
@@ -60,7 +60,7 @@ pub struct Net(Arc<Shared>);
 
 struct Shared {
     far: Far,
-    faults: Faults,
+    faults: SharedFaultPlan,
     /// A server of lines has one client at a time.
     turn: Arc<tokio::sync::Mutex<()>>,
     state: Mutex<State>,
@@ -86,7 +86,7 @@ impl fmt::Debug for Net {
 
 impl Net {
     /// Returns a network of connections, or a serial line with this number of bits per second.
-    pub fn new(far: Far, faults: Faults, baud: Option<u32>, seed: u64) -> Self {
+    pub fn new(far: Far, faults: SharedFaultPlan, baud: Option<u32>, seed: u64) -> Self {
         let turn = Arc::default();
         let chance = StdRng::seed_from_u64(seed);
         let state =
@@ -258,7 +258,7 @@ impl Net {
     }
 
     /// Returns the dialler by which a life of the program reaches the machines. Only these connections are watched.
-    pub fn dial(&self, life: &Arc<Life>, wires: Option<&(Wires, Cues)>) -> Box<dyn Dial> {
+    pub fn dial(&self, life: &Arc<Life>, wires: Option<&(Wires, Cues)>) -> Box<dyn Connector> {
         Box::new(Caller { net: self.clone(), life: life.clone(), wires: wires.cloned() })
     }
 }
@@ -270,8 +270,8 @@ struct Caller {
     wires: Option<(Wires, Cues)>,
 }
 
-impl Dial for Caller {
-    fn dial<'a>(&'a mut self, _: &'a Line) -> Dialled<'a> {
+impl Connector for Caller {
+    fn connect<'a>(&'a mut self, _: &'a LineAddress) -> ConnectFuture<'a> {
         Box::pin(async move {
             let way = self.net.way();
             tokio::time::sleep(way.unwrap_or(Duration::from_secs(60))).await;
@@ -320,7 +320,7 @@ impl fmt::Debug for Port {
 }
 
 impl LineStream for Port {
-    fn waiting(&mut self, cx: &mut Context<'_>) -> io::Result<usize> {
+    fn waiting_bytes(&mut self, cx: &mut Context<'_>) -> io::Result<usize> {
         loop {
             match self.from.poll_recv(cx) {
                 Poll::Ready(Some(bytes)) => self.ahead.extend(bytes),

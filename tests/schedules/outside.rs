@@ -6,12 +6,12 @@ use std::time::Duration;
 
 use regrind::device::{Link, Machine as _, ModbusCmm, ModbusGrinder, ModbusSettings};
 use regrind::drive::{Orders, Request};
-use regrind_sim::command::{Frame, Mode};
-use regrind_sim::options::Layout;
+use regrind_sim::command::{CommandFrame, Mode};
+use regrind_sim::options::RegisterLayout;
 use regrind_sim::rsh::Controller;
 use regrind_sim::wire::SharedMachine;
 use regrind_sim::wire::dme::SharedServer;
-use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
+use regrind_sim::wire::faults::{Fault, FaultPlan, SharedFaultPlan, When};
 use regrind_sim::wire::rsh::SharedController;
 use regrind_sim::words::WordOrder;
 use tokio::time::{Instant, sleep};
@@ -36,7 +36,7 @@ const SET_RIGHT: Duration = Duration::from_secs(3);
 pub struct Outside {
     pub plants: [Plant; 2],
     pub nets: [Net; 2],
-    pub faults: [Faults; 2],
+    pub faults: [SharedFaultPlan; 2],
     pub disk: SharedDisk,
     pub orders: Office,
     pub given: Arc<Mutex<Vec<Given>>>,
@@ -117,8 +117,9 @@ impl Outside {
             // type of line.
             Act::Stranger { aborts, .. } if !self.is_serial => self.stranger(machine, aborts).await,
             Act::HighNumber { .. } => {
-                let frame = Frame { sequence: u32::MAX - 3, command: 1, owner: 99, epoch: 1, ..Frame::default() };
-                let at = Layout::default().command;
+                let frame =
+                    CommandFrame { sequence: u32::MAX - 3, command: 1, owner: 99, epoch: 1, ..CommandFrame::default() };
+                let at = RegisterLayout::default().command;
                 // The write is acknowledged, and the command is refused.
                 let _ = of.with(|machine| machine.write(at, &frame.registers(WordOrder::Big)));
             }
@@ -154,9 +155,9 @@ impl Outside {
                 controller.with(Controller::make_ready);
             }
             Act::Manual { lasts, .. } => {
-                controller.with(|controller| controller.turn_to("MANUAL"));
+                controller.with(|controller| controller.set_mode("MANUAL"));
                 sleep(*lasts).await;
-                controller.with(|controller| controller.turn_to("AUTO"));
+                controller.with(|controller| controller.set_mode("AUTO"));
             }
             Act::Supplies { lasts, .. } => {
                 controller.with(Controller::switch_off);
@@ -196,7 +197,8 @@ impl Outside {
         let settings = ModbusSettings { owner: 99, epoch: 1, ..self.settings[which].clone() };
         let seed = self.number as u64;
         let dial = self.nets[which].dial(&life, None);
-        let link = Link::over(settings.line.clone(), settings.request_timeout, settings.quarantine, dial, seed);
+        let link =
+            Link::with_connector(settings.line.clone(), settings.request_timeout, settings.quarantine, dial, seed);
         // The command is refused if the machine has an owner that is alive; its content does not matter here.
         if which == 0 {
             let mut machine = ModbusCmm::on(link, settings);

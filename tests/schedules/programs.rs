@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 
 use regrind::cell::StateName;
-use regrind_sim::rsh::deed::Deed;
+use regrind_sim::rsh::deed::ControllerEvent;
 use tokio::time::Instant;
 
 use crate::checker::{Evidence, is_intent};
@@ -44,7 +44,7 @@ fn named(path: &str) -> Option<(&str, u64)> {
 fn begins_what_is_meant(evidence: &Evidence) -> Result<(), String> {
     let mut begun = BTreeSet::new();
     for (at, deed) in &evidence.rsh_deeds {
-        let Deed::Began { path, text } = deed else { continue };
+        let ControllerEvent::Began { path, text } = deed else { continue };
         let when = evidence.seconds(*at);
         if !begun.insert(path) {
             return Err(format!("{path} was begun twice, again at {when:.3} s"));
@@ -74,8 +74,8 @@ fn goes_on_by_an_order(evidence: &Evidence) -> Result<(), String> {
     let mut aborted: Option<Instant> = None;
     for (at, deed) in &evidence.rsh_deeds {
         match deed {
-            Deed::Aborted => aborted = Some(*at),
-            Deed::Moves => {
+            ControllerEvent::Aborted => aborted = Some(*at),
+            ControllerEvent::MotionStarted => {
                 let Some(since) = aborted.take() else { continue };
                 if !evidence.written.iter().any(|w| since <= w.at && w.at <= *at && is_intent(w, 1)) {
                     let [since, at] = [since, *at].map(|at| evidence.seconds(at));
@@ -108,14 +108,18 @@ fn paused_at_once(evidence: &Evidence) -> Result<(), String> {
     for given in
         evidence.given.iter().filter(|given| matches!(given.what, "hold" | "stop") && given.done && given.moved[1])
     {
-        let moved = evidence.rsh_deeds.iter().rfind(|(at, deed)| *at <= given.at && *deed == Deed::Moves);
+        let moved =
+            evidence.rsh_deeds.iter().rfind(|(at, deed)| *at <= given.at && *deed == ControllerEvent::MotionStarted);
         let since = moved.map_or(evidence.began, |(at, _)| *at);
         let by = given.at.max(since + SEEN_WITHIN) + HOLDS_WITHIN;
         let is_hindered = hindered.iter().any(|(from, to)| *from <= by && given.at <= *to + RECOVERS_WITHIN);
         // A restarted program first has to connect to the machines.
         let ended = evidence.shown.iter().rfind(|shown| shown.at <= by && shown.state.is_none());
         let has_met = ended.is_none_or(|ended| ended.at + RECOVERS_WITHIN < given.at);
-        let stands = evidence.rsh_deeds.iter().any(|(at, deed)| given.at <= *at && *at <= by && *deed == Deed::Stands);
+        let stands = evidence
+            .rsh_deeds
+            .iter()
+            .any(|(at, deed)| given.at <= *at && *at <= by && *deed == ControllerEvent::MotionEnded);
         let told = evidence.wires.lines.iter().any(|spoken| {
             let makes_safe = matches!(spoken.line.as_str(), "set pause" | "set abort");
             spoken.machine == 1 && makes_safe && since <= spoken.at && spoken.at <= by

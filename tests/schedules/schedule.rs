@@ -417,8 +417,8 @@ fn rsh_faults(chance: &mut StdRng) -> Vec<RshFault> {
         OfRsh::Ignored,
         OfRsh::Fails,
         OfRsh::CutBefore,
-        OfRsh::CutBehind,
-        OfRsh::Aside,
+        OfRsh::CutAfter,
+        OfRsh::UnmatchedLines,
     ];
     let mut faults = Vec::new();
     for _ in 0..[0, 0, 1, 2, 4, 8][chance.random_range(0..6)] {

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use regrind::cell::StateName;
-use regrind_sim::dme::deed::Deed;
+use regrind_sim::dme::deed::MachineEvent;
 use tokio::time::Instant;
 
 use crate::checker::{Evidence, is_intent};
@@ -42,7 +42,7 @@ pub fn check(evidence: &Evidence) -> Result<(), String> {
 /// Returns every motion that began: its command, its start and its end.
 fn motions(evidence: &Evidence) -> impl Iterator<Item = (Instant, &str, [[f64; 3]; 2])> {
     evidence.deeds.iter().filter_map(|(at, deed)| match deed {
-        Deed::Moves { command, from_mm, to_mm } => Some((*at, command.as_str(), [*from_mm, *to_mm])),
+        MachineEvent::MotionStarted { command, from_mm, to_mm } => Some((*at, command.as_str(), [*from_mm, *to_mm])),
         _ => None,
     })
 }
@@ -77,8 +77,8 @@ fn nothing_after_an_abort(evidence: &Evidence) -> Result<(), String> {
     let mut aborted = None;
     for (at, deed) in &evidence.deeds {
         match (deed, aborted) {
-            (Deed::Aborted, _) => aborted = Some(*at),
-            (Deed::Moves { command, .. }, Some(since)) => {
+            (MachineEvent::Aborted, _) => aborted = Some(*at),
+            (MachineEvent::MotionStarted { command, .. }, Some(since)) => {
                 let goes_on = |w: &Recorded| {
                     is_intent(w, 0) || w.payload["command"] == "resume_machine" && w.payload["device"] == "cmm"
                 };
@@ -98,7 +98,7 @@ fn nothing_after_an_abort(evidence: &Evidence) -> Result<(), String> {
 /// excluded: the machine does it in its own way.
 fn travels_at_the_clearance(evidence: &Evidence) -> Result<(), String> {
     let touched = evidence.deeds.iter().filter_map(|(_, deed)| match deed {
-        Deed::Touched { point_mm, .. } => Some(point_mm[2]),
+        MachineEvent::Touched { point_mm, .. } => Some(point_mm[2]),
         _ => None,
     });
     let clearance_mm = touched.fold(f64::NEG_INFINITY, f64::max) + evidence.clearance_mm;
@@ -131,7 +131,7 @@ fn measured_is_touched(evidence: &Evidence) -> Result<(), String> {
         let next = intents().find(|w| w.at > intent.at).map(|w| w.at);
         let mut last = BTreeMap::new();
         for (at, deed) in &evidence.deeds {
-            if let Deed::Touched { point_mm, centre_mm, .. } = deed
+            if let MachineEvent::Touched { point_mm, centre_mm, .. } = deed
                 && intent.at <= *at
                 && next.is_none_or(|next| *at < next)
             {

@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
 
-use regrind_sim::command::{Command, Frame};
-use regrind_sim::options::Layout;
+use regrind_sim::command::{Command, CommandFrame};
+use regrind_sim::options::RegisterLayout;
 use regrind_sim::words::WordOrder;
 use tokio::time::Instant;
 
@@ -17,7 +17,7 @@ pub struct Sent {
     /// Index of the machine: 0 is the CMM, 1 the grinder.
     pub machine: usize,
     pub command: Command,
-    pub frame: Frame,
+    pub frame: CommandFrame,
 }
 
 /// Line as it left the program, without its line end.
@@ -65,7 +65,7 @@ impl Listening {
                 self.cues.see_start();
             }
             if line.ends_with(" AbortE()") || line == "set abort" {
-                wires.sent.push(Sent { at, machine, command: Command::Abort, frame: Frame::default() });
+                wires.sent.push(Sent { at, machine, command: Command::Abort, frame: CommandFrame::default() });
             }
             wires.lines.push(Spoken { at, machine, line });
         }
@@ -102,7 +102,7 @@ impl Watched {
         self.open = Some(Vec::new());
         let Some((unit, pdu)) = self.parts(request) else { return self.wrong(format!("it sends {request:?}")) };
         let Some(address) = pdu.get(1..3).map(|pair| u16::from_be_bytes([pair[0], pair[1]])) else { return };
-        let layout = Layout::default();
+        let layout = RegisterLayout::default();
         match pdu[0] {
             16 if address == layout.sync => drop(self.being_proven.insert(unit)),
             3 if address == layout.sync && self.being_proven.contains(&unit) => drop(self.proven.insert(unit)),
@@ -118,8 +118,8 @@ impl Watched {
 
     fn commands(&mut self, unit: u8, bytes: &[u8]) {
         let words: Vec<u16> = bytes.chunks_exact(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect();
-        let frame = <[u16; 20]>::try_from(words).ok().and_then(|words| Frame::read(WordOrder::Big, &words));
-        let Some((frame, command)) = frame.and_then(|frame| Some((frame, Command::of(frame.command)?))) else {
+        let frame = <[u16; 20]>::try_from(words).ok().and_then(|words| CommandFrame::read(WordOrder::Big, &words));
+        let Some((frame, command)) = frame.and_then(|frame| Some((frame, Command::from_number(frame.command)?))) else {
             return self.wrong("it commands what is no command".to_owned());
         };
         if !self.proven.contains(&unit) {

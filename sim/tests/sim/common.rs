@@ -1,7 +1,7 @@
 //! A client in a few lines: payloads, whole jobs, and what is left of a deviation when the part may be moved.
 #![allow(dead_code)]
 
-use regrind_sim::body::{Body, Outcome, Payload, Payloads};
+use regrind_sim::body::{Payload, Payloads, Physics, ResultData};
 use regrind_sim::part::{Aperture, PartSpec, ShapeSpec};
 use regrind_sim::payload::{Feature, Map, Pass, PassRecord, Plan, PointRecord, Target, decode_points};
 use regrind_sim::process::Grinder;
@@ -68,7 +68,7 @@ pub fn cmm_payloads(plan: &Plan) -> Payloads {
 }
 
 /// Goes on in steps until the machine has finished; panics on a fault.
-pub fn run(machine: &mut impl Body, step_s: f64) {
+pub fn run(machine: &mut impl Physics, step_s: f64) {
     while !{
         let progress = machine.advance(step_s);
         assert_eq!(progress.fault, 0);
@@ -81,7 +81,7 @@ pub fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass
     grinder.prepare(job, cycle, &grinder_payloads(map, pass)).unwrap();
     grinder.begin();
     run(grinder, 7.0);
-    PassRecord::decode(&grinder.outcome(1).bytes).unwrap()
+    PassRecord::decode(&grinder.end_job(1).bytes).unwrap()
 }
 
 /// A plan for places over the nominal surface of a world, touched along the normals.
@@ -102,11 +102,11 @@ pub fn plan(world: &World, places_mm: &[[f64; 2]]) -> Plan {
 }
 
 /// A whole measurement.
-pub fn measure(cmm: &mut impl Body, plan: &Plan) -> (Outcome, Vec<PointRecord>) {
+pub fn measure(cmm: &mut impl Physics, plan: &Plan) -> (ResultData, Vec<PointRecord>) {
     cmm.prepare(1, 0, &cmm_payloads(plan)).unwrap();
     cmm.begin();
     run(cmm, 100.0);
-    let outcome = cmm.outcome(1);
+    let outcome = cmm.end_job(1);
     let records = decode_points(&outcome.bytes, (outcome.format == 2).then_some(outcome.scale_mm)).unwrap();
     (outcome, records)
 }

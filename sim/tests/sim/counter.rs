@@ -3,11 +3,11 @@
 
 use std::sync::{Arc, Mutex};
 
-use regrind_sim::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
+use regrind_sim::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
 use regrind_sim::command::interlock;
 
 /// What the handshake asked of the physics, in order, but for the time that passed.
-pub type Asked = Arc<Mutex<Vec<String>>>;
+pub type RecordedCalls = Arc<Mutex<Vec<String>>>;
 
 /// A job is a number of seconds; a payload whose first byte is 0xEE is of another part.
 pub struct Counter {
@@ -16,7 +16,7 @@ pub struct Counter {
     pub done_s: f64,
     pub fault: Arc<Mutex<u16>>,
     pub interlocks: Arc<Mutex<u16>>,
-    pub asked: Asked,
+    pub calls: RecordedCalls,
     pub got: Arc<Mutex<Payloads>>,
     pub duration_s: f64,
 }
@@ -29,14 +29,14 @@ impl Counter {
             done_s: 0.0,
             fault: Arc::default(),
             interlocks: Arc::new(Mutex::new(interlock::ALL)),
-            asked: Arc::default(),
+            calls: Arc::default(),
             got: Arc::default(),
             duration_s: f64::NAN,
         }
     }
 
-    fn ask(&self, what: impl Into<String>) {
-        self.asked.lock().unwrap().push(what.into());
+    fn record_call(&self, what: impl Into<String>) {
+        self.calls.lock().unwrap().push(what.into());
     }
 
     fn progress(&self) -> Progress {
@@ -49,7 +49,7 @@ impl Counter {
     }
 }
 
-impl Body for Counter {
+impl Physics for Counter {
     fn kind(&self) -> Kind {
         self.kind
     }
@@ -76,7 +76,7 @@ impl Body for Counter {
 
     fn begin(&mut self) {
         self.duration_s = 0.0;
-        self.ask("begin");
+        self.record_call("begin");
     }
 
     fn advance(&mut self, seconds: f64) -> Progress {
@@ -87,16 +87,16 @@ impl Body for Counter {
     }
 
     fn retract(&mut self) {
-        self.ask("retract");
+        self.record_call("retract");
     }
 
-    fn outcome(&mut self, result: u16) -> Outcome {
-        self.ask(format!("outcome {result}"));
+    fn end_job(&mut self, result: u16) -> ResultData {
+        self.record_call(format!("outcome {result}"));
         let (kind, format, bytes, records) = match self.kind {
             Kind::Cmm => (4, 2, (0..31 * 20).map(|i| i as u8).collect::<Vec<u8>>(), 31),
             Kind::Grinder => (5, 1, (100..164).collect(), 1),
         };
-        Outcome {
+        ResultData {
             kind,
             format,
             bytes,

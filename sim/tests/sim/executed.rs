@@ -1,7 +1,7 @@
 //! The wheel along a path that somebody else executes, against what can be worked out by hand and against the grinder that makes its own.
 
 use crate::common::{grind, net, pass, small_perfect, zero_map};
-use regrind_sim::cmm::Touch;
+use regrind_sim::cmm::TouchResult;
 use regrind_sim::spec::{GrinderSpec, WorldSpec};
 use regrind_sim::world::World;
 
@@ -14,7 +14,7 @@ fn sweep(world: &World, spacing_mm: f64, height_mm: f64, tracks: impl Iterator<I
     let mut clock = 0.0;
     let mut to = |wheel: &mut regrind_sim::executed::Wheel, place: [f64; 3]| {
         clock += 1e-3;
-        wheel.at(place, clock);
+        wheel.move_to(place, clock);
     };
     let above = |x: f64, y: f64, over_mm: f64| {
         let (point, n) = world.nominal(x, y);
@@ -27,7 +27,7 @@ fn sweep(world: &World, spacing_mm: f64, height_mm: f64, tracks: impl Iterator<I
         (0..=170).filter(|k| way(*k) <= until_x_mm).for_each(|k| to(&mut wheel, above(way(k), y, height_mm)));
         to(&mut wheel, above(way(170).min(until_x_mm), y, 20.0));
     }
-    wheel.settle();
+    wheel.finish_waiting_track();
 }
 
 fn over(world: &World, half_mm: [f64; 2]) -> Vec<f64> {
@@ -42,7 +42,7 @@ fn the_surface_stands_where_the_path_has_it() {
         sweep(&world, spacing_mm, 0.013, 0..(20.0 / spacing_mm).round() as u32, 99.0);
         let off = over(&world, [14.9, 9.9]).iter().fold(0.0, |most: f64, h| most.max((h - 0.013).abs()));
         assert!(off < 1e-9, "{off} mm at {spacing_mm} mm");
-        let [pass] = world.sweeps()[..] else { panic!("one pass") };
+        let [pass] = world.executed_passes()[..] else { panic!("one pass") };
         assert_eq!((pass.strokes, pass.strokes_in_air), (1.0, 0.0), "nothing twice, and nothing left out");
         assert!((pass.spacing_mm - spacing_mm).abs() < 1e-9, "{pass:?}");
     }
@@ -92,37 +92,37 @@ fn a_wheel_that_nobody_knows_the_place_of_grinds_nothing() {
     let world = World::new(small_perfect()).unwrap();
     let mut wheel = world.wheel(RADIUS_MM).unwrap();
     for k in 0..100 {
-        wheel.at([0.0, 0.0, 12.5], f64::from(k) * 1e-3);
-        wheel.away();
+        wheel.move_to([0.0, 0.0, 12.5], f64::from(k) * 1e-3);
+        wheel.set_position_unknown();
     }
-    assert!(world.sweeps().is_empty() && world.deviation_mm(0.0, 0.0) > 0.199);
+    assert!(world.executed_passes().is_empty() && world.deviation_mm(0.0, 0.0) > 0.199);
 }
 
 #[test]
 fn a_part_of_which_nobody_knows_how_it_is_is_not_measured() {
     let touched = |world: &World| {
         let (point, normal) = world.nominal(0.0, 0.0);
-        world.led().touch(point, normal, [1.5, 2.0, 2.0])
+        world.touch_probe().touch(point, normal, [1.5, 2.0, 2.0])
     };
     let world = World::new(small_perfect()).unwrap();
-    assert!(matches!(touched(&world), Touch::Centre(_)));
+    assert!(matches!(touched(&world), TouchResult::Centre(_)));
     let mut wheel = world.wheel(RADIUS_MM).unwrap();
-    wheel.at([0.0, 0.0, 90.0], 0.0);
-    wheel.lost();
-    assert_eq!(touched(&world), Touch::Unexpected);
+    wheel.move_to([0.0, 0.0, 90.0], 0.0);
+    wheel.path_lost();
+    assert_eq!(touched(&world), TouchResult::Unexpected);
     // And one that the wheel was driven into.
     let world = World::new(small_perfect()).unwrap();
     let mut wheel = world.wheel(RADIUS_MM).unwrap();
-    wheel.at([0.0, 0.0, 90.0], 0.0);
-    wheel.at([0.0, 0.0, 5.0], 0.1);
-    assert_eq!(touched(&world), Touch::Unexpected);
+    wheel.move_to([0.0, 0.0, 90.0], 0.0);
+    wheel.move_to([0.0, 0.0, 5.0], 0.1);
+    assert_eq!(touched(&world), TouchResult::Unexpected);
     // Where the wheel is, no probe is.
     let world = World::new(small_perfect()).unwrap();
     let mut wheel = world.wheel(RADIUS_MM).unwrap();
-    wheel.at([0.0, 0.0, 90.0], 0.0);
-    wheel.at([0.0, 0.0, 12.55], 0.1);
-    assert_eq!(touched(&world), Touch::Unexpected);
-    wheel.at([0.0, 0.0, 90.0], 0.2);
-    assert!(matches!(touched(&world), Touch::Centre(_)));
+    wheel.move_to([0.0, 0.0, 90.0], 0.0);
+    wheel.move_to([0.0, 0.0, 12.55], 0.1);
+    assert_eq!(touched(&world), TouchResult::Unexpected);
+    wheel.move_to([0.0, 0.0, 90.0], 0.2);
+    assert!(matches!(touched(&world), TouchResult::Centre(_)));
     assert!(world.wheel(0.0).is_err());
 }

@@ -1,11 +1,11 @@
 //! The grinder against what can be worked out by hand.
 
 use crate::common::{NOMINAL, grind, grinder_payloads, map_of, net, pass, run, small_perfect, zero_map};
-use regrind_sim::body::Body;
+use regrind_sim::body::Physics;
 use regrind_sim::part::{PartSpec, ShapeSpec};
 use regrind_sim::payload::{Pass, PassRecord};
 use regrind_sim::spec::GrinderSpec;
-use regrind_sim::spec::{Faults, Mirrored, WorldSpec};
+use regrind_sim::spec::{Mirrored, WorldFaults, WorldSpec};
 use regrind_sim::world::World;
 
 const HALF_MM: [f64; 2] = [15.0, 10.0];
@@ -49,7 +49,7 @@ fn the_record_agrees_with_area_path_and_time() {
     grinder.prepare(4, 2, &grinder_payloads(&zero_map(HALF_MM), &deep(0.15))).unwrap();
     grinder.begin();
     run(&mut grinder, 1.0);
-    let outcome = grinder.outcome(1);
+    let outcome = grinder.end_job(1);
     let record = PassRecord::decode(&outcome.bytes).unwrap();
     // 33 mm of track with overtravel, 24 tracks 1 mm apart, at 1500 mm/min.
     let path_mm = 24.0 * 33.0 + 23.0;
@@ -84,17 +84,17 @@ fn a_share_of_what_stood_proud_stays_and_spark_out_takes_it_again() {
 #[test]
 fn a_map_displaces_the_surface_by_what_it_says() {
     let slope = |x: f64, y: f64| 1e-4 * x + 2e-4 * y;
-    let mirrored = |map_mirrored| Faults { map_mirrored, ..Faults::default() };
-    type Case = (Faults, f64, fn([f64; 2]) -> [f64; 2]);
+    let mirrored = |map_mirrored| WorldFaults { map_mirrored, ..WorldFaults::default() };
+    type Case = (WorldFaults, f64, fn([f64; 2]) -> [f64; 2]);
     let cases: [Case; 8] = [
-        (Faults::default(), 1.0, |at| at),
-        (Faults { map_sign_flipped: true, ..Faults::default() }, -1.0, |at| at),
+        (WorldFaults::default(), 1.0, |at| at),
+        (WorldFaults { map_sign_flipped: true, ..WorldFaults::default() }, -1.0, |at| at),
         (mirrored(Mirrored::X), 1.0, |[x, y]| [-x, y]),
         (mirrored(Mirrored::Y), 1.0, |[x, y]| [x, -y]),
         (mirrored(Mirrored::HalfTurn), 1.0, |[x, y]| [-x, -y]),
         (mirrored(Mirrored::QuarterTurn), 1.0, |[x, y]| [-y, x]),
-        (Faults { map_doubled: true, ..Faults::default() }, 2.0, |at| at),
-        (Faults { map_ignored: true, ..Faults::default() }, 0.0, |at| at),
+        (WorldFaults { map_doubled: true, ..WorldFaults::default() }, 2.0, |at| at),
+        (WorldFaults { map_ignored: true, ..WorldFaults::default() }, 0.0, |at| at),
     ];
     for (faults, times, turned) in cases {
         let world = world(WorldSpec { faults: faults.clone(), ..small_perfect() });
@@ -178,7 +178,7 @@ fn between_the_tracks_ridges_stand_where_the_wheel_has_cut() {
     grinder.begin();
     grinder.advance((24.0 * 33.0 + 23.0) / 50.0);
     grinder.retract();
-    grinder.outcome(3);
+    grinder.end_job(3);
     // Tracks lie 1 mm apart from -11.5 mm; the first half of them has been ground. h = t^2 / (8 r), and a parabola between.
     let ridge_mm = 1.0 / (8.0 * wheel_mm);
     let stands = |y: f64, height_mm: f64| {
@@ -210,7 +210,7 @@ fn an_abort_leaves_a_half_ground_part() {
     assert!((499..=501).contains(&progress.done) && !progress.finished, "{progress:?}");
     grinder.retract();
     assert_eq!(grinder.interlocks() & 2, 2);
-    let record = PassRecord::decode(&grinder.outcome(3).bytes).unwrap();
+    let record = PassRecord::decode(&grinder.end_job(3).bytes).unwrap();
     assert_eq!((record.result, world.history()[0].result), (3, 3));
     assert!((record.path_mm - total_s / 2.0 * 25.0).abs() < 1e-9);
     assert!((world.deviation_mm(0.0, -6.0) - 0.1).abs() < 1e-15);
@@ -230,7 +230,7 @@ fn the_same_seed_gives_the_same_run_in_whatever_steps() {
             grinder.prepare(1, cycle, &payloads).unwrap();
             grinder.begin();
             run(&mut grinder, step_s);
-            seen.push(grinder.outcome(1).bytes);
+            seen.push(grinder.end_job(1).bytes);
             cmm.prepare(
                 1,
                 cycle,
@@ -239,7 +239,7 @@ fn the_same_seed_gives_the_same_run_in_whatever_steps() {
             .unwrap();
             cmm.begin();
             run(&mut cmm, step_s);
-            seen.push(cmm.outcome(1).bytes);
+            seen.push(cmm.end_job(1).bytes);
         }
         (seen, world.deviations_mm(&places()))
     };
@@ -284,7 +284,7 @@ fn what_does_not_fit_is_refused_and_nothing_moves() {
     assert!(world.history().is_empty());
     assert_eq!(answer(&mut grinder, &map, &good), 0);
     let holds_another = crate::common::small_perfect();
-    let faults = Faults { wrong_part: true, ..Faults::default() };
+    let faults = WorldFaults { wrong_part: true, ..WorldFaults::default() };
     let other = World::new(WorldSpec { faults, ..holds_another }).unwrap();
     assert_eq!(answer(&mut other.grinder(), &map, &good), 8);
 }
@@ -323,7 +323,7 @@ fn the_two_machines_exclude_each_other() {
     assert_eq!(cmm.prepare(1, 0, &plan).unwrap_err().answer, 9);
     grinder.retract();
     assert_eq!((grinder.interlocks(), cmm.interlocks()), (15, 11), "held, the part is still in the grinder");
-    grinder.outcome(2);
+    grinder.end_job(2);
     assert_eq!(cmm.interlocks(), 15);
     cmm.prepare(1, 0, &plan).unwrap();
     cmm.begin();

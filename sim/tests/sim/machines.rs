@@ -3,18 +3,18 @@
 use std::time::Duration;
 
 use crate::common::{net, pass, plan, small_perfect, zero_map};
-use regrind_sim::body::Body;
-use regrind_sim::command::{Answer, Command, Frame, State};
+use regrind_sim::body::Physics;
+use regrind_sim::command::{Answer, Command, CommandFrame, State};
 use regrind_sim::options::MachineOptions;
 use regrind_sim::payload::{PassRecord, decode_points};
-use regrind_sim::registers::Machine;
+use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::words::{WordOrder, bytes_of, registers_of, turn_payload};
 use regrind_sim::world::World;
 
 const HALF_MM: [f64; 2] = [15.0, 10.0];
 
 struct Desk {
-    machine: Machine,
+    machine: SimulatedMachine,
     order: WordOrder,
     digest: u32,
     sequence: u32,
@@ -22,13 +22,13 @@ struct Desk {
 }
 
 impl Desk {
-    fn new(body: impl Body + 'static, order: WordOrder, payloads: Vec<(u16, Vec<u8>)>) -> Self {
+    fn new(body: impl Physics + 'static, order: WordOrder, payloads: Vec<(u16, Vec<u8>)>) -> Self {
         Self::with(body, MachineOptions { word_order: order, ..MachineOptions::default() }, payloads)
     }
 
-    fn with(body: impl Body + 'static, options: MachineOptions, payloads: Vec<(u16, Vec<u8>)>) -> Self {
+    fn with(body: impl Physics + 'static, options: MachineOptions, payloads: Vec<(u16, Vec<u8>)>) -> Self {
         let (order, options) = (options.word_order, MachineOptions { speed: 200.0, ..options });
-        let machine = Machine::new(Box::new(body), 5, options);
+        let machine = SimulatedMachine::new(Box::new(body), 5, options);
         let identities: Vec<u8> = payloads.iter().flat_map(|(kind, _)| [*kind as u8; 32]).collect();
         let mut desk = Self { machine, order, digest: crc32fast::hash(&identities), sequence: 0, beat: 0 };
         for (kind, bytes) in payloads {
@@ -64,7 +64,7 @@ impl Desk {
 
     fn command(&mut self, command: Command, expected: Answer) {
         self.sequence += 1;
-        let frame = Frame {
+        let frame = CommandFrame {
             sequence: self.sequence,
             command: command as u16,
             cycle: 1,

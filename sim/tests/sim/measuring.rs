@@ -2,11 +2,11 @@
 
 use crate::common::{cmm_payloads, measure, net, plan, run, small_perfect};
 use regrind_sim::Vec3;
-use regrind_sim::body::Body;
+use regrind_sim::body::Physics;
 use regrind_sim::part::{Aperture, PartSpec, ShapeSpec};
 use regrind_sim::payload::{Feature, Plan, Status, Target, decode_points};
 use regrind_sim::spec::CmmSpec;
-use regrind_sim::spec::{Faults, WorldSpec};
+use regrind_sim::spec::{WorldFaults, WorldSpec};
 use regrind_sim::world::World;
 
 fn world(spec: WorldSpec) -> World {
@@ -82,14 +82,14 @@ fn nothing_is_found_beyond_the_edge_or_without_a_part() {
     plan.approach_mm = 0.1;
     // The stock of 0.2 mm stands in the way of an approach to 0.1 mm.
     assert_eq!(statuses(&beyond, &plan)[0].0, Status::NotReached);
-    let faults = Faults { no_part: true, ..Faults::default() };
+    let faults = WorldFaults { no_part: true, ..WorldFaults::default() };
     let bare = world(WorldSpec { faults, ..small_perfect() });
     assert!(statuses(&bare, &plan).iter().all(|(status, _)| *status == Status::NotFound));
 }
 
 #[test]
 fn a_part_turned_round_stops_the_machine_or_reads_quite_wrong() {
-    let faults = Faults { part_turned_180: true, ..Faults::default() };
+    let faults = WorldFaults { part_turned_180: true, ..WorldFaults::default() };
     let world = world(WorldSpec { faults, ..WorldSpec::default() });
     let mut cmm = world.cmm();
     let plan = plan(&world, &net([49.0, 29.0], 2.0));
@@ -98,7 +98,7 @@ fn a_part_turned_round_stops_the_machine_or_reads_quite_wrong() {
     let progress = cmm.advance(1e6);
     assert_eq!((progress.fault, progress.finished), (2, false), "{progress:?}");
     assert_eq!(cmm.interlocks() & 2, 2, "the probe is clear after the stop");
-    let outcome = cmm.outcome(4);
+    let outcome = cmm.end_job(4);
     let records = decode_points(&outcome.bytes, None).unwrap();
     assert_eq!(records.len(), plan.targets.len(), "a record for every target, reached or not");
     assert!(records.iter().filter(|r| r.status == Status::NotReached).count() > 20);
@@ -149,7 +149,7 @@ fn a_loading_shifts_the_part_and_lying_still_does_not() {
 #[test]
 fn faults_show_in_the_points_as_they_should() {
     let spec = small_perfect();
-    let read = |faults: Faults, scaled: bool| {
+    let read = |faults: WorldFaults, scaled: bool| {
         let mut spec = WorldSpec { faults, ..spec.clone() };
         spec.cmm.scaled_points = scaled;
         let world = world(spec);
@@ -158,32 +158,32 @@ fn faults_show_in_the_points_as_they_should() {
         cmm.prepare(1, 0, &cmm_payloads(&plan)).unwrap();
         cmm.begin();
         run(&mut cmm, 1.0);
-        (cmm.outcome(1), plan)
+        (cmm.end_job(1), plan)
     };
-    let (plain, plan) = read(Faults::default(), false);
+    let (plain, plan) = read(WorldFaults::default(), false);
     let truth = decode_points(&plain.bytes, None).unwrap();
-    let (scaled, _) = read(Faults::default(), true);
+    let (scaled, _) = read(WorldFaults::default(), true);
     assert_eq!((scaled.format, scaled.scale_mm, scaled.bytes.len()), (2, 1e-6, 60));
     for (a, b) in decode_points(&scaled.bytes, Some(1e-6)).unwrap().iter().zip(&truth) {
         assert!(distance(a.position_mm, b.position_mm) < 1e-6);
     }
-    let (inches, _) = read(Faults { inches: true, ..Faults::default() }, false);
+    let (inches, _) = read(WorldFaults { inches: true, ..WorldFaults::default() }, false);
     for (a, b) in decode_points(&inches.bytes, None).unwrap().iter().zip(&truth) {
         assert!(distance(a.position_mm.map(|c| c * 25.4), b.position_mm) < 1e-12);
     }
-    let contact = Faults { returns_contact_points: true, ..Faults::default() };
+    let contact = WorldFaults { returns_contact_points: true, ..WorldFaults::default() };
     let (lying, _) = read(contact.clone(), false);
-    let (honest, _) = read(Faults { contact_points_declared: true, ..contact }, false);
+    let (honest, _) = read(WorldFaults { contact_points_declared: true, ..contact }, false);
     assert_eq!((lying.coordinates, honest.coordinates), (1, 2));
     for ((a, b), target) in decode_points(&lying.bytes, None).unwrap().iter().zip(&truth).zip(&plan.targets) {
         let back: Vec3 = std::array::from_fn(|i| b.position_mm[i] - 1.5 * target.normal[i]);
         assert!(distance(a.position_mm, back) < 1e-12);
     }
-    let (short, _) = read(Faults { missing_records: 2, ..Faults::default() }, false);
+    let (short, _) = read(WorldFaults { missing_records: 2, ..WorldFaults::default() }, false);
     assert_eq!((short.records, short.bytes.len()), (1, 32));
-    let (none, _) = read(Faults { missing_records: 99, non_finite_point: true, ..Faults::default() }, false);
+    let (none, _) = read(WorldFaults { missing_records: 99, non_finite_point: true, ..WorldFaults::default() }, false);
     assert_eq!((none.records, none.bytes.len()), (0, 0));
-    let (nan, _) = read(Faults { non_finite_point: true, ..Faults::default() }, false);
+    let (nan, _) = read(WorldFaults { non_finite_point: true, ..WorldFaults::default() }, false);
     assert!(f64::from_be_bytes(nan.bytes[40..48].try_into().unwrap()).is_nan());
     assert_eq!(decode_points(&nan.bytes, None).unwrap_err().answer, 8);
 }
@@ -218,7 +218,7 @@ fn a_stopped_measurement_says_so_of_every_target() {
     assert_eq!(cmm.interlocks(), 15);
     cmm.advance(1.0);
     assert_eq!(cmm.interlocks(), 13);
-    let outcome = cmm.outcome(2);
+    let outcome = cmm.end_job(2);
     let records = decode_points(&outcome.bytes, None).unwrap();
     assert_eq!((records.len(), outcome.duration_s), (15, 5.5));
     assert_eq!(records.iter().filter(|r| r.status == Status::Touched).count(), 5);

@@ -4,10 +4,10 @@ use std::time::Duration;
 
 use crate::counter::{Counter, digest, payloads};
 use regrind_sim::body::Kind;
-use regrind_sim::command::{Answer, Command, Frame, Mode, State, interlock};
-use regrind_sim::options::{Layout, MachineOptions};
-use regrind_sim::registers::{Exception, Machine};
-use regrind_sim::seen::{Beats, What};
+use regrind_sim::command::{Answer, Command, CommandFrame, Mode, State, interlock};
+use regrind_sim::options::{MachineOptions, RegisterLayout};
+use regrind_sim::registers::{Exception, SimulatedMachine};
+use regrind_sim::seen::{BeatStatistics, HandshakeEvent};
 use regrind_sim::words::{WordOrder, bytes_of, registers_of, turn_payload};
 
 const MS: Duration = Duration::from_millis(1);
@@ -15,7 +15,7 @@ const S: Duration = Duration::from_secs(1);
 
 /// A client at a machine's registers.
 struct Desk {
-    machine: Machine,
+    machine: SimulatedMachine,
     order: WordOrder,
     kind: Kind,
     sequence: u32,
@@ -25,7 +25,7 @@ struct Desk {
 }
 
 /// Something that happens at a desk.
-type Deed = fn(&mut Desk);
+type ClientAction = fn(&mut Desk);
 
 /// The status block, read.
 #[derive(Debug, PartialEq)]
@@ -54,7 +54,7 @@ struct Status {
 impl Desk {
     fn at(body: Counter, options: MachineOptions) -> Self {
         let (order, kind) = (options.word_order, body.kind);
-        let machine = Machine::new(Box::new(body), 77, options);
+        let machine = SimulatedMachine::new(Box::new(body), 77, options);
         Self { machine, order, kind, sequence: 100, owner: 9, epoch: 1, beat: 0 }
     }
 
@@ -133,10 +133,10 @@ impl Desk {
     }
 
     /// The frame of a command as the client would fill it in now, with the next number.
-    fn frame(&mut self, command: Command) -> Frame {
+    fn frame(&mut self, command: Command) -> CommandFrame {
         self.sequence += 1;
         let status = self.status();
-        Frame {
+        CommandFrame {
             sequence: self.sequence,
             command: command as u16,
             cycle: 2,
@@ -149,7 +149,7 @@ impl Desk {
         }
     }
 
-    fn put(&mut self, frame: Frame) -> u16 {
+    fn put(&mut self, frame: CommandFrame) -> u16 {
         self.machine.write(40, &frame.registers(self.order)).unwrap();
         self.status().answer
     }
@@ -309,7 +309,7 @@ fn addresses_outside_the_blocks_are_refused() {
 
 #[test]
 fn blocks_may_be_moved() {
-    let layout = Layout { identity: 1000, status: 2000, ..Layout::default() };
+    let layout = RegisterLayout { identity: 1000, status: 2000, ..RegisterLayout::default() };
     let mut desk = Desk::at(Counter::new(Kind::Cmm, 1.0), MachineOptions { layout, ..MachineOptions::default() });
     assert_eq!(desk.read(1000, 1), [0x5247]);
     assert_eq!(desk.read(2001, 1), [1]);
@@ -321,7 +321,7 @@ fn a_whole_job_runs_on_each_kind_of_machine_in_each_order() {
     for kind in [Kind::Cmm, Kind::Grinder] {
         for order in [WordOrder::Big, WordOrder::Little] {
             let body = Counter::new(kind, 5.0);
-            let (asked, got) = (body.asked.clone(), body.got.clone());
+            let (asked, got) = (body.calls.clone(), body.got.clone());
             let options = MachineOptions { word_order: order, speed: 2.0, ..MachineOptions::default() };
             let mut desk = Desk::at(body, options);
             desk.get_ready();
@@ -450,7 +450,7 @@ fn in_every_state_a_stranger_may_only_abort() {
 fn an_unknown_command_is_answered_so() {
     for command in [0, 11, 0xFFFF] {
         let mut desk = Desk::ready(Kind::Cmm);
-        let frame = Frame { command, ..desk.frame(Command::Prepare) };
+        let frame = CommandFrame { command, ..desk.frame(Command::Prepare) };
         assert_eq!(desk.put(frame), Answer::Unknown as u16);
     }
 }
@@ -472,9 +472,11 @@ fn a_command_written_again_changes_nothing() {
     desk.put(frame);
     assert_eq!(desk.machine.state(), State::Idle, "an old frame is not looked at");
     assert_eq!(desk.machine.began(), [(frame.sequence, 41, 2)]);
-    let repeats = desk.machine.log().iter().filter(|s| matches!(s.what, What::Repeated { .. })).count();
+    let repeats = desk.machine.log().iter().filter(|s| matches!(s.what, HandshakeEvent::Repeated { .. })).count();
     assert_eq!(repeats, 5);
-    assert!(matches!(desk.machine.log().last().unwrap().what, What::Old { sequence } if sequence == frame.sequence));
+    assert!(
+        matches!(desk.machine.log().last().unwrap().what, HandshakeEvent::Old { sequence } if sequence == frame.sequence)
+    );
 }
 
 #[test]
@@ -494,7 +496,7 @@ fn a_frame_that_is_not_sound_is_not_looked_at() {
             desk = Desk::ready(Kind::Cmm);
         }
     }
-    let zero = Frame { sequence: 0, ..sound };
+    let zero = CommandFrame { sequence: 0, ..sound };
     desk.put(zero);
     assert_eq!(desk.status(), before);
 }
@@ -516,15 +518,15 @@ fn start_needs_the_token_the_job_the_cycle_and_the_digest() {
     desk.accept(Command::Prepare);
     let good = desk.frame(Command::Start);
     let wrong = [
-        (Frame { token: good.token ^ 1, ..good }, Answer::Token),
-        (Frame { token: 0, ..good }, Answer::Token),
-        (Frame { job: 42, ..good }, Answer::Different),
-        (Frame { cycle: 3, ..good }, Answer::Different),
-        (Frame { digest: good.digest ^ 1, ..good }, Answer::Different),
+        (CommandFrame { token: good.token ^ 1, ..good }, Answer::Token),
+        (CommandFrame { token: 0, ..good }, Answer::Token),
+        (CommandFrame { job: 42, ..good }, Answer::Different),
+        (CommandFrame { cycle: 3, ..good }, Answer::Different),
+        (CommandFrame { digest: good.digest ^ 1, ..good }, Answer::Different),
     ];
     for (frame, answer) in wrong {
         desk.sequence += 1;
-        assert_eq!(desk.put(Frame { sequence: desk.sequence, ..frame }), answer as u16, "{frame:?}");
+        assert_eq!(desk.put(CommandFrame { sequence: desk.sequence, ..frame }), answer as u16, "{frame:?}");
         assert_eq!(desk.machine.state(), State::Prepared);
     }
     desk.accept(Command::Start);
@@ -542,7 +544,7 @@ fn a_payload_that_changes_after_prepare_stops_the_start() {
 
 #[test]
 fn a_token_dies() {
-    let kills: [(&str, Deed); 6] = [
+    let kills: [(&str, ClientAction); 6] = [
         ("HOLD", |desk| assert_eq!(desk.command(Command::Hold), Answer::NotAllowed as u16)),
         ("CLAIM", |desk| desk.accept(Command::Claim)),
         ("ABORT", |desk| desk.accept(Command::Abort)),
@@ -585,7 +587,7 @@ fn a_token_lives_for_thirty_seconds() {
 
 #[test]
 fn a_job_and_cycle_begin_once_whatever_became_of_them() {
-    let ends: [(&str, Deed); 4] = [
+    let ends: [(&str, ClientAction); 4] = [
         ("complete", |desk| {
             desk.wait(6 * S);
             desk.accept(Command::Acknowledge);
@@ -634,10 +636,10 @@ fn prepare_says_what_is_wrong() {
     assert_eq!(desk.command(Command::Prepare), Answer::Payload as u16, "no pass in force");
     desk.get_ready();
     let prepare = desk.frame(Command::Prepare);
-    assert_eq!(desk.put(Frame { digest: 1, ..prepare }), Answer::Different as u16);
+    assert_eq!(desk.put(CommandFrame { digest: 1, ..prepare }), Answer::Different as u16);
     for (change, answer) in [(666, Answer::Limits), (0, Answer::Different)] {
         let frame = desk.frame(Command::Prepare);
-        assert_eq!(desk.put(Frame { job: change, ..frame }), answer as u16, "job {change}");
+        assert_eq!(desk.put(CommandFrame { job: change, ..frame }), answer as u16, "job {change}");
     }
     for bit in [interlock::GUARDS, interlock::CLEAR, interlock::CLAMPED, interlock::SUPPLIES] {
         desk.machine.open_interlocks(bit);
@@ -710,7 +712,7 @@ fn a_stopped_job_leaves_what_it_has_and_an_aborted_one_nothing() {
 fn acknowledge_must_name_the_job() {
     let mut desk = Desk::in_state(State::Complete);
     let good = desk.frame(Command::Acknowledge);
-    assert_eq!(desk.put(Frame { argument: good.argument + 1, ..good }), Answer::Argument as u16);
+    assert_eq!(desk.put(CommandFrame { argument: good.argument + 1, ..good }), Answer::Argument as u16);
     assert_eq!(desk.machine.state(), State::Complete);
     desk.accept(Command::Acknowledge);
 }
@@ -834,7 +836,7 @@ fn what_opens_while_it_moves_is_a_fault() {
 #[test]
 fn a_fault_of_the_physics_ends_the_job() {
     let body = Counter::new(Kind::Cmm, 5.0);
-    let (fault, asked) = (body.fault.clone(), body.asked.clone());
+    let (fault, asked) = (body.fault.clone(), body.calls.clone());
     let mut desk = Desk::at(body, MachineOptions::default());
     desk.get_ready();
     desk.accept(Command::Prepare);
@@ -988,11 +990,11 @@ fn the_log_tells_a_job_from_end_to_end() {
         .log()
         .iter()
         .map(|seen| match &seen.what {
-            What::Commanded { frame, answer, .. } => format!("{} {answer:?}", frame.command),
-            What::Changed { from, to } => format!("{from:?} {to:?}"),
-            What::Began { start: by, job, cycle } => format!("began {} {job} {cycle}", by - start),
-            What::Ended { result, .. } => format!("ended {result}"),
-            What::Taken { kind, .. } => format!("taken {kind}"),
+            HandshakeEvent::Commanded { frame, answer, .. } => format!("{} {answer:?}", frame.command),
+            HandshakeEvent::Changed { from, to } => format!("{from:?} {to:?}"),
+            HandshakeEvent::Began { start: by, job, cycle } => format!("began {} {job} {cycle}", by - start),
+            HandshakeEvent::Ended { result, .. } => format!("ended {result}"),
+            HandshakeEvent::Taken { kind, .. } => format!("taken {kind}"),
             other => format!("{other:?}"),
         })
         .collect();
@@ -1024,11 +1026,11 @@ fn a_job_that_ended_tells_how_its_client_beat() {
     desk.wait(3 * S);
     assert_eq!(desk.machine.state(), State::Complete);
     let ended = desk.machine.log().iter().find_map(|seen| match seen.what {
-        What::Ended { beats, .. } => Some(beats),
+        HandshakeEvent::Ended { beats, .. } => Some(beats),
         _ => None,
     });
     // At 0, 0.25, 0.5 and 0.75 s; then eight from 3.1 to 4.85 s; the job takes 5 s.
-    assert_eq!(ended, Some(Beats { heard: 12, mean: 4850 * MS / 11, longest_silence: 2350 * MS }));
+    assert_eq!(ended, Some(BeatStatistics { heard: 12, mean: 4850 * MS / 11, longest_silence: 2350 * MS }));
 }
 
 #[test]
@@ -1091,12 +1093,14 @@ fn check_log(desk: &Desk, seed: u64) {
     let log = desk.machine.log();
     let mut state = State::Idle;
     for (before, seen) in log.iter().zip(&log[1..]) {
-        if let What::Began { start, .. } = seen.what {
-            let What::Commanded { frame, answer, state } = &before.what else { panic!("seed {seed}: {before:?}") };
+        if let HandshakeEvent::Began { start, .. } = seen.what {
+            let HandshakeEvent::Commanded { frame, answer, state } = &before.what else {
+                panic!("seed {seed}: {before:?}")
+            };
             assert_eq!((frame.sequence, frame.command, *answer), (start, 3, Answer::Accepted), "seed {seed}");
             assert_eq!(*state, State::Prepared, "seed {seed}");
         }
-        if let What::Changed { from, to } = seen.what {
+        if let HandshakeEvent::Changed { from, to } = seen.what {
             assert_eq!(from, state, "seed {seed}");
             state = to;
             assert!(to != State::Execute || matches!(from, State::Prepared | State::Held), "seed {seed}: {from:?}");

@@ -6,11 +6,11 @@ use std::time::{Duration, Instant};
 
 use crate::counter::{Counter, digest, payloads};
 use regrind_sim::body::Kind;
-use regrind_sim::command::{Command, Frame, State};
+use regrind_sim::command::{Command, CommandFrame, State};
 use regrind_sim::options::MachineOptions;
-use regrind_sim::registers::Machine;
+use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::wire::Serving;
-use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
+use regrind_sim::wire::faults::{Fault, FaultPlan, SharedFaultPlan, When};
 #[cfg(unix)]
 use regrind_sim::wire::pty::Pty;
 use regrind_sim::wire::rtu::Line;
@@ -23,9 +23,9 @@ use tokio_modbus::{ExceptionCode, Slave, client};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 
-fn machine(kind: Kind) -> Machine {
+fn machine(kind: Kind) -> SimulatedMachine {
     let options = MachineOptions { speed: 50.0, acting: Duration::from_millis(30), ..MachineOptions::default() };
-    Machine::new(Box::new(Counter::new(kind, 20.0)), 5, options)
+    SimulatedMachine::new(Box::new(Counter::new(kind, 20.0)), 5, options)
 }
 
 async fn patiently<T>(what: impl Future<Output = T>) -> T {
@@ -52,7 +52,7 @@ fn u32_at(words: &[u16], at: usize) -> u32 {
     WordOrder::Big.to_u32([words[at], words[at + 1]])
 }
 
-async fn command(wire: &mut Context, frame: Frame) -> Vec<u16> {
+async fn command(wire: &mut Context, frame: CommandFrame) -> Vec<u16> {
     wire.write_multiple_registers(40, &frame.registers(WordOrder::Big)).await.unwrap().unwrap();
     let status = wire.read_holding_registers(64, 48).await.unwrap().unwrap();
     assert_eq!((u32_at(&status, 4), status[6]), (frame.sequence, 1), "{frame:?}");
@@ -81,13 +81,14 @@ async fn send_payloads(wire: &mut Context, kind: Kind) {
 async fn run_a_job(wire: &mut Context, kind: Kind) -> Vec<u8> {
     let identity = wire.read_holding_registers(0, 32).await.unwrap().unwrap();
     assert_eq!((identity[0], identity[3], identity[12]), (0x5247, kind as u16, 1));
-    let claim = Frame { sequence: 1, command: Command::Claim as u16, owner: 3, epoch: 1, ..Frame::default() };
+    let claim =
+        CommandFrame { sequence: 1, command: Command::Claim as u16, owner: 3, epoch: 1, ..CommandFrame::default() };
     command(wire, claim).await;
     send_payloads(wire, kind).await;
     let prepare =
-        Frame { sequence: 2, command: Command::Prepare as u16, job: 8, cycle: 1, digest: digest(kind), ..claim };
+        CommandFrame { sequence: 2, command: Command::Prepare as u16, job: 8, cycle: 1, digest: digest(kind), ..claim };
     let token = u32_at(&command(wire, prepare).await, 14);
-    command(wire, Frame { sequence: 3, command: Command::Start as u16, token, ..prepare }).await;
+    command(wire, CommandFrame { sequence: 3, command: Command::Start as u16, token, ..prepare }).await;
     let status = until(wire, State::Complete).await;
     assert_eq!((u32_at(&status, 16), status[18]), (3, 1));
     let header = wire.read_holding_registers(400, 56).await.unwrap().unwrap();
@@ -101,7 +102,7 @@ async fn run_a_job(wire: &mut Context, kind: Kind) -> Vec<u8> {
         bytes.extend(bytes_of(&registers[4..4 + usize::from(registers[2])]));
     }
     assert_eq!(crc32fast::hash(&bytes), u32_at(&header, 4));
-    command(wire, Frame { sequence: 4, command: Command::Acknowledge as u16, argument: 3, ..claim }).await;
+    command(wire, CommandFrame { sequence: 4, command: Command::Acknowledge as u16, argument: 3, ..claim }).await;
     until(wire, State::Idle).await;
     bytes
 }
@@ -131,7 +132,7 @@ async fn a_whole_job_runs_over_tcp_on_two_units_of_one_port() {
 #[tokio::test]
 async fn a_whole_job_runs_over_a_serial_line_with_two_units() {
     let units = vec![(1, machine(Kind::Cmm)), (2, machine(Kind::Grinder))];
-    let serving = Serving::rtu(units, Line::unpaced(115_200), Faults::none()).unwrap();
+    let serving = Serving::rtu(units, Line::unpaced(115_200), SharedFaultPlan::none()).unwrap();
     let port = tokio_serial::SerialStream::open(&tokio_serial::new(serving.path().unwrap().to_str().unwrap(), 115_200));
     let mut wire = client::rtu::attach_slave(port.unwrap(), Slave(1));
     assert_eq!(run_a_job(&mut wire, Kind::Cmm).await.len(), 620);
@@ -143,7 +144,7 @@ async fn a_whole_job_runs_over_a_serial_line_with_two_units() {
 #[tokio::test]
 async fn a_paced_line_takes_the_time_of_its_baud_rate() {
     let line = Line::paced(9600);
-    let serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], line, Faults::none()).unwrap();
+    let serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], line, SharedFaultPlan::none()).unwrap();
     let port = tokio_serial::SerialStream::open(&tokio_serial::new(serving.path().unwrap().to_str().unwrap(), 9600));
     let mut wire = client::rtu::attach_slave(port.unwrap(), Slave(1));
     let began = Instant::now();
@@ -173,15 +174,17 @@ async fn unknown_functions_units_and_addresses_get_their_exceptions() {
 #[tokio::test]
 async fn a_client_that_falls_silent_makes_the_machine_hold() {
     let options = MachineOptions { speed: 0.001, lost_after_ms: 300, ..MachineOptions::default() };
-    let machine = Machine::new(Box::new(Counter::new(Kind::Cmm, 20.0)), 5, options);
+    let machine = SimulatedMachine::new(Box::new(Counter::new(Kind::Cmm, 20.0)), 5, options);
     let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine)]).await.unwrap();
     let mut wire = connect(&serving, 1).await;
-    let claim = Frame { sequence: 1, command: Command::Claim as u16, owner: 3, epoch: 1, ..Frame::default() };
+    let claim =
+        CommandFrame { sequence: 1, command: Command::Claim as u16, owner: 3, epoch: 1, ..CommandFrame::default() };
     command(&mut wire, claim).await;
     send_payloads(&mut wire, Kind::Cmm).await;
-    let prepare = Frame { sequence: 2, command: Command::Prepare as u16, job: 8, digest: digest(Kind::Cmm), ..claim };
+    let prepare =
+        CommandFrame { sequence: 2, command: Command::Prepare as u16, job: 8, digest: digest(Kind::Cmm), ..claim };
     let token = u32_at(&command(&mut wire, prepare).await, 14);
-    command(&mut wire, Frame { sequence: 3, command: Command::Start as u16, token, ..prepare }).await;
+    command(&mut wire, CommandFrame { sequence: 3, command: Command::Start as u16, token, ..prepare }).await;
     let status = patiently(async {
         loop {
             let status = wire.read_holding_registers(64, 48).await.unwrap().unwrap();
@@ -343,7 +346,8 @@ async fn words_can_be_exchanged() {
 #[tokio::test]
 async fn a_command_can_be_lost_on_the_way_there_or_on_the_way_back() {
     let serving = serve().await;
-    let claim = Frame { sequence: 1, command: Command::Claim as u16, owner: 3, epoch: 1, ..Frame::default() };
+    let claim =
+        CommandFrame { sequence: 1, command: Command::Claim as u16, owner: 3, epoch: 1, ..CommandFrame::default() };
     let words = claim.registers(WordOrder::Big);
     let pdu = [&[16, 0, 40, 0, 20, 40][..], &bytes_of(&words)].concat();
     for (fault, done) in [(Fault::DropRequest, 0), (Fault::DropReply, 1)] {
@@ -398,15 +402,16 @@ async fn a_machine_can_reboot_in_a_state() {
         let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine(Kind::Cmm))]).await.unwrap();
         serving.faults().set(FaultPlan::new(0).once(When::InState(state), Fault::Reboot));
         let mut wire = connect(&serving, 1).await;
-        let claim = Frame { sequence: 1, command: Command::Claim as u16, owner: 3, epoch: 1, ..Frame::default() };
+        let claim =
+            CommandFrame { sequence: 1, command: Command::Claim as u16, owner: 3, epoch: 1, ..CommandFrame::default() };
         command(&mut wire, claim).await;
         send_payloads(&mut wire, Kind::Cmm).await;
         let prepare =
-            Frame { sequence: 2, command: Command::Prepare as u16, job: 8, digest: digest(Kind::Cmm), ..claim };
-        let write = |frame: Frame| frame.registers(WordOrder::Big);
+            CommandFrame { sequence: 2, command: Command::Prepare as u16, job: 8, digest: digest(Kind::Cmm), ..claim };
+        let write = |frame: CommandFrame| frame.registers(WordOrder::Big);
         wire.write_multiple_registers(40, &write(prepare)).await.unwrap().unwrap();
         let token = serving.machine(1).unwrap().with(|m| m.read(78, 2)).unwrap();
-        let start = Frame { sequence: 3, command: Command::Start as u16, token: u32_at(&token, 0), ..prepare };
+        let start = CommandFrame { sequence: 3, command: Command::Start as u16, token: u32_at(&token, 0), ..prepare };
         wire.write_multiple_registers(40, &write(start)).await.unwrap().unwrap();
         let boot_id = patiently(async {
             loop {
@@ -461,7 +466,7 @@ fn open(serving: &Serving) -> tokio_serial::SerialStream {
 #[tokio::test]
 async fn a_serial_line_answers_only_what_is_sound_and_for_its_units() {
     let units = vec![(1, machine(Kind::Cmm)), (2, machine(Kind::Grinder))];
-    let serving = Serving::rtu(units, Line::unpaced(115_200), Faults::none()).unwrap();
+    let serving = Serving::rtu(units, Line::unpaced(115_200), SharedFaultPlan::none()).unwrap();
     let mut port = open(&serving);
     let answer = rtu_frame(1, &[3, 2, 0x52, 0x47]);
     for silent in [rtu_frame(9, &READ), rtu_frame(0, &READ), rtu_frame(0, &[16, 0, 36, 0, 1, 2, 0, 7])] {
@@ -479,7 +484,7 @@ async fn a_serial_line_answers_only_what_is_sound_and_for_its_units() {
 
 #[tokio::test]
 async fn a_serial_line_finds_its_frames_again_after_noise() {
-    let serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(115_200), Faults::none()).unwrap();
+    let serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(115_200), SharedFaultPlan::none()).unwrap();
     let mut port = open(&serving);
     let (ask, answer) = (rtu_frame(1, &READ), rtu_frame(1, &[3, 2, 0x52, 0x47]));
     let mut flipped = ask.clone();
@@ -522,7 +527,7 @@ async fn a_serial_line_breaks_as_it_is_told() {
         (Fault::Truncate(3), good[..3].to_vec()),
     ];
     for (fault, mut expected) in cases {
-        let faults = Faults::from(FaultPlan::new(0).once(When::Any, fault.clone()));
+        let faults = SharedFaultPlan::from(FaultPlan::new(0).once(When::Any, fault.clone()));
         let serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(115_200), faults).unwrap();
         let mut port = open(&serving);
         port.write_all(&rtu_frame(1, &READ)).await.unwrap();
@@ -554,7 +559,8 @@ async fn a_serial_line_can_have_the_name_that_a_cell_file_gives_it() {
     let name = folder.path().join("cmm");
     // A link that an older simulator left behind is replaced; a file of somebody else is not.
     std::os::unix::fs::symlink("/dev/pts/none", &name).unwrap();
-    let mut serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(9600), Faults::none()).unwrap();
+    let mut serving =
+        Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(9600), SharedFaultPlan::none()).unwrap();
     serving.link(&name).unwrap();
     assert_eq!(serving.path(), Some(name.as_path()));
     let mut port = open(&serving);
@@ -563,7 +569,8 @@ async fn a_serial_line_can_have_the_name_that_a_cell_file_gives_it() {
     serving.stop().await;
     assert!(std::fs::symlink_metadata(&name).is_err(), "the link goes with the line");
     std::fs::write(&name, "mine").unwrap();
-    let mut serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(9600), Faults::none()).unwrap();
+    let mut serving =
+        Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(9600), SharedFaultPlan::none()).unwrap();
     assert!(serving.link(&name).is_err());
     drop(serving);
     assert_eq!(std::fs::read_to_string(&name).unwrap(), "mine");

@@ -25,7 +25,7 @@ fn plan() -> CellPlan {
         on_refusal: Disposal::Hold,
         gates: Gates {
             least_found: 0.95,
-            least_coverage: 0.9,
+            min_coverage: 0.9,
             most_shift_mm: 1.0,
             most_turn_rad: 0.1,
             most_radius_error_mm: Some(0.002),

@@ -53,7 +53,7 @@ enum What {
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
-  regrind study begin mirror.toml --name limits --seeds 1..50 --vary acceptance.pv_um=2.5,3.0 --vary cycle.most_cycles=3,5 --plant planner.toml
+  regrind study begin mirror.toml --name limits --seeds 1..50 --vary acceptance.pv_um=2.5,3.0 --vary cycle.max_cycles=3,5 --plant planner.toml
 
 Exit codes: 0 begun; 2 the recipe is not as it should be with one of the values, or there is a study of that name; 3 the database cannot be reached.")]
 struct ToBegin {

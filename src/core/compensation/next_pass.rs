@@ -15,13 +15,13 @@ pub struct CorrectionLimits {
     /// Minimum depth of removal at any place, in millimetres.
     pub least_depth_mm: f64,
     /// Maximum correction at any place, in millimetres.
-    pub largest_correction_mm: f64,
+    pub max_correction_mm: f64,
     /// Level of the first pass, in millimetres; removal is counted from it.
     pub allowance_mm: f64,
     /// Maximum total removal below the surface of the first pass, in millimetres.
     pub removal_budget_mm: f64,
     /// Maximum depth that the machine may remove in one pass at any place, in millimetres.
-    pub largest_depth_mm: f64,
+    pub max_depth_mm: f64,
 }
 
 /// Correction of the next pass and its expected removal.
@@ -44,7 +44,7 @@ pub struct NextPass {
 pub enum NextPassError {
     #[error(
         "the correction would reach {found_um:.2} um at x {x_mm:.2}, y {y_mm:.2} mm, more than the {limit_um:.2} um that the recipe allows; find \
-         the cause of so large an error, or raise largest_correction_um",
+         the cause of so large an error, or raise max_correction_um",
         found_um = 1e3 * found_mm, limit_um = 1e3 * limit_mm
     )]
     TooLarge { found_mm: f64, x_mm: f64, y_mm: f64, limit_mm: f64 },
@@ -61,7 +61,7 @@ pub enum NextPassError {
     )]
     BudgetAtOnce { removed_mm: f64, budget_mm: f64 },
     #[error(
-        "the next pass would take {found_um:.2} um off where it takes off most, more than the {limit_um:.2} um of grinder.limits.largest_depth_mm; \
+        "the next pass would take {found_um:.2} um off where it takes off most, more than the {limit_um:.2} um of grinder.limits.max_depth_mm; \
          lower the error by another way, or raise the limit if the machine allows it",
         found_um = 1e3 * found_mm, limit_um = 1e3 * limit_mm
     )]
@@ -88,14 +88,14 @@ impl Correction {
     /// # Errors
     /// A correction above its limit, and a removal above the budget.
     pub fn removed_mm(&self, limits: &CorrectionLimits) -> Result<f64, NextPassError> {
-        let within = |v: f64| v.abs() <= limits.largest_correction_mm;
+        let within = |v: f64| v.abs() <= limits.max_correction_mm;
         if let Some(k) = self.values_mm.iter().position(|v| !within(*v)) {
-            let ([x_mm, y_mm], limit_mm) = (self.grid.place_mm(k), limits.largest_correction_mm);
+            let ([x_mm, y_mm], limit_mm) = (self.grid.place_mm(k), limits.max_correction_mm);
             return Err(NextPassError::TooLarge { found_mm: self.values_mm[k], x_mm, y_mm, limit_mm });
         }
         // Negative values of the correction and of the parameters increase the removal.
-        let deepest_mm = self.displaced_mm().iter().copied().fold(0.0, f64::min);
-        let removed_mm = limits.allowance_mm - self.level_mm - deepest_mm;
+        let max_depth_mm = self.displaced_mm().iter().copied().fold(0.0, f64::min);
+        let removed_mm = limits.allowance_mm - self.level_mm - max_depth_mm;
         // A picometre is rounding, not removal.
         if removed_mm > limits.removal_budget_mm + 1e-9 {
             return Err(NextPassError::BudgetSpent { removed_mm, budget_mm: limits.removal_budget_mm });
@@ -131,7 +131,7 @@ impl Correction {
         let rise_mm = on_grid.iter().map(|change| response * change).fold(0.0, f64::max);
         let depth_mm = limits.depth_of_cut_mm.max(rise_mm + 2.0 * scatter_mm + limits.least_depth_mm);
         let fall_mm = on_grid.iter().map(|change| response * change).fold(0.0, f64::min);
-        let (found_mm, limit_mm) = (depth_mm - fall_mm, limits.largest_depth_mm);
+        let (found_mm, limit_mm) = (depth_mm - fall_mm, limits.max_depth_mm);
         if found_mm > limit_mm {
             return Err(NextPassError::TooDeep { found_mm, limit_mm });
         }
@@ -167,10 +167,10 @@ mod tests {
     const LIMITS: CorrectionLimits = CorrectionLimits {
         depth_of_cut_mm: 0.01,
         least_depth_mm: 0.0005,
-        largest_correction_mm: 0.05,
+        max_correction_mm: 0.05,
         allowance_mm: 0.06,
         removal_budget_mm: 0.06,
-        largest_depth_mm: 0.062,
+        max_depth_mm: 0.062,
     };
 
     fn map(values_mm: [f64; 4]) -> ErrorMap {

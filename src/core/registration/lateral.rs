@@ -84,7 +84,7 @@ pub fn weak_for_compensation(found: &Registration, covariance: &Matrix6<f64>, li
         "the measured heights are good, but the shape of the part does not tell where on it they lie{weak}. The \
          correction might sit {beside_mm:.2} mm beside its place, allowed are {:.2} mm. Where the error map climbs, by up to {:.2} um per \
          mm, that makes it wrong by {:.1} um, allowed are {:.1} um, {:.0} % of the {:.1} um rms to be corrected; at edges and seams by \
-         more. Hold the directions in the recipe if the fixture holds the part better than that (registration.hold = [\"x\", \"y\", \
+         more. Hold the directions in the recipe if the fixture holds the part better than that (registration.lock = [\"x\", \"y\", \
          \"rz\"]), or measure edges or marks that show them",
         limits.place_mm,
         1e3 * slope,

@@ -13,11 +13,11 @@ use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use super::dmis;
-use super::measured::{Wanted, check_measurement, foreign, measurement};
-use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, read_json, unhex};
+use super::measured::{ResultRequirements, assemble_measurement, check_measurement, contradiction};
+use super::outbox::{AcceptedFiles, HandOverHeader, Outbox, StoredHandover, json_lines, read_json, unhex};
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Watch, WatchedFile};
-use super::{Exchange, ExchangeError, HandOver, Look, MeasureOrder, Pattern, Permit, Standing};
+use super::{Exchange, ExchangeError, HandOver, HandOverStatus, MeasureOrder, Pattern, Permit, PollResult};
 use crate::{Job, MeasuredPoint, Measurement, Plan, Target, TargetKind, hex};
 use regrind_formats::FormatError;
 use regrind_formats::references::{References, parse_references, read_references};
@@ -36,7 +36,7 @@ pub struct CmmExchange {
     pub stable_for: Duration,
     /// Time for which a look waits until the found files are read. A longer read is reported by a later look; meanwhile
     /// the job can be held.
-    pub read_within: Duration,
+    pub read_timeout: Duration,
     /// Known properties of the result files.
     pub content: Content,
     /// Pattern for the names of result files, with `{part}`, `{job}`, `{cycle}` and `*`.
@@ -46,11 +46,11 @@ pub struct CmmExchange {
     /// True if a result may have any number of points without targets; false if it needs a point for every target.
     pub free_count: bool,
     /// True if files are accepted that were in the inbox before the plan was handed over.
-    pub take_earlier: bool,
+    pub accept_earlier_files: bool,
     /// Minimum number of points with a free count; with fewer points the driver waits for further stations.
-    pub least_points: usize,
+    pub min_points: usize,
     /// Minimum fraction of the targets that need a point in a result.
-    pub least_found: f64,
+    pub min_coverage: f64,
     /// True if the plan itself may be returned as the measurement.
     pub rehearsal: bool,
     /// Maximum difference in mm between the probe radius in a file and that of the plan.
@@ -67,15 +67,15 @@ impl CmmExchange {
             outbox: outbox.into(),
             inbox: inbox.into(),
             stable_for: Duration::from_secs(2),
-            read_within: READ_WITHIN,
+            read_timeout: DEFAULT_READ_TIMEOUT,
             content: Content::default(),
             result: Pattern::new("{part}_c{cycle}.*"),
             stations: None,
             free_count: false,
-            least_points: 1,
-            least_found: 0.0,
+            min_points: 1,
+            min_coverage: 0.0,
             rehearsal: false,
-            take_earlier: false,
+            accept_earlier_files: false,
             probe_tolerance_mm: 1e-3,
             dmis_sensor: None,
         }
@@ -112,13 +112,13 @@ pub struct CmmFolders {
     judge: Arc<Judge>,
     watch: Watch,
     /// Judgement that still runs.
-    judging: Option<Judging>,
+    running_judgement: Option<RunningJudgement>,
     /// Plan that this program handed over last.
     published: Option<(Job, Arc<Plan>)>,
     /// Expected result, once the plan was handed over or found again.
     expected: Option<Expected>,
     /// Content of the folder at the last judgement, and the result of that judgement.
-    judged: Option<(Vec<WatchedFile>, Look<Measurement>)>,
+    last_judgement: Option<(Vec<WatchedFile>, PollResult<Measurement>)>,
 }
 
 /// Judge that reads the files of the inbox and compares them with the expected result.
@@ -131,16 +131,16 @@ struct Judge {
 /// Judgement of the inbox on a thread of its own, so that a file that takes long to read does not prevent a hold or an
 /// abort.
 #[derive(Debug)]
-struct Judging {
+struct RunningJudgement {
     job: Job,
     found: Vec<WatchedFile>,
-    judged: mpsc::Receiver<(Judgement, Vec<String>)>,
+    receiver: mpsc::Receiver<(Judgement, Vec<String>)>,
 }
 
 /// Default time for which a look waits until the found files are read.
-const READ_WITHIN: Duration = Duration::from_millis(40);
+const DEFAULT_READ_TIMEOUT: Duration = Duration::from_millis(40);
 /// Maximum size in bytes of a file that is read although its name does not match the pattern.
-const MOST_TO_LOOK_INTO: u64 = 16 << 20;
+const MAX_UNMATCHED_BYTES: u64 = 16 << 20;
 
 /// Expected result.
 #[derive(Clone, Debug)]
@@ -165,10 +165,10 @@ struct Accepted {
 type Judgement = Result<Option<Accepted>, ExchangeError>;
 
 /// Judgement, with its notes and the files as they were.
-struct Judged {
+struct FinishedJudgement {
     judgement: Judgement,
     notes: Vec<String>,
-    of: Vec<WatchedFile>,
+    files: Vec<WatchedFile>,
 }
 
 /// Files of a station: its points, and the reference points as it sees them.
@@ -180,12 +180,12 @@ impl CmmFolders {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
         let judge = Arc::new(Judge { settings, outbox });
-        Self { judge, watch, judging: None, published: None, expected: None, judged: None }
+        Self { judge, watch, running_judgement: None, published: None, expected: None, last_judgement: None }
     }
 
     /// Returns the expected result of a job. Finds the hand-over again if it was made before a restart.
     fn expect(&mut self, job: Job) -> Result<Expected, ExchangeError> {
-        if let Some(expected) = self.expected.as_ref().filter(|e| e.stored.ticket.job() == job) {
+        if let Some(expected) = self.expected.as_ref().filter(|e| e.stored.header.job() == job) {
             return Ok(expected.clone());
         }
         let stored = self.judge.outbox.handed_over(job)?;
@@ -212,9 +212,9 @@ impl CmmFolders {
 
     /// Returns the judgement of some files, with the files as they were, if it is complete. Starts a judgement, unless
     /// one still runs.
-    fn judged_by_now(&mut self, expected: &Expected, found: &[WatchedFile]) -> Option<Judged> {
-        let job = expected.stored.ticket.job();
-        if self.judging.is_none() {
+    fn finished_judgement(&mut self, expected: &Expected, found: &[WatchedFile]) -> Option<FinishedJudgement> {
+        let job = expected.stored.header.job();
+        if self.running_judgement.is_none() {
             let (judge, expected, files) = (Arc::clone(&self.judge), expected.clone(), found.to_owned());
             let (tell, judged) = mpsc::channel();
             std::thread::spawn(move || {
@@ -223,14 +223,14 @@ impl CmmFolders {
                 // The receiver may be gone.
                 let _ = tell.send((judgement, notes));
             });
-            self.judging = Some(Judging { job, found: found.to_owned(), judged });
+            self.running_judgement = Some(RunningJudgement { job, found: found.to_owned(), receiver: judged });
         }
-        let judged = self.judging.as_ref()?.judged.recv_timeout(self.judge.settings.read_within);
+        let judged = self.running_judgement.as_ref()?.receiver.recv_timeout(self.judge.settings.read_timeout);
         if matches!(judged, Err(mpsc::RecvTimeoutError::Timeout)) {
             return None;
         }
-        let Judging { job: asked, found: of, .. } = self.judging.take()?;
-        let broken = || (Err(ExchangeError::NotRead { folder: self.judge.settings.inbox.clone() }), Vec::new());
+        let RunningJudgement { job: asked, found: of, .. } = self.running_judgement.take()?;
+        let broken = || (Err(ExchangeError::ReaderFailed { folder: self.judge.settings.inbox.clone() }), Vec::new());
         let (judgement, notes) = judged.unwrap_or_else(|_| broken());
         // Other files may have arrived or changed meanwhile, as a log does repeatedly. The files of an answer must not
         // have changed.
@@ -239,7 +239,7 @@ impl CmmFolders {
             Ok(Some(accepted)) => accepted.files.iter().all(|(name, _)| stands(name)),
             _ => true,
         };
-        (asked == job && holds).then_some(Judged { judgement, notes, of })
+        (asked == job && holds).then_some(FinishedJudgement { judgement, notes, files: of })
     }
 }
 
@@ -251,7 +251,7 @@ impl Judge {
         }?;
         if let Some((accepted, plan)) = accepted.as_ref().zip(expected.plan.as_ref()) {
             let path = accepted.files.first().map_or_else(PathBuf::new, |(name, _)| self.settings.inbox.join(name));
-            let CmmExchange { least_found, rehearsal, .. } = self.settings;
+            let CmmExchange { min_coverage: least_found, rehearsal, .. } = self.settings;
             check_measurement(&path, plan, &accepted.measurement, least_found, rehearsal)?;
         }
         Ok(accepted)
@@ -259,7 +259,7 @@ impl Judge {
 
     /// Returns true if a file may be read; otherwise adds the reason to the notes.
     fn is_new(&self, expected: &Expected, file: &WatchedFile, notes: &mut Vec<String>) -> bool {
-        let earlier = !self.settings.take_earlier && expected.stored.ticket.is_earlier(&file.name, &file.look);
+        let earlier = !self.settings.accept_earlier_files && expected.stored.header.is_earlier(&file.name, &file.stamp);
         if earlier {
             notes.push(format!("{} lay there before the plan was handed over; left alone", file.name));
         }
@@ -269,7 +269,7 @@ impl Judge {
     // ---- one file --------------------------------------------------------------------------------------------------
 
     fn judge_single(&self, expected: &Expected, found: &[WatchedFile], notes: &mut Vec<String>) -> Judgement {
-        let ticket = &expected.stored.ticket;
+        let ticket = &expected.stored.header;
         let pattern = self.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
         let mut ours: Vec<&WatchedFile> = Vec::new();
         for file in found {
@@ -284,7 +284,7 @@ impl Judge {
                 }
                 continue;
             }
-            match self.belongs(ticket, &pattern, file) {
+            match self.foreign_reason(ticket, &pattern, file) {
                 Ok(None) => ours.push(file),
                 Ok(Some(why)) => notes.push(format!("{} {why}; left alone", file.name)),
                 Err(error) => notes.push(error.to_string()),
@@ -309,9 +309,14 @@ impl Judge {
     }
 
     /// Returns the reason why a file does not belong to a hand-over, or `None` if it does.
-    fn belongs(&self, ticket: &Ticket, pattern: &Pattern, file: &WatchedFile) -> Result<Option<String>, ExchangeError> {
-        if file.look.bytes > MOST_TO_LOOK_INTO && !pattern.fits(&file.name) {
-            let most = MOST_TO_LOOK_INTO >> 20;
+    fn foreign_reason(
+        &self,
+        ticket: &HandOverHeader,
+        pattern: &Pattern,
+        file: &WatchedFile,
+    ) -> Result<Option<String>, ExchangeError> {
+        if file.stamp.bytes > MAX_UNMATCHED_BYTES && !pattern.fits(&file.name) {
+            let most = MAX_UNMATCHED_BYTES >> 20;
             let pattern = pattern.as_str();
             return Ok(Some(format!(
                 "is larger than {most} MiB and its name does not fit {pattern}: it was not looked into"
@@ -319,7 +324,7 @@ impl Judge {
         }
         let says = read_statements(&file.path, &read_bytes(&file.path)?)?;
         let says_so = says.part.is_some() && says.cycle.is_some() || says.plan.is_some();
-        Ok(foreign(&says, &ticket.part, ticket.cycle, &ticket.identity).or_else(|| {
+        Ok(contradiction(&says, &ticket.part, ticket.cycle, &ticket.identity).or_else(|| {
             match says_so || pattern.fits(&file.name) {
                 true => None,
                 false => {
@@ -331,7 +336,7 @@ impl Judge {
 
     fn accept_single(&self, expected: &Expected, file: &WatchedFile) -> Result<Accepted, ExchangeError> {
         let (result, sha) = self.read(expected, &file.path)?;
-        let points = self.wanted(expected).matched(&file.path, &result)?;
+        let points = self.requirements(expected).assign_by_index(&file.path, &result)?;
         let mut notes: Vec<String> = result.notes.iter().map(|note| format!("{}: {note}", file.name)).collect();
         notes.extend(switched_off(&file.name, &result));
         let measurement = self.measurement(expected, points, &[result]);
@@ -342,38 +347,38 @@ impl Judge {
     fn read(&self, expected: &Expected, path: &Path) -> Result<(ResultFile, String), ExchangeError> {
         let bytes = read_bytes(path)?;
         let sha = hex(&Sha256::digest(&bytes));
-        self.check_not_taken(expected, path, &sha)?;
-        Ok((self.wanted(expected).read(path, &bytes)?, sha))
+        self.check_not_accepted_before(expected, path, &sha)?;
+        Ok((self.requirements(expected).read(path, &bytes)?, sha))
     }
 
     /// Returns the requirements for a result of a hand-over.
-    fn wanted<'a>(&'a self, expected: &'a Expected) -> Wanted<'a> {
-        Wanted {
+    fn requirements<'a>(&'a self, expected: &'a Expected) -> ResultRequirements<'a> {
+        ResultRequirements {
             targets: (!self.settings.free_count).then_some(&*expected.targets),
             content: &self.settings.content,
-            probe_radius_mm: expected.stored.ticket.tool_radius_mm,
+            probe_radius_mm: expected.stored.header.tool_radius_mm,
             probe_tolerance_mm: self.settings.probe_tolerance_mm,
         }
     }
 
     /// Rejects bytes that were the answer to another hand-over.
-    fn check_not_taken(&self, expected: &Expected, path: &Path, sha: &str) -> Result<(), ExchangeError> {
-        let own = (expected.stored.ticket.job, expected.stored.ticket.cycle);
-        let taken = self.outbox.list()?.into_iter().filter_map(|stored| stored.taken);
+    fn check_not_accepted_before(&self, expected: &Expected, path: &Path, sha: &str) -> Result<(), ExchangeError> {
+        let own = (expected.stored.header.job, expected.stored.header.cycle);
+        let taken = self.outbox.list()?.into_iter().filter_map(|stored| stored.accepted);
         let before = taken.filter(|t| (t.job, t.cycle) != own).find(|t| t.files.iter().any(|(_, s)| s == sha));
         match before {
             // Another run may use the same measurement if the cell file allows it; another cycle of the same run never
             // may.
-            Some(Taken { job, cycle, .. }) if job == own.0 || !self.settings.take_earlier => {
-                Err(ExchangeError::TakenBefore { path: path.to_owned(), job, cycle })
+            Some(AcceptedFiles { job, cycle, .. }) if job == own.0 || !self.settings.accept_earlier_files => {
+                Err(ExchangeError::AcceptedBefore { path: path.to_owned(), job, cycle })
             }
             _ => Ok(()),
         }
     }
 
     fn measurement(&self, expected: &Expected, points: Vec<MeasuredPoint>, results: &[ResultFile]) -> Measurement {
-        let ticket = &expected.stored.ticket;
-        measurement(points, results, ticket.job(), unhex(&ticket.identity), ticket.start_number)
+        let ticket = &expected.stored.header;
+        assemble_measurement(points, results, ticket.job(), unhex(&ticket.identity), ticket.start_number)
     }
 
     // ---- several stations ------------------------------------------------------------------------------------------
@@ -386,7 +391,7 @@ impl Judge {
         notes: &mut Vec<String>,
     ) -> Judgement {
         let new: Vec<&WatchedFile> = found.iter().filter(|file| self.is_new(expected, file, notes)).collect();
-        let (pairs, waiting) = self.paired(&expected.stored.ticket, stations, &new)?;
+        let (pairs, waiting) = self.paired(&expected.stored.header, stations, &new)?;
         if !waiting.is_empty() {
             let (there, of, waiting) = (pairs.len(), stations.files.len(), waiting.join(", "));
             notes.push(format!("{there} of {of} stations are there; waiting for {waiting}"));
@@ -398,7 +403,7 @@ impl Judge {
             notes.push(format!("left alone, no station's: {}", left.join(", ")));
         }
         let accepted = self.merge(expected, stations, &pairs)?;
-        let (there, least) = (accepted.measurement.points.len(), self.settings.least_points);
+        let (there, least) = (accepted.measurement.points.len(), self.settings.min_points);
         if self.settings.free_count && there < least {
             notes.extend(accepted.notes);
             notes.push(format!(
@@ -413,7 +418,7 @@ impl Judge {
     /// Returns the files of the stations that are there, points and references, and the names of the missing ones.
     fn paired<'f>(
         &self,
-        ticket: &Ticket,
+        ticket: &HandOverHeader,
         stations: &Stations,
         new: &[&'f WatchedFile],
     ) -> Result<(Vec<Pair<'f>>, Vec<String>), ExchangeError> {
@@ -446,7 +451,12 @@ impl Judge {
     }
 
     /// Returns the stations with each star replaced by the characters that it matches, in the order of their names.
-    fn named_stations(&self, ticket: &Ticket, stations: &Stations, files: &[&WatchedFile]) -> Vec<StationFiles> {
+    fn named_stations(
+        &self,
+        ticket: &HandOverHeader,
+        stations: &Stations,
+        files: &[&WatchedFile],
+    ) -> Vec<StationFiles> {
         let mut named = Vec::new();
         for station in &stations.files {
             let [points, references] =
@@ -471,14 +481,14 @@ impl Judge {
         let (mut files, mut notes) = (Vec::new(), Vec::new());
         for (k, (file, reference_file)) in pairs.iter().enumerate() {
             let (result, sha) = self.read(expected, &file.path)?;
-            if let Some(why) = self.says_otherwise(expected, file)? {
+            if let Some(why) = self.station_contradiction(expected, file)? {
                 return Err(why);
             }
             let bytes = read_bytes(&reference_file.path)?;
             let seen = parse_references(&reference_file.path, &bytes, stations.group.as_deref())?;
             let placed = self.place(k, &seen, &nominal, stations)?;
             notes.extend(switched_off(&file.name, &result));
-            notes.push(placed.words());
+            notes.push(placed.summary());
             points.extend(result.points.iter().map(|p| placed.cmm_from_station.point(p)));
             files.extend([(file.name.clone(), sha), (reference_file.name.clone(), hex(&Sha256::digest(&bytes)))]);
             if let Some(first) = results.first().filter(|first| first.coordinates != result.coordinates) {
@@ -494,7 +504,7 @@ impl Judge {
             }
             results.push(result);
         }
-        let points = self.wanted(expected).in_order(&self.settings.inbox, &points)?;
+        let points = self.requirements(expected).assign_in_order(&self.settings.inbox, &points)?;
         Ok(Accepted { measurement: self.measurement(expected, points, &results), files, notes })
     }
 
@@ -510,9 +520,13 @@ impl Judge {
     }
 
     /// Returns an error for the file of a station that states another part, cycle or plan.
-    fn says_otherwise(&self, expected: &Expected, file: &WatchedFile) -> Result<Option<ExchangeError>, ExchangeError> {
-        let ticket = &expected.stored.ticket;
-        let why = self.belongs(ticket, &Pattern::new("*"), file)?;
+    fn station_contradiction(
+        &self,
+        expected: &Expected,
+        file: &WatchedFile,
+    ) -> Result<Option<ExchangeError>, ExchangeError> {
+        let ticket = &expected.stored.header;
+        let why = self.foreign_reason(ticket, &Pattern::new("*"), file)?;
         Ok(why.map(|found| {
             FormatError::Contradiction {
                 path: file.path.clone(),
@@ -536,7 +550,7 @@ impl Exchange for CmmFolders {
 
     fn publish(&mut self, job: Job, sequence: u32, order: &MeasureOrder, permit: &Permit) -> Result<(), ExchangeError> {
         let CmmExchange { part, inbox, .. } = &self.judge.settings;
-        let ticket = Ticket::new(part, job, sequence, &order.plan_identity, order.plan.probe_radius_mm, inbox)?;
+        let ticket = HandOverHeader::new(part, job, sequence, &order.plan_identity, order.plan.probe_radius_mm, inbox)?;
         let expects = self.judge.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
         let mut files = vec![
             ("plan.csv", plan_csv(&ticket.part, job, &ticket.identity, &order.plan).into_bytes()),
@@ -546,32 +560,34 @@ impl Exchange for CmmFolders {
             (&self.judge.settings.dmis_sensor, self.judge.settings.content.coordinates)
         {
             let (part, identity) = (&*ticket.part, &*ticket.identity);
-            let about = dmis::About { part, cycle: ticket.cycle, identity, sensor, coordinates };
+            let about = dmis::DmisHeader { part, cycle: ticket.cycle, identity, sensor, coordinates };
             files.push(("plan.dmi", dmis::program(&order.plan, &about).into_bytes()));
         }
         self.judge.outbox.publish(&ticket, &files, permit)?;
-        (self.expected, self.judged, self.judging) = (None, None, None);
+        (self.expected, self.last_judgement, self.running_judgement) = (None, None, None);
         self.published = Some((job, Arc::new(order.plan.clone())));
         Ok(())
     }
 
-    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), ExchangeError> {
-        (self.expected, self.judged, self.judging) = (None, None, None);
+    fn mark(&mut self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError> {
+        (self.expected, self.last_judgement, self.running_judgement) = (None, None, None);
         self.judge.outbox.mark(job, standing)
     }
 
-    fn look(&mut self, now: Duration, job: Job) -> Result<Look<Measurement>, ExchangeError> {
+    fn poll(&mut self, now: Duration, job: Job) -> Result<PollResult<Measurement>, ExchangeError> {
         let mut expected = self.expect(job)?;
         let since = *expected.since.get_or_insert(now);
         self.expected = Some(expected.clone());
-        let found = self.watch.look(now)?;
-        if let Some((_, look)) = self.judged.as_ref().filter(|(before, _)| *before == found) {
+        let found = self.watch.scan(now)?;
+        if let Some((_, look)) = self.last_judgement.as_ref().filter(|(before, _)| *before == found) {
             return Ok(look.clone());
         }
-        let Some(Judged { judgement, mut notes, of }) = self.judged_by_now(&expected, &found) else {
+        let Some(FinishedJudgement { judgement, mut notes, files: of }) = self.finished_judgement(&expected, &found)
+        else {
             let names = || found.iter().map(|file| file.name.as_str()).collect::<Vec<_>>().join(", ");
-            let reading = || Look { begun: false, answer: None, notes: vec![format!("reading {}", names())] };
-            return Ok(self.judged.as_ref().map_or_else(reading, |(_, before)| before.clone()));
+            let reading =
+                || PollResult { start_confirmed: false, answer: None, notes: vec![format!("reading {}", names())] };
+            return Ok(self.last_judgement.as_ref().map_or_else(reading, |(_, before)| before.clone()));
         };
         let answer = match judgement {
             Ok(None) => None,
@@ -580,15 +596,15 @@ impl Exchange for CmmFolders {
                 None
             }
             Ok(Some(accepted)) => {
-                let taken = Taken { job: job.job, cycle: job.cycle, files: accepted.files };
-                self.judge.outbox.note_taken(&expected.stored, &taken)?;
+                let taken = AcceptedFiles { job: job.job, cycle: job.cycle, files: accepted.files };
+                self.judge.outbox.record_accepted(&expected.stored, &taken)?;
                 notes.extend(accepted.notes);
                 let duration_s = now.saturating_sub(since).as_secs_f64();
                 Some(Measurement { duration_s: Some(duration_s), ..accepted.measurement })
             }
         };
-        let look = Look { begun: answer.is_some(), answer, notes };
-        self.judged = Some((of, look.clone()));
+        let look = PollResult { start_confirmed: answer.is_some(), answer, notes };
+        self.last_judgement = Some((of, look.clone()));
         Ok(look)
     }
 }
@@ -623,7 +639,7 @@ fn stored_plan(folder: &Path) -> Result<Plan, ExchangeError> {
         })
     };
     let targets = rows.map(target).collect::<Result<_, _>>()?;
-    Ok(Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful: None })
+    Ok(Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful_start: None })
 }
 
 /// Parses a row of `plan.csv`; returns `None` for any other row.
@@ -636,7 +652,7 @@ fn stored_target(row: &str) -> Option<Target> {
         let [x, y, z] = words.map(|word| word.parse().ok());
         Some([x?, y?, z?])
     };
-    Some(Target { index: index.parse().ok()?, what, point_mm: three([x, y, z])?, normal: three([nx, ny, nz])? })
+    Some(Target { index: index.parse().ok()?, kind: what, point_mm: three([x, y, z])?, normal: three([nx, ny, nz])? })
 }
 
 /// Returns the plan as a CSV table, with a header that identifies it.
@@ -650,12 +666,12 @@ pub(crate) fn plan_csv(part: &str, job: Job, identity: &str, plan: &Plan) -> Str
     for target in &plan.targets {
         let ([x, y, z], [nx, ny, nz]) = (target.point_mm, target.normal);
         // Writing to a string cannot fail.
-        let _ = writeln!(text, "{},{x},{y},{z},{nx},{ny},{nz},{}", target.index, target.what as u16);
+        let _ = writeln!(text, "{},{x},{y},{z},{nx},{ny},{nz},{}", target.index, target.kind as u16);
     }
     text
 }
 
-fn plan_json(ticket: &Ticket, order: &MeasureOrder, settings: &CmmExchange, expects: &str) -> Vec<u8> {
+fn plan_json(ticket: &HandOverHeader, order: &MeasureOrder, settings: &CmmExchange, expects: &str) -> Vec<u8> {
     let plan = &order.plan;
     let expects = match &settings.stations {
         None => serde_json::json!({
@@ -679,7 +695,7 @@ fn plan_json(ticket: &Ticket, order: &MeasureOrder, settings: &CmmExchange, expe
         "approach_mm": plan.approach_mm, "search_mm": plan.search_mm, "speed_mm_s": plan.speed_mm_s,
         "safe_height_mm": plan.safe_height_mm, "expected_back": expects,
         // After an unusable measurement the part may not lie where it should.
-        "careful_targets": plan.careful.map_or(0, |careful| careful.targets),
-        "careful_speed_mm_s": plan.careful.map(|careful| careful.speed_mm_s),
+        "careful_targets": plan.careful_start.map_or(0, |careful| careful.target_count),
+        "careful_speed_mm_s": plan.careful_start.map(|careful| careful.speed_mm_s),
     }))
 }

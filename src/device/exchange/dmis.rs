@@ -11,7 +11,7 @@ use crate::payload::Plan;
 use regrind_formats::result::Coordinates;
 
 /// Data that identify a program.
-pub(super) struct About<'a> {
+pub(super) struct DmisHeader<'a> {
     pub(super) part: &'a str,
     pub(super) cycle: u16,
     /// Identity of the plan.
@@ -28,7 +28,7 @@ fn quotable(text: &str) -> Option<&str> {
 }
 
 /// Returns the DMIS program of a plan.
-pub(super) fn program(plan: &Plan, about: &About<'_>) -> String {
+pub(super) fn program(plan: &Plan, about: &DmisHeader<'_>) -> String {
     let (compensation, what) = match about.coordinates {
         Coordinates::Centres => ("OFF", "centres"),
         Coordinates::Contacts => ("ON", "contacts"),
@@ -48,7 +48,8 @@ pub(super) fn program(plan: &Plan, about: &About<'_>) -> String {
     let _ = writeln!(text, "SNSET/APPRCH,{approach_mm}\nSNSET/SEARCH,{search_mm}\nSNSET/RETRCT,{approach_mm}");
     let highest_mm = plan.targets.iter().map(|target| target.point_mm[2]).fold(f64::NEG_INFINITY, f64::max);
     let over_mm = highest_mm + plan.safe_height_mm + plan.probe_radius_mm;
-    let slow = plan.careful.map_or((0, speed_mm_s), |careful| (careful.targets as usize, careful.speed_mm_s));
+    let slow =
+        plan.careful_start.map_or((0, speed_mm_s), |careful| (careful.target_count as usize, careful.speed_mm_s));
     for (k, target) in plan.targets.iter().enumerate() {
         let speed_mm_s = if k < slow.0 { slow.1 } else { speed_mm_s };
         if k == 0 || k == slow.0 {
@@ -68,14 +69,14 @@ pub(super) fn program(plan: &Plan, about: &About<'_>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::payload::{Careful, Target, TargetKind};
+    use crate::payload::{CarefulStart, Target, TargetKind};
     use regrind_formats::result::{Content, parse_result};
 
     const PLAN: &str = "00112233445566778899aabbccddeeff00112233445566778899aabbccddeeff";
 
     fn plan() -> Plan {
         let (what, normal) = (TargetKind::Part, [0.6, 0.0, 0.8]);
-        let target = |index, point_mm| Target { index, what, point_mm, normal };
+        let target = |index, point_mm| Target { index, kind: what, point_mm, normal };
         Plan {
             targets: vec![target(7, [1.5, -2.25, 3.0]), target(9, [4.0, 5.0, 6.0])],
             probe_radius_mm: 1.5,
@@ -83,14 +84,14 @@ mod tests {
             search_mm: 2.0,
             speed_mm_s: 5.0,
             safe_height_mm: 50.0,
-            careful: Some(Careful { targets: 1, speed_mm_s: 1.0 }),
+            careful_start: Some(CarefulStart { target_count: 1, speed_mm_s: 1.0 }),
         }
     }
 
     #[test]
     fn a_program_touches_each_target_from_over_the_part_and_its_output_says_what_it_is_of() {
         let about =
-            About { part: "SN-7", cycle: 2, identity: PLAN, sensor: "PROBE6", coordinates: Coordinates::Centres };
+            DmisHeader { part: "SN-7", cycle: 2, identity: PLAN, sensor: "PROBE6", coordinates: Coordinates::Centres };
         let text = program(&plan(), &about);
         for statement in [
             "UNITS/MM,ANGDEC\n",
@@ -111,7 +112,7 @@ mod tests {
         assert_eq!((read.statements.cycle, read.statements.plan.as_deref()), (Some(2), Some(PLAN)));
         assert_eq!((read.coordinates, read.indices), (Some(Coordinates::Centres), Some(vec![7])));
         // A name that would end its quotes is not written.
-        let odd = program(&plan(), &About { part: "SN'7", ..about });
+        let odd = program(&plan(), &DmisHeader { part: "SN'7", ..about });
         assert!(!odd.contains("SN'7") && !odd.contains("'part:"));
     }
 }

@@ -19,7 +19,7 @@ pub enum ExchangeError {
     /// Neither file nor cell states if the coordinates are probe centres or contact points.
     #[error(
         "{path}: neither the file nor the cell says whether the coordinates are probe centres or contact points, and a wrong guess is \
-         off by the probe radius; put `# coordinates: centres` or `# coordinates: contacts` above the points, or `what = \"centres\"` \
+         off by the probe radius; put `# coordinates: centres` or `# coordinates: contacts` above the points, or `coordinates = \"centres\"` \
          into the cell file"
     )]
     CoordinatesUnstated { path: PathBuf },
@@ -31,9 +31,9 @@ pub enum ExchangeError {
     Count { path: PathBuf, found: usize, expected: usize },
     /// Too few targets of the plan have a point.
     #[error(
-        "{path}: points of {found} of {expected} targets, and {least} are needed; export the whole measurement, or touch what is missing first"
+        "{path}: points of {found} of {expected} targets, and {min} are needed; export the whole measurement, or touch what is missing first"
     )]
-    Short { path: PathBuf, found: usize, expected: usize, least: usize },
+    TooFewTargets { path: PathBuf, found: usize, expected: usize, min: usize },
     /// The radius of the probe differs from that of the plan.
     #[error(
         "{path}: measured with a probe radius of {found_mm} mm, the recipe says {expected_mm} mm; they may differ by {limit_mm} mm: \
@@ -42,10 +42,10 @@ pub enum ExchangeError {
     ProbeRadius { path: PathBuf, found_mm: f64, expected_mm: f64, limit_mm: f64 },
     /// A station sees too few or too many reference points.
     #[error(
-        "station {station} sees {seen} reference points without names, the nominal file has {nominal} ({names}); {why}: give one \
+        "station {station} sees {seen} reference points without names, the nominal file has {nominal} ({names}); {reason}: give one \
          for each, or give them the nominal names"
     )]
-    ReferenceCount { station: String, seen: usize, nominal: usize, names: String, why: &'static str },
+    ReferenceCount { station: String, seen: usize, nominal: usize, names: String, reason: &'static str },
     /// Too few reference points have a nominal name.
     #[error(
         "station {station}: fewer than 3 of its reference points bear a nominal name; missing are {missing}, not known are {extra}"
@@ -62,7 +62,7 @@ pub enum ExchangeError {
     Several { folder: PathBuf, pattern: String, names: Vec<String> },
     /// The file was already accepted for another cycle.
     #[error("{path}: the same bytes were the result of job {job} cycle {cycle}; export the new measurement")]
-    TakenBefore { path: PathBuf, job: u32, cycle: u16 },
+    AcceptedBefore { path: PathBuf, job: u32, cycle: u16 },
     /// The confirmation is for another hand-over.
     #[error("{path}: confirms {found}, handed over was {expected}; {remedy}")]
     Confirmation { path: PathBuf, found: String, expected: String, remedy: &'static str },
@@ -85,11 +85,11 @@ pub enum ExchangeError {
     #[error(
         "{folder}: a file there could not be read by a fault of this program; take away what does not belong there, and report it"
     )]
-    NotRead { folder: PathBuf },
+    ReaderFailed { folder: PathBuf },
     /// The file belongs to something else, by its statements or its points.
-    #[error("{path}: {why}; export the measurement that was asked for")]
-    Foreign { path: PathBuf, why: String },
+    #[error("{path}: {reason}; export the measurement that was asked for")]
+    Foreign { path: PathBuf, reason: String },
     /// The file was already a measurement of this run.
     #[error("{path}: the same bytes were a measurement of this run before; export the new one")]
-    Offered { path: PathBuf },
+    AlreadyMeasured { path: PathBuf },
 }

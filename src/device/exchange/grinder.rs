@@ -12,9 +12,9 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, read_json, unhex};
+use super::outbox::{AcceptedFiles, HandOverHeader, Outbox, StoredHandover, json_lines, read_json, unhex};
 use super::watch::{Watch, WatchedFile};
-use super::{Confirmed, Exchange, ExchangeError, GrindOrder, HandOver, Look, Permit, Standing};
+use super::{ConfirmedStep, Exchange, ExchangeError, GrindOrder, HandOver, HandOverStatus, Permit, PollResult};
 use crate::{CorrectionMap, Job, Outcome, PassRecord, hex};
 use regrind_formats::result::read_bytes;
 use regrind_formats::write_atomic;
@@ -63,12 +63,12 @@ struct Confirmation {
 }
 
 impl Confirmation {
-    fn of(ticket: &Ticket) -> Self {
+    fn from_ticket(ticket: &HandOverHeader) -> Self {
         Self { map: ticket.identity.clone(), job: Some(ticket.job), cycle: Some(ticket.cycle), ..Self::default() }
     }
 
     /// Returns an error if the confirmation does not match a hand-over.
-    fn check(&self, path: &Path, ticket: &Ticket) -> Result<(), ExchangeError> {
+    fn check(&self, path: &Path, ticket: &HandOverHeader) -> Result<(), ExchangeError> {
         let wrong = |found: String, expected: String, remedy| {
             Err(ExchangeError::Confirmation { path: path.to_owned(), found, expected, remedy })
         };
@@ -104,7 +104,7 @@ impl GrinderFolders {
     }
 
     fn expect(&mut self, job: Job) -> Result<StoredHandover, ExchangeError> {
-        if let Some(stored) = self.expected.as_ref().filter(|l| l.ticket.job() == job) {
+        if let Some(stored) = self.expected.as_ref().filter(|l| l.header.job() == job) {
             return Ok(stored.clone());
         }
         let stored = self.outbox.handed_over(job)?;
@@ -122,7 +122,7 @@ impl GrinderFolders {
         notes: &mut Vec<String>,
     ) -> Option<(Confirmation, String)> {
         let file = found.iter().find(|f| f.name == name)?;
-        if stored.ticket.is_earlier(name, &file.look) {
+        if stored.header.is_earlier(name, &file.stamp) {
             notes.push(format!("{name} lay there before the map was handed over; left alone"));
             return None;
         }
@@ -133,14 +133,14 @@ impl GrinderFolders {
         let read = || -> Result<(Confirmation, String), ExchangeError> {
             let bytes = read_bytes(&file.path)?;
             let confirmation: Confirmation = read_json(&file.path)?;
-            confirmation.check(&file.path, &stored.ticket)?;
+            confirmation.check(&file.path, &stored.header)?;
             Ok((confirmation, hex(&Sha256::digest(&bytes))))
         };
         read().map_err(|error| notes.push(format!("not taken: {error}"))).ok()
     }
 
     fn record(&self, stored: &StoredHandover, done: &Confirmation, now: Duration) -> PassRecord {
-        let ticket = &stored.ticket;
+        let ticket = &stored.header;
         PassRecord {
             removed_mm3: done.removed_mm3,
             wheel_radius_mm: done.wheel_radius_mm,
@@ -161,8 +161,8 @@ impl Exchange for GrinderFolders {
 
     fn publish(&mut self, job: Job, sequence: u32, order: &GrindOrder, permit: &Permit) -> Result<(), ExchangeError> {
         let GrinderExchange { part, inbox, .. } = &self.settings;
-        let ticket = Ticket::new(part, job, sequence, &order.map_identity, order.pass.wheel_radius_mm, inbox)?;
-        let word = json_lines(&serde_json::json!(Confirmation::of(&ticket)));
+        let ticket = HandOverHeader::new(part, job, sequence, &order.map_identity, order.pass.wheel_radius_mm, inbox)?;
+        let word = json_lines(&serde_json::json!(Confirmation::from_ticket(&ticket)));
         let files = [
             ("correction.csv", correction_csv(&ticket, &order.map).into_bytes()),
             ("correction.json", json_lines(&correction_json(&ticket, order, inbox))),
@@ -174,14 +174,14 @@ impl Exchange for GrinderFolders {
         Ok(())
     }
 
-    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), ExchangeError> {
+    fn mark(&mut self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError> {
         self.expected = None;
         self.outbox.mark(job, standing)
     }
 
-    fn look(&mut self, now: Duration, job: Job) -> Result<Look<PassRecord>, ExchangeError> {
+    fn poll(&mut self, now: Duration, job: Job) -> Result<PollResult<PassRecord>, ExchangeError> {
         let stored = self.expect(job)?;
-        let found = self.watch.look(now)?;
+        let found = self.watch.scan(now)?;
         let mut notes = Vec::new();
         if self.confirmation(STARTED, &stored, &found, &mut notes).is_some() {
             self.started.get_or_insert(now);
@@ -190,37 +190,37 @@ impl Exchange for GrinderFolders {
         let begun = self.started.is_some() || done.is_some();
         let Some((done, sha)) = done else {
             let (what, word, file) = if begun { ("end", "done", DONE) } else { ("start", "started", STARTED) };
-            let map = stored.ticket.identity.get(..8).unwrap_or_default();
+            let map = stored.header.identity.get(..8).unwrap_or_default();
             notes.push(format!(
                 "waiting for the {what} to be confirmed: regrind confirm {word} --map {map}, or copy {file} from {} to {}",
                 stored.path.display(),
                 self.settings.inbox.display()
             ));
-            return Ok(Look { answer: None, begun, notes });
+            return Ok(PollResult { answer: None, start_confirmed: begun, notes });
         };
         if self.started.is_none() {
             notes.push("the end was confirmed without a start".to_owned());
         }
-        let taken = Taken { job: job.job, cycle: job.cycle, files: vec![(DONE.to_owned(), sha)] };
-        self.outbox.note_taken(&stored, &taken)?;
-        Ok(Look { answer: Some(self.record(&stored, &done, now)), begun, notes })
+        let taken = AcceptedFiles { job: job.job, cycle: job.cycle, files: vec![(DONE.to_owned(), sha)] };
+        self.outbox.record_accepted(&stored, &taken)?;
+        Ok(PollResult { answer: Some(self.record(&stored, &done, now)), start_confirmed: begun, notes })
     }
 
-    fn confirm(&mut self, job: Job, what: Confirmed, map_identity: [u8; 32]) -> Result<(), ExchangeError> {
+    fn confirm(&mut self, job: Job, what: ConfirmedStep, map_identity: [u8; 32]) -> Result<(), ExchangeError> {
         let stored = self.expect(job)?;
-        if hex(&map_identity) != stored.ticket.identity {
-            return Err(ExchangeError::OtherMap { expected: unhex(&stored.ticket.identity), found: map_identity });
+        if hex(&map_identity) != stored.header.identity {
+            return Err(ExchangeError::OtherMap { expected: unhex(&stored.header.identity), found: map_identity });
         }
-        if stored.standing != Standing::Open {
+        if stored.status != HandOverStatus::Open {
             return Err(ExchangeError::NotOpen { job: job.job, cycle: job.cycle });
         }
-        let name = if what == Confirmed::Started { STARTED } else { DONE };
-        let word = json_lines(&serde_json::json!(Confirmation::of(&stored.ticket)));
+        let name = if what == ConfirmedStep::Started { STARTED } else { DONE };
+        let word = json_lines(&serde_json::json!(Confirmation::from_ticket(&stored.header)));
         Ok(write_atomic(&self.settings.inbox.join(name), &word)?)
     }
 }
 
-fn correction_csv(ticket: &Ticket, map: &CorrectionMap) -> String {
+fn correction_csv(ticket: &HandOverHeader, map: &CorrectionMap) -> String {
     let mut text = format!(
         "# Regrind correction\n# part: {}\n# job: {}\n# cycle: {}\n# map: {}\n# units: mm\n# frame: model\n\
          # correction: by how much the ground surface is wanted displaced along the outward normal; positive leaves material\n\
@@ -235,7 +235,7 @@ fn correction_csv(ticket: &Ticket, map: &CorrectionMap) -> String {
     text
 }
 
-fn correction_json(ticket: &Ticket, order: &GrindOrder, inbox: &Path) -> serde_json::Value {
+fn correction_json(ticket: &HandOverHeader, order: &GrindOrder, inbox: &Path) -> serde_json::Value {
     let (map, grid, pass) = (&order.map, &order.map.grid, &order.pass);
     serde_json::json!({
         "kind": "correction map", "part": ticket.part, "job": ticket.job, "cycle": ticket.cycle, "map": ticket.identity,

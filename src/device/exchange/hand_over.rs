@@ -30,14 +30,14 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
     ) -> Result<(), ExchangeError>;
 
     /// Changes the standing of a hand-over.
-    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), ExchangeError>;
+    fn mark(&mut self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError>;
 
     /// Looks for the answer to an open hand-over. `now` is the time since the driver was created.
-    fn look(&mut self, now: Duration, job: Job) -> Result<Look<Self::Answer>, ExchangeError>;
+    fn poll(&mut self, now: Duration, job: Job) -> Result<PollResult<Self::Answer>, ExchangeError>;
 
     /// Records that a person has begun or ended the job with this map identity. The default returns an error, for
     /// machines that report a job by files alone.
-    fn confirm(&mut self, job: Job, _what: Confirmed, _map_identity: [u8; 32]) -> Result<(), ExchangeError> {
+    fn confirm(&mut self, job: Job, _what: ConfirmedStep, _map_identity: [u8; 32]) -> Result<(), ExchangeError> {
         Err(ExchangeError::NotOpen { job: job.job, cycle: job.cycle })
     }
 }
@@ -48,7 +48,7 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
 #[derive(Debug, Clone, Default)]
 pub struct Permit(Arc<AtomicU8>);
 
-const GIVEN: u8 = 0;
+const VALID: u8 = 0;
 const USED: u8 = 1;
 const WITHDRAWN: u8 = 2;
 
@@ -60,12 +60,12 @@ impl Permit {
 
     /// Uses the permit up. Returns false if it was withdrawn.
     pub fn use_up(&self) -> bool {
-        self.0.compare_exchange(GIVEN, USED, Ordering::AcqRel, Ordering::Acquire).is_ok()
+        self.0.compare_exchange(VALID, USED, Ordering::AcqRel, Ordering::Acquire).is_ok()
     }
 
     /// Withdraws the permit. Returns false if it was not valid any more, so that the hand-over may have appeared.
     pub(super) fn withdraw(&self) -> bool {
-        self.0.swap(WITHDRAWN, Ordering::AcqRel) == GIVEN
+        self.0.swap(WITHDRAWN, Ordering::AcqRel) == VALID
     }
 
     /// Returns true if the permit was withdrawn.
@@ -76,7 +76,7 @@ impl Permit {
 
 /// Fact that a person confirms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Confirmed {
+pub enum ConfirmedStep {
     /// The machine has begun.
     Started,
     /// The machine has ended, and the part is clear.
@@ -91,12 +91,12 @@ pub struct HandOver {
     /// Start number; it increases from one hand-over to the next.
     pub sequence: u32,
     /// Standing of the hand-over.
-    pub standing: Standing,
+    pub status: HandOverStatus,
 }
 
 /// Standing of a hand-over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Standing {
+pub enum HandOverStatus {
     /// It waits for its answer.
     Open,
     /// It was taken back temporarily.
@@ -111,11 +111,11 @@ pub enum Standing {
 
 /// Result of a look at the folders.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Look<A> {
+pub struct PollResult<A> {
     /// Answer, if it is there, complete and correct.
     pub answer: Option<A>,
     /// True if a person has confirmed that the machine has begun.
-    pub begun: bool,
+    pub start_confirmed: bool,
     /// Notes for a person: which files were ignored and why, and which are awaited.
     pub notes: Vec<String>,
 }

@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use tokio::time::{Instant, timeout};
 
-use super::{Confirmed, Exchange, ExchangeError, GrindOrder, HandOver, MeasureOrder, Permit, Standing};
+use super::{ConfirmedStep, Exchange, ExchangeError, GrindOrder, HandOver, HandOverStatus, MeasureOrder, Permit};
 use crate::{
-    Answer, Answered, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Identity, Interrupt, Job,
-    Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status, Word,
-    digest,
+    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt,
+    Job, Machine, MachineKind, Measurement, OperatorConfirmation, Outcome, Pass, PassRecord, Plan, Reconciled, Started,
+    State, Status, digest,
 };
 
 /// Machine that is reached through two folders.
@@ -18,7 +18,7 @@ use crate::{
 #[derive(Debug)]
 pub struct ExchangeMachine<M: Exchange> {
     name: Arc<str>,
-    answers_within: Duration,
+    timeout: Duration,
     made: Instant,
     machine: Arc<Mutex<FolderMachine<M>>>,
 }
@@ -36,18 +36,18 @@ struct FolderMachine<M: Exchange> {
     /// Job that is prepared, running or finished, and its start number.
     job: Option<(Job, u32)>,
     /// All hand-overs that were ever made, the oldest first.
-    handed: Vec<HandOver>,
+    hand_overs: Vec<HandOver>,
     outcome: Outcome,
     done: u32,
     answer: Option<M::Answer>,
-    begun: bool,
+    start_confirmed: bool,
     notes: Vec<String>,
     owned: bool,
     /// True if the machine cannot reach the part at the place where the other machine works.
     apart: bool,
     /// True if it is clear of the part. A person who confirms the end of a pass confirms this; a file that arrives does
     /// not.
-    clear: Option<bool>,
+    clear_of_part: Option<bool>,
 }
 
 impl<M: Exchange> ExchangeMachine<M> {
@@ -63,17 +63,17 @@ impl<M: Exchange> ExchangeMachine<M> {
             state: State::Idle,
             loaded: None,
             job: None,
-            handed: Vec::new(),
+            hand_overs: Vec::new(),
             outcome: Outcome::None,
             done: 0,
             answer: None,
-            begun: false,
+            start_confirmed: false,
             notes: Vec::new(),
             owned: false,
             apart: false,
-            clear: None,
+            clear_of_part: None,
         };
-        Self { name, answers_within, made: Instant::now(), machine: Arc::new(Mutex::new(machine)) }
+        Self { name, timeout: answers_within, made: Instant::now(), machine: Arc::new(Mutex::new(machine)) }
     }
 
     /// Sets if the machine is apart from the other one, so that it is always clear of the part.
@@ -84,31 +84,31 @@ impl<M: Exchange> ExchangeMachine<M> {
     }
 
     /// Runs work on the folders on a thread that may block.
-    async fn at_work<T: Send + 'static>(
+    async fn run_blocking<T: Send + 'static>(
         &self,
         what: &'static str,
-        work: impl FnOnce(&mut FolderMachine<M>, Duration) -> Answered<T> + Send + 'static,
-    ) -> Answered<T> {
+        work: impl FnOnce(&mut FolderMachine<M>, Duration) -> DeviceResult<T> + Send + 'static,
+    ) -> DeviceResult<T> {
         let (machine, now) = (Arc::clone(&self.machine), self.made.elapsed());
         let job = tokio::task::spawn_blocking(move || {
             let mut machine = machine.lock().unwrap_or_else(PoisonError::into_inner);
             work(&mut machine, now)
         });
-        let limit = self.answers_within;
+        let limit = self.timeout;
         match timeout(limit, job).await {
             Ok(Ok(told)) => told,
             Ok(Err(broken)) if broken.is_panic() => std::panic::resume_unwind(broken.into_panic()),
-            Ok(Err(_)) => Err(DeviceError::Disconnected { machine: Arc::clone(&self.name), what }),
-            Err(_) => Err(DeviceError::TimedOut { machine: Arc::clone(&self.name), what, limit }),
+            Ok(Err(_)) => Err(DeviceError::Disconnected { machine: Arc::clone(&self.name), operation: what }),
+            Err(_) => Err(DeviceError::TimedOut { machine: Arc::clone(&self.name), operation: what, limit }),
         }
     }
 
     async fn command(
         &self,
         command: Command,
-        work: impl FnOnce(&mut FolderMachine<M>) -> Answered<()> + Send + 'static,
-    ) -> Answered<Status> {
-        self.at_work("a command", move |machine, _| {
+        work: impl FnOnce(&mut FolderMachine<M>) -> DeviceResult<()> + Send + 'static,
+    ) -> DeviceResult<Status> {
+        self.run_blocking("a command", move |machine, _| {
             machine.check_connected("a command")?;
             if !machine.owned && !matches!(command, Command::Claim | Command::Abort) {
                 return Err(machine.refused(command, Answer::NotOwner));
@@ -119,8 +119,8 @@ impl<M: Exchange> ExchangeMachine<M> {
         .await
     }
 
-    async fn load(&self, request: M::Request, digest: u32) -> Answered<()> {
-        self.at_work("a payload", move |machine, _| {
+    async fn load(&self, request: M::Request, digest: u32) -> DeviceResult<()> {
+        self.run_blocking("a payload", move |machine, _| {
             machine.check_connected("a payload")?;
             if matches!(machine.state, State::Execute | State::Holding | State::Held) {
                 return Err(machine.refused(Command::Prepare, Answer::WrongState));
@@ -134,8 +134,8 @@ impl<M: Exchange> ExchangeMachine<M> {
         .await
     }
 
-    async fn answer(&self, job: Job) -> Answered<(M::Answer, u32)> {
-        self.at_work("a result", move |machine, _| {
+    async fn answer(&self, job: Job) -> DeviceResult<(M::Answer, u32)> {
+        self.run_blocking("a result", move |machine, _| {
             let same = machine.job.is_some_and(|(own, _)| own == job);
             match &machine.answer {
                 Some(answer) if machine.state == State::Complete && same => Ok((answer.clone(), machine.done)),
@@ -147,8 +147,12 @@ impl<M: Exchange> ExchangeMachine<M> {
 }
 
 impl<M: Exchange> FolderMachine<M> {
-    fn check_connected(&self, what: &'static str) -> Answered<()> {
-        if self.connected { Ok(()) } else { Err(DeviceError::NotConnected { machine: Arc::clone(&self.name), what }) }
+    fn check_connected(&self, what: &'static str) -> DeviceResult<()> {
+        if self.connected {
+            Ok(())
+        } else {
+            Err(DeviceError::NotConnected { machine: Arc::clone(&self.name), operation: what })
+        }
     }
 
     fn refused(&self, command: Command, answer: Answer) -> DeviceError {
@@ -165,9 +169,9 @@ impl<M: Exchange> FolderMachine<M> {
                 machine,
                 field: "the identity of the map",
                 sent: short(&expected),
-                held: short(&found),
+                found: short(&found),
             },
-            error => DeviceError::Folder { machine, why: error.to_string() },
+            error => DeviceError::Folder { machine, reason: error.to_string() },
         }
     }
 
@@ -176,34 +180,35 @@ impl<M: Exchange> FolderMachine<M> {
             job: self.job.map(|(job, _)| job),
             done: self.done,
             outcome: self.outcome,
-            clear_of_part: if self.apart { Some(true) } else { self.clear },
-            ..Status::of(self.state)
+            clear_of_part: if self.apart { Some(true) } else { self.clear_of_part },
+            ..Status::from_state(self.state)
         }
     }
 
     /// Reads the hand-overs in the folder. At the first call, an open or held hand-over gives the job and the state of
     /// this machine.
-    fn open(&mut self) -> Answered<()> {
-        self.handed = self.exchange.open().map_err(|error| self.failed(Command::Claim, error))?;
+    fn open(&mut self) -> DeviceResult<()> {
+        self.hand_overs = self.exchange.open().map_err(|error| self.failed(Command::Claim, error))?;
         if !self.connected
-            && let Some(last) = self.handed.last().filter(|h| matches!(h.standing, Standing::Open | Standing::Held))
+            && let Some(last) =
+                self.hand_overs.last().filter(|h| matches!(h.status, HandOverStatus::Open | HandOverStatus::Held))
         {
             self.job = Some((last.job, last.sequence));
-            self.state = if last.standing == Standing::Open { State::Execute } else { State::Held };
+            self.state = if last.status == HandOverStatus::Open { State::Execute } else { State::Held };
         }
         self.connected = true;
         Ok(())
     }
 
     /// Looks for the answer, if one is awaited.
-    fn look(&mut self, now: Duration) -> Answered<()> {
+    fn poll_answer(&mut self, now: Duration) -> DeviceResult<()> {
         let Some((job, sequence)) = self.job.filter(|_| self.state == State::Execute) else { return Ok(()) };
-        let look = self.exchange.look(now, job).map_err(|error| self.failed(Command::Start, error))?;
+        let look = self.exchange.poll(now, job).map_err(|error| self.failed(Command::Start, error))?;
         self.notes = look.notes;
-        self.begun = look.begun;
+        self.start_confirmed = look.start_confirmed;
         if look.answer.is_some() {
             self.answer = look.answer;
-            self.clear = (self.kind == MachineKind::Grinder).then_some(true);
+            self.clear_of_part = (self.kind == MachineKind::Grinder).then_some(true);
             self.finish(Outcome::Complete, sequence);
         }
         Ok(())
@@ -213,7 +218,7 @@ impl<M: Exchange> FolderMachine<M> {
         (self.state, self.outcome, self.done) = (State::Complete, outcome, sequence);
     }
 
-    fn prepare(&mut self, job: Job) -> Answered<Armed> {
+    fn prepare(&mut self, job: Job) -> DeviceResult<Armed> {
         if self.state != State::Idle {
             return Err(self.refused(Command::Prepare, Answer::WrongState));
         }
@@ -225,16 +230,16 @@ impl<M: Exchange> FolderMachine<M> {
             Some(_) => {}
         }
         self.open()?;
-        if self.handed.iter().any(|h| (h.job.job, h.job.cycle) == (job.job, job.cycle)) {
+        if self.hand_overs.iter().any(|h| (h.job.job, h.job.cycle) == (job.job, job.cycle)) {
             return Err(self.refused(Command::Prepare, Answer::AlreadyBegun));
         }
-        let start_sequence = self.handed.last().map_or(0, |h| h.sequence) + 1;
+        let start_sequence = self.hand_overs.last().map_or(0, |h| h.sequence) + 1;
         (self.job, self.state) = (Some((job, start_sequence)), State::Prepared);
-        (self.outcome, self.answer, self.begun) = (Outcome::None, None, false);
+        (self.outcome, self.answer, self.start_confirmed) = (Outcome::None, None, false);
         Ok(Armed { job, start_sequence, token: 0, boot_id: 0 })
     }
 
-    fn start(&mut self, armed: &Armed, permit: &Permit) -> Answered<Started> {
+    fn start(&mut self, armed: &Armed, permit: &Permit) -> DeviceResult<Started> {
         if permit.is_withdrawn() {
             return Err(self.refused(Command::Start, Answer::DeadToken));
         }
@@ -248,7 +253,7 @@ impl<M: Exchange> FolderMachine<M> {
         if let Err(error) = self.exchange.publish(job, sequence, request, permit) {
             return self.after_failed_start(armed, error, permit);
         }
-        self.handed.push(HandOver { job, sequence, standing: Standing::Open });
+        self.hand_overs.push(HandOver { job, sequence, status: HandOverStatus::Open });
         if permit.is_withdrawn() {
             return self.take_back_late(armed);
         }
@@ -257,27 +262,27 @@ impl<M: Exchange> FolderMachine<M> {
 
     /// Takes back a hand-over that appeared after it was given up. Its client may have continued without it, so it must
     /// not stay open. Its ending shows later that it was open for a moment.
-    fn take_back_late(&mut self, armed: &Armed) -> Answered<Started> {
-        self.mark(Command::Start, Standing::Stopped)?;
-        self.notes = self.taken_back();
+    fn take_back_late(&mut self, armed: &Armed) -> DeviceResult<Started> {
+        self.mark(Command::Start, HandOverStatus::Stopped)?;
+        self.notes = self.withdrawal_notes();
         self.finish(Outcome::Stopped, armed.start_sequence);
         Err(self.refused(Command::Start, Answer::DeadToken))
     }
 
-    fn started(&mut self, armed: &Armed) -> Answered<Started> {
-        (self.state, self.clear) = (State::Execute, None);
+    fn started(&mut self, armed: &Armed) -> DeviceResult<Started> {
+        (self.state, self.clear_of_part) = (State::Execute, None);
         self.notes = vec!["handed over; waiting for the answer".to_owned()];
         Ok(Started { job: armed.job, start_sequence: armed.start_sequence, status: self.status() })
     }
 
     /// Handles an error while the hand-over was published: reads from the folder if the hand-over is there.
-    fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError, permit: &Permit) -> Answered<Started> {
+    fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError, permit: &Permit) -> DeviceResult<Started> {
         let why = self.failed(Command::Start, error);
         match self.exchange.open() {
             Ok(handed) => {
-                self.handed = handed;
+                self.hand_overs = handed;
                 let ours = |h: &HandOver| (h.job, h.sequence) == (armed.job, armed.start_sequence);
-                if self.handed.iter().any(ours) {
+                if self.hand_overs.iter().any(ours) {
                     return if permit.is_withdrawn() { self.take_back_late(armed) } else { self.started(armed) };
                 }
                 (self.state, self.job) = (State::Idle, None);
@@ -287,45 +292,45 @@ impl<M: Exchange> FolderMachine<M> {
                 machine: Arc::clone(&self.name),
                 job: armed.job,
                 sequence: armed.start_sequence,
-                why: Box::new(why),
+                cause: Box::new(why),
             }),
         }
     }
 
-    fn mark(&mut self, command: Command, standing: Standing) -> Answered<()> {
+    fn mark(&mut self, command: Command, standing: HandOverStatus) -> DeviceResult<()> {
         let Some((job, sequence)) = self.job else { return Err(self.refused(command, Answer::WrongState)) };
         self.exchange.mark(job, standing).map_err(|error| self.failed(command, error))?;
-        for handed in self.handed.iter_mut().filter(|h| h.sequence == sequence) {
-            handed.standing = standing;
+        for handed in self.hand_overs.iter_mut().filter(|h| h.sequence == sequence) {
+            handed.status = standing;
         }
         Ok(())
     }
 
-    fn hold(&mut self) -> Answered<()> {
+    fn hold(&mut self) -> DeviceResult<()> {
         if self.state != State::Execute {
             return Err(self.refused(Command::Hold, Answer::WrongState));
         }
-        self.mark(Command::Hold, Standing::Held)?;
+        self.mark(Command::Hold, HandOverStatus::Held)?;
         self.state = State::Held;
-        self.notes = self.taken_back();
+        self.notes = self.withdrawal_notes();
         Ok(())
     }
 
-    fn resume(&mut self) -> Answered<()> {
+    fn resume(&mut self) -> DeviceResult<()> {
         if self.state != State::Held {
             return Err(self.refused(Command::Resume, Answer::WrongState));
         }
-        self.mark(Command::Resume, Standing::Open)?;
+        self.mark(Command::Resume, HandOverStatus::Open)?;
         self.state = State::Execute;
         Ok(())
     }
 
-    fn stop(&mut self) -> Answered<()> {
+    fn stop(&mut self) -> DeviceResult<()> {
         match (self.state, self.job) {
             (State::Prepared, _) => (self.state, self.job) = (State::Idle, None),
             (State::Execute | State::Held, Some((_, sequence))) => {
-                self.mark(Command::Stop, Standing::Stopped)?;
-                self.notes = self.taken_back();
+                self.mark(Command::Stop, HandOverStatus::Stopped)?;
+                self.notes = self.withdrawal_notes();
                 self.finish(Outcome::Stopped, sequence);
             }
             _ => return Err(self.refused(Command::Stop, Answer::WrongState)),
@@ -333,22 +338,23 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(())
     }
 
-    fn abort(&mut self) -> Answered<()> {
+    fn abort(&mut self) -> DeviceResult<()> {
         let was = std::mem::replace(&mut self.state, State::Aborted);
-        let lies = |h: &&HandOver| matches!(h.standing, Standing::Open | Standing::Held);
-        let ours = self.job.filter(|(_, sequence)| self.handed.iter().filter(lies).any(|h| h.sequence == *sequence));
+        let lies = |h: &&HandOver| matches!(h.status, HandOverStatus::Open | HandOverStatus::Held);
+        let ours =
+            self.job.filter(|(_, sequence)| self.hand_overs.iter().filter(lies).any(|h| h.sequence == *sequence));
         if was == State::Prepared || ours.is_none() {
             return Ok(());
         }
-        self.notes = self.taken_back();
+        self.notes = self.withdrawal_notes();
         (self.outcome, self.answer) = (Outcome::Aborted, None);
         // The state becomes ABORTED even if the folder cannot be reached. The error says that the hand-over may still
         // be there.
-        self.mark(Command::Abort, Standing::Aborted)
+        self.mark(Command::Abort, HandOverStatus::Aborted)
     }
 
-    fn taken_back(&self) -> Vec<String> {
-        let words = match (self.begun, self.kind) {
+    fn withdrawal_notes(&self) -> Vec<String> {
+        let words = match (self.start_confirmed, self.kind) {
             (true, MachineKind::Grinder) => {
                 "the hand-over was taken back, but the start was confirmed: stop the grinder at its own panel"
             }
@@ -362,7 +368,7 @@ impl<M: Exchange> FolderMachine<M> {
         vec![words.to_owned()]
     }
 
-    fn acknowledge(&mut self, done: u32) -> Answered<()> {
+    fn acknowledge(&mut self, done: u32) -> DeviceResult<()> {
         if self.state != State::Complete {
             return Err(self.refused(Command::Acknowledge, Answer::WrongState));
         }
@@ -370,20 +376,20 @@ impl<M: Exchange> FolderMachine<M> {
             return Err(self.refused(Command::Acknowledge, Answer::OtherResult));
         }
         if self.outcome == Outcome::Complete {
-            self.mark(Command::Acknowledge, Standing::Closed)?;
+            self.mark(Command::Acknowledge, HandOverStatus::Closed)?;
         }
         (self.state, self.job, self.answer) = (State::Idle, None, None);
-        (self.outcome, self.done, self.begun) = (Outcome::None, 0, false);
+        (self.outcome, self.done, self.start_confirmed) = (Outcome::None, 0, false);
         self.notes.clear();
         Ok(())
     }
 
     /// Accepts the operator confirmation that the job with this map identity has begun, or has ended with the part
     /// clear.
-    fn confirm(&mut self, what: Confirmed, map_identity: [u8; 32]) -> Answered<Vec<String>> {
+    fn confirm(&mut self, what: ConfirmedStep, map_identity: [u8; 32]) -> DeviceResult<Vec<String>> {
         self.check_connected("a confirmation")?;
         if self.kind == MachineKind::Cmm {
-            return Err(DeviceError::TellsItself { machine: Arc::clone(&self.name) });
+            return Err(DeviceError::ConfirmationNotNeeded { machine: Arc::clone(&self.name) });
         }
         let Some((job, _)) = self.job.filter(|_| self.state == State::Execute) else {
             return Err(self.refused(Command::Start, Answer::WrongState));
@@ -392,10 +398,10 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(Vec::new())
     }
 
-    fn reconcile(&mut self, intended: &Armed) -> Answered<Reconciled> {
+    fn reconcile(&mut self, intended: &Armed) -> DeviceResult<Reconciled> {
         self.open()?;
         let Job { job, cycle, .. } = intended.job;
-        let Some(handed) = self.handed.iter().find(|h| (h.job.job, h.job.cycle) == (job, cycle)).copied() else {
+        let Some(handed) = self.hand_overs.iter().find(|h| (h.job.job, h.job.cycle) == (job, cycle)).copied() else {
             // It will not be handed over later either: the prepared job is discarded.
             if self.state == State::Prepared {
                 (self.state, self.job) = (State::Idle, None);
@@ -407,40 +413,42 @@ impl<M: Exchange> FolderMachine<M> {
                 "the folder holds a hand-over of {} with number {}, meant was {} with number {}",
                 handed.job, handed.sequence, intended.job, intended.start_sequence
             );
-            return Ok(Reconciled::Unknown { why });
+            return Ok(Reconciled::Unknown { reason: why });
         }
         self.job = Some((handed.job, handed.sequence));
-        Ok(match handed.standing {
-            Standing::Open | Standing::Held if self.state == State::Complete => Reconciled::Finished(self.status()),
-            Standing::Open => {
+        Ok(match handed.status {
+            HandOverStatus::Open | HandOverStatus::Held if self.state == State::Complete => {
+                Reconciled::Finished(self.status())
+            }
+            HandOverStatus::Open => {
                 self.state = State::Execute;
                 Reconciled::Running(self.status())
             }
-            Standing::Held => {
+            HandOverStatus::Held => {
                 self.state = State::Held;
                 Reconciled::Running(self.status())
             }
-            Standing::Stopped => {
+            HandOverStatus::Stopped => {
                 self.finish(Outcome::Stopped, handed.sequence);
                 Reconciled::Finished(self.status())
             }
-            Standing::Aborted => {
+            HandOverStatus::Aborted => {
                 (self.state, self.outcome, self.done) = (State::Aborted, Outcome::Aborted, handed.sequence);
                 Reconciled::Finished(self.status())
             }
-            Standing::Closed => {
+            HandOverStatus::Closed => {
                 (self.state, self.job) = (State::Idle, None);
                 let why = "its result was acknowledged before; it must stand in the journal".to_owned();
-                Reconciled::Unknown { why }
+                Reconciled::Unknown { reason: why }
             }
         })
     }
 }
 
 /// Guard that withdraws a permit when nobody waits for its hand-over any more.
-struct GivenUp(Permit);
+struct WithdrawOnDrop(Permit);
 
-impl Drop for GivenUp {
+impl Drop for WithdrawOnDrop {
     fn drop(&mut self) {
         self.0.withdraw();
     }
@@ -460,24 +468,24 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
         }
     }
 
-    async fn connect(&mut self) -> Answered<Identity> {
-        self.at_work("who it is", |machine, _| {
+    async fn connect(&mut self) -> DeviceResult<Identity> {
+        self.run_blocking("who it is", |machine, _| {
             machine.open()?;
-            Ok(Identity::by_person(machine.kind, &machine.name))
+            Ok(Identity::for_manual_machine(machine.kind, &machine.name))
         })
         .await
     }
 
-    async fn status(&mut self) -> Answered<Status> {
-        self.at_work("its status", |machine, now| {
+    async fn status(&mut self) -> DeviceResult<Status> {
+        self.run_blocking("its status", |machine, now| {
             machine.check_connected("its status")?;
-            machine.look(now)?;
+            machine.poll_answer(now)?;
             Ok(machine.status())
         })
         .await
     }
 
-    async fn claim(&mut self) -> Answered<Status> {
+    async fn claim(&mut self) -> DeviceResult<Status> {
         self.command(Command::Claim, |machine| {
             machine.owned = true;
             Ok(())
@@ -485,8 +493,8 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
         .await
     }
 
-    async fn prepare(&mut self, job: Job) -> Answered<Armed> {
-        self.at_work("PREPARE", move |machine, _| {
+    async fn prepare(&mut self, job: Job) -> DeviceResult<Armed> {
+        self.run_blocking("PREPARE", move |machine, _| {
             machine.check_connected("PREPARE")?;
             if !machine.owned {
                 return Err(machine.refused(Command::Prepare, Answer::NotOwner));
@@ -496,14 +504,14 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
         .await
     }
 
-    async fn start(&mut self, armed: Armed) -> Answered<Started> {
+    async fn start(&mut self, armed: Armed) -> DeviceResult<Started> {
         let (job, sequence) = (armed.job, armed.start_sequence);
         let permit = Permit::new();
         let kept = permit.clone();
         // A client that drops this future no longer waits.
-        let _until_here = GivenUp(permit.clone());
+        let _until_here = WithdrawOnDrop(permit.clone());
         let told = self
-            .at_work("START", move |machine, _| {
+            .run_blocking("START", move |machine, _| {
                 machine.check_connected("START")?;
                 machine.start(&armed, &kept)
             })
@@ -516,29 +524,29 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
             // The hand-over may have appeared in this moment; then it is taken back.
             Err(why @ (DeviceError::TimedOut { .. } | DeviceError::Disconnected { .. })) => {
                 let machine = Arc::clone(&self.name);
-                Err(DeviceError::StartUnknown { machine, job, sequence, why: Box::new(why) })
+                Err(DeviceError::StartUnknown { machine, job, sequence, cause: Box::new(why) })
             }
             told => told,
         }
     }
 
-    async fn hold(&mut self) -> Answered<Status> {
+    async fn hold(&mut self) -> DeviceResult<Status> {
         self.command(Command::Hold, FolderMachine::hold).await
     }
 
-    async fn resume(&mut self) -> Answered<Status> {
+    async fn resume(&mut self) -> DeviceResult<Status> {
         self.command(Command::Resume, FolderMachine::resume).await
     }
 
-    async fn stop(&mut self) -> Answered<Status> {
+    async fn stop(&mut self) -> DeviceResult<Status> {
         self.command(Command::Stop, FolderMachine::stop).await
     }
 
-    async fn abort(&mut self) -> Answered<Status> {
+    async fn abort(&mut self) -> DeviceResult<Status> {
         self.command(Command::Abort, FolderMachine::abort).await
     }
 
-    async fn clear(&mut self) -> Answered<Status> {
+    async fn clear(&mut self) -> DeviceResult<Status> {
         self.command(Command::Clear, |machine| {
             if !matches!(machine.state, State::Aborted | State::Faulted) {
                 return Err(machine.refused(Command::Clear, Answer::WrongState));
@@ -550,11 +558,11 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
         .await
     }
 
-    async fn acknowledge(&mut self, done: u32) -> Answered<Status> {
+    async fn acknowledge(&mut self, done: u32) -> DeviceResult<Status> {
         self.command(Command::Acknowledge, move |machine| machine.acknowledge(done)).await
     }
 
-    async fn release(&mut self) -> Answered<Status> {
+    async fn release(&mut self) -> DeviceResult<Status> {
         self.command(Command::Release, |machine| {
             if machine.state == State::Execute {
                 return Err(machine.refused(Command::Release, Answer::WrongState));
@@ -565,42 +573,44 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
         .await
     }
 
-    async fn reconcile(&mut self, intended: &Armed) -> Answered<Reconciled> {
+    async fn reconcile(&mut self, intended: &Armed) -> DeviceResult<Reconciled> {
         let intended = intended.clone();
-        self.at_work("what became of a start", move |machine, _| machine.reconcile(&intended)).await
+        self.run_blocking("what became of a start", move |machine, _| machine.reconcile(&intended)).await
     }
 
-    async fn confirm(&mut self, word: Word) -> Answered<Vec<String>> {
+    async fn confirm(&mut self, word: OperatorConfirmation) -> DeviceResult<Vec<String>> {
         let (what, map_identity) = match word {
-            Word::Started { map_identity } => (Confirmed::Started, map_identity),
-            Word::Done { map_identity, .. } => (Confirmed::Done, map_identity),
-            Word::Still => return Err(DeviceError::TellsItself { machine: Arc::clone(&self.name) }),
+            OperatorConfirmation::Started { map_identity } => (ConfirmedStep::Started, map_identity),
+            OperatorConfirmation::Done { map_identity, .. } => (ConfirmedStep::Done, map_identity),
+            OperatorConfirmation::Still => {
+                return Err(DeviceError::ConfirmationNotNeeded { machine: Arc::clone(&self.name) });
+            }
         };
-        let map_identity = map_identity.ok_or_else(|| DeviceError::MapUnnamed { machine: Arc::clone(&self.name) })?;
-        self.at_work("a confirmation", move |machine, _| machine.confirm(what, map_identity)).await
+        let map_identity = map_identity.ok_or_else(|| DeviceError::MapNotNamed { machine: Arc::clone(&self.name) })?;
+        self.run_blocking("a confirmation", move |machine, _| machine.confirm(what, map_identity)).await
     }
 }
 
 impl<M: Exchange<Request = MeasureOrder, Answer = Measurement>> Cmm for ExchangeMachine<M> {
-    async fn load_plan(&mut self, plan: &Plan, _: &Interrupt) -> Answered<()> {
+    async fn load_plan(&mut self, plan: &Plan, _: &Interrupt) -> DeviceResult<()> {
         let plan_identity = plan.identity();
         self.load(MeasureOrder { plan: plan.clone(), plan_identity }, digest(&[plan_identity])).await
     }
 
-    async fn collect(&mut self, job: Job, _: &Interrupt) -> Answered<Measurement> {
+    async fn collect(&mut self, job: Job, _: &Interrupt) -> DeviceResult<Measurement> {
         let (measurement, done) = self.answer(job).await?;
         Ok(Measurement { done, ..measurement })
     }
 }
 
 impl<M: Exchange<Request = GrindOrder, Answer = PassRecord>> Grinder for ExchangeMachine<M> {
-    async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, _: &Interrupt) -> Answered<()> {
+    async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, _: &Interrupt) -> DeviceResult<()> {
         let map_identity = map.identity();
         let order = GrindOrder { map: map.clone(), pass: *pass, map_identity };
         self.load(order, digest(&[map_identity, pass.identity()])).await
     }
 
-    async fn collect(&mut self, job: Job, _: &Interrupt) -> Answered<PassRecord> {
+    async fn collect(&mut self, job: Job, _: &Interrupt) -> DeviceResult<PassRecord> {
         let (record, done) = self.answer(job).await?;
         Ok(PassRecord { done, ..record })
     }

@@ -4,14 +4,14 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use super::ExchangeError;
-use crate::{BesidePlan, Job, MeasuredPoint, Measurement, Plan, PointStatus};
+use crate::{Job, MeasuredPoint, Measurement, Plan, PlanMismatch, PointStatus};
 use regrind_core::geometry::Point;
 use regrind_formats::FormatError;
 use regrind_formats::result::{Content, Coordinates, ResultFile, Statements, check_ended, parse_result};
 
 /// Requirements for a measurement.
 #[derive(Clone, Copy, Debug)]
-pub struct Wanted<'a> {
+pub struct ResultRequirements<'a> {
     /// Numbers of the targets of the plan, in its order; `None` if any number of points is allowed.
     pub targets: Option<&'a [u32]>,
     /// Known properties of the files.
@@ -22,7 +22,7 @@ pub struct Wanted<'a> {
     pub probe_tolerance_mm: f64,
 }
 
-impl Wanted<'_> {
+impl ResultRequirements<'_> {
     /// Reads the bytes of a file of points and checks them against plan and cell; `path` is its name in messages.
     ///
     /// # Errors
@@ -47,9 +47,9 @@ impl Wanted<'_> {
     /// # Errors
     /// The number of points without indices differs from the number of targets, or an index is not a target of the plan
     /// or occurs twice.
-    pub fn matched(&self, path: &Path, result: &ResultFile) -> Result<Vec<MeasuredPoint>, ExchangeError> {
+    pub fn assign_by_index(&self, path: &Path, result: &ResultFile) -> Result<Vec<MeasuredPoint>, ExchangeError> {
         let Some(targets) = self.targets else { return Ok(numbered(&result.points)) };
-        let Some(indices) = &result.indices else { return self.in_order(path, &result.points) };
+        let Some(indices) = &result.indices else { return self.assign_in_order(path, &result.points) };
         // In the order of the plan; a target without a row counts as not found.
         let mut all: Vec<MeasuredPoint> = targets.iter().map(|&index| not_found(index)).collect();
         let place: HashMap<u32, usize> = targets.iter().enumerate().map(|(k, &t)| (t, k)).collect();
@@ -71,7 +71,7 @@ impl Wanted<'_> {
     ///
     /// # Errors
     /// The number of points differs from the number of targets of the plan.
-    pub fn in_order(&self, path: &Path, points: &[Point]) -> Result<Vec<MeasuredPoint>, ExchangeError> {
+    pub fn assign_in_order(&self, path: &Path, points: &[Point]) -> Result<Vec<MeasuredPoint>, ExchangeError> {
         match self.targets {
             None => Ok(numbered(points)),
             Some(targets) if points.len() != targets.len() => {
@@ -100,20 +100,20 @@ pub fn check_measurement(
     let expected = plan.targets.len();
     // A further batch has only a few targets, of which one may be out of reach. All batches together are checked once
     // they are there.
-    let is_first = Job { job: measurement.job, cycle: measurement.cycle, digest: 0 }.number().batch == 0;
+    let is_first = Job { job: measurement.job, cycle: measurement.cycle, digest: 0 }.batch_id().batch == 0;
     let least = if is_first { (least_found * expected as f64).ceil() as usize } else { expected.div_ceil(2) };
     if found < least {
-        return Err(ExchangeError::Short { path: path.to_owned(), found, expected, least });
+        return Err(ExchangeError::TooFewTargets { path: path.to_owned(), found, expected, min: least });
     }
     match plan.check(measurement) {
-        Err(BesidePlan::GivenBack) if rehearsal => Ok(()),
-        Err(beside) => Err(ExchangeError::Foreign { path: path.to_owned(), why: beside.to_string() }),
+        Err(PlanMismatch::EqualsPlan) if rehearsal => Ok(()),
+        Err(beside) => Err(ExchangeError::Foreign { path: path.to_owned(), reason: beside.to_string() }),
         Ok(()) => Ok(()),
     }
 }
 
 /// Assembles a measurement from its files. A value that no file gives stays unknown.
-pub fn measurement(
+pub fn assemble_measurement(
     points: Vec<MeasuredPoint>,
     results: &[ResultFile],
     job: Job,
@@ -135,7 +135,7 @@ pub fn measurement(
 }
 
 /// Returns the reason why the statements in a file contradict a plan; `None` if there is no contradiction.
-pub fn foreign(says: &Statements, part: &str, cycle: u16, plan: &str) -> Option<String> {
+pub fn contradiction(says: &Statements, part: &str, cycle: u16, plan: &str) -> Option<String> {
     if let Some(other) = says.part.as_ref().filter(|other| *other != part) {
         return Some(format!("is of part {other}, not {part}"));
     }
@@ -146,11 +146,11 @@ pub fn foreign(says: &Statements, part: &str, cycle: u16, plan: &str) -> Option<
 }
 
 fn touched(index: u32, at_mm: [f64; 3]) -> MeasuredPoint {
-    MeasuredPoint { index, status: PointStatus::Touched, quality: 0, at_mm }
+    MeasuredPoint { index, status: PointStatus::Touched, quality: 0, position_mm: at_mm }
 }
 
 fn not_found(index: u32) -> MeasuredPoint {
-    MeasuredPoint { index, status: PointStatus::NotFound, quality: 100, at_mm: [0.0; 3] }
+    MeasuredPoint { index, status: PointStatus::NotFound, quality: 100, position_mm: [0.0; 3] }
 }
 
 fn numbered(points: &[Point]) -> Vec<MeasuredPoint> {

@@ -20,29 +20,29 @@ use std::time::{Duration, SystemTime};
 
 use serde::{Deserialize, Serialize};
 
-use super::watch::{FileLook, Watch};
-use super::{ExchangeError, HandOver, Permit, Standing, file_word};
+use super::watch::{FileStamp, Watch};
+use super::{ExchangeError, HandOver, HandOverStatus, Permit, file_word};
 use crate::{Job, hex};
 use regrind_formats::{FormatError, read_whole, sync_folder, try_writing, write_atomic, write_json_atomic};
 
 /// File in every folder of a hand-over.
-const TICKET: &str = "handover.json";
+const HEADER_FILE: &str = "handover.json";
 /// File that is written there when an answer was accepted.
-const TAKEN: &str = "taken.json";
+const ACCEPTED_FILE: &str = "taken.json";
 /// Maximum size of these files, in bytes.
-const MOST_BYTES: u64 = 16 << 20;
+const MAX_BYTES: u64 = 16 << 20;
 
-const ENDINGS: [(Standing, &str); 5] = [
-    (Standing::Open, ""),
-    (Standing::Held, ".held"),
-    (Standing::Stopped, ".stopped"),
-    (Standing::Aborted, ".aborted"),
-    (Standing::Closed, ".done"),
+const ENDINGS: [(HandOverStatus, &str); 5] = [
+    (HandOverStatus::Open, ""),
+    (HandOverStatus::Held, ".held"),
+    (HandOverStatus::Stopped, ".stopped"),
+    (HandOverStatus::Aborted, ".aborted"),
+    (HandOverStatus::Closed, ".done"),
 ];
 
 /// What a hand-over says of itself.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Ticket {
+pub(super) struct HandOverHeader {
     /// Of this file's layout: 1.
     pub format: u16,
     pub part: String,
@@ -58,7 +58,7 @@ pub(super) struct Ticket {
     pub earlier: Vec<(String, u64, u128)>,
 }
 
-impl Ticket {
+impl HandOverHeader {
     /// Creates the ticket of a job, with the list of files that are in the inbox now.
     pub(super) fn new(
         part: &str,
@@ -68,7 +68,7 @@ impl Ticket {
         tool_radius_mm: f64,
         inbox: &Path,
     ) -> Result<Self, ExchangeError> {
-        let earlier = Watch::new(inbox, Duration::ZERO).look(Duration::ZERO)?.into_iter();
+        let earlier = Watch::new(inbox, Duration::ZERO).scan(Duration::ZERO)?.into_iter();
         Ok(Self {
             format: 1,
             part: part.to_owned(),
@@ -78,7 +78,7 @@ impl Ticket {
             start_number,
             identity: hex(identity),
             tool_radius_mm,
-            earlier: earlier.map(|file| (file.name, file.look.bytes, nanoseconds(file.look.modified))).collect(),
+            earlier: earlier.map(|file| (file.name, file.stamp.bytes, nanoseconds(file.stamp.modified))).collect(),
         })
     }
 
@@ -87,7 +87,7 @@ impl Ticket {
     }
 
     /// Returns true if a file was in the inbox before the hand-over and has not changed since.
-    pub(super) fn is_earlier(&self, name: &str, look: &FileLook) -> bool {
+    pub(super) fn is_earlier(&self, name: &str, look: &FileStamp) -> bool {
         self.earlier.iter().any(|(n, bytes, at)| n == name && *bytes == look.bytes && *at == nanoseconds(look.modified))
     }
 }
@@ -99,7 +99,7 @@ fn nanoseconds(at: SystemTime) -> u128 {
 
 /// What was accepted as the answer to a hand-over.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Taken {
+pub(super) struct AcceptedFiles {
     pub job: u32,
     pub cycle: u16,
     /// The files and the SHA-256 of their bytes.
@@ -110,9 +110,9 @@ pub(super) struct Taken {
 #[derive(Clone, Debug)]
 pub(super) struct StoredHandover {
     pub path: PathBuf,
-    pub ticket: Ticket,
-    pub standing: Standing,
-    pub taken: Option<Taken>,
+    pub header: HandOverHeader,
+    pub status: HandOverStatus,
+    pub accepted: Option<AcceptedFiles>,
 }
 
 /// Folder of the hand-overs.
@@ -125,12 +125,12 @@ impl Outbox {
     /// Checks access to this folder and to the inbox, and returns every hand-over, the oldest first.
     pub(super) fn open(&self, inbox: &mut Watch) -> Result<Vec<HandOver>, ExchangeError> {
         try_writing(&self.folder)?;
-        inbox.look(Duration::ZERO)?;
+        inbox.scan(Duration::ZERO)?;
         let handed = self.list()?.into_iter();
-        let hand_over = |StoredHandover { ticket, standing, .. }| HandOver {
+        let hand_over = |StoredHandover { header: ticket, status: standing, .. }| HandOver {
             job: ticket.job(),
             sequence: ticket.start_number,
-            standing,
+            status: standing,
         };
         Ok(handed.map(hand_over).collect())
     }
@@ -142,11 +142,12 @@ impl Outbox {
         for entry in fs::read_dir(&self.folder).map_err(unreadable)? {
             let path = entry.map_err(unreadable)?.path();
             let Some(name) = path.file_name().and_then(|n| n.to_str()) else { continue };
-            if name.starts_with('.') || !path.join(TICKET).is_file() {
+            if name.starts_with('.') || !path.join(HEADER_FILE).is_file() {
                 continue;
             }
-            let ticket: Ticket = read_json(&path.join(TICKET))?;
-            let taken = if path.join(TAKEN).is_file() { Some(read_json(&path.join(TAKEN))?) } else { None };
+            let ticket: HandOverHeader = read_json(&path.join(HEADER_FILE))?;
+            let taken =
+                if path.join(ACCEPTED_FILE).is_file() { Some(read_json(&path.join(ACCEPTED_FILE))?) } else { None };
             let ending = name.strip_prefix(base_name(&ticket.part, ticket.job()).as_str());
             let Some(standing) = ENDINGS.iter().find(|(_, e)| Some(*e) == ending).map(|(s, _)| *s) else {
                 let expected = "a folder with the name that was given to it, or with the ending .held, .stopped, .aborted or .done";
@@ -159,15 +160,15 @@ impl Outbox {
                 }
                 .into());
             };
-            found.push(StoredHandover { path, ticket, standing, taken });
+            found.push(StoredHandover { path, header: ticket, status: standing, accepted: taken });
         }
-        found.sort_by_key(|stored| stored.ticket.start_number);
+        found.sort_by_key(|stored| stored.header.start_number);
         Ok(found)
     }
 
     /// Returns the hand-over of a job and cycle, if there is one.
     fn find(&self, job: Job) -> Result<Option<StoredHandover>, ExchangeError> {
-        Ok(self.list()?.into_iter().find(|l| (l.ticket.job, l.ticket.cycle) == (job.job, job.cycle)))
+        Ok(self.list()?.into_iter().find(|l| (l.header.job, l.header.cycle) == (job.job, job.cycle)))
     }
 
     /// Returns the hand-over of a job and cycle; an error if it is missing.
@@ -178,7 +179,7 @@ impl Outbox {
     /// Publishes a hand-over in the folder: its ticket, and files by name. Nothing appears if the permit was withdrawn.
     pub(super) fn publish(
         &self,
-        ticket: &Ticket,
+        ticket: &HandOverHeader,
         files: &[(&str, Vec<u8>)],
         permit: &Permit,
     ) -> Result<(), ExchangeError> {
@@ -192,7 +193,7 @@ impl Outbox {
         for (name, bytes) in files {
             write_atomic(&draft.0.join(name), bytes)?;
         }
-        write_json_atomic(draft.0.join(TICKET), ticket)?;
+        write_json_atomic(draft.0.join(HEADER_FILE), ticket)?;
         if !permit.use_up() {
             return Err(ExchangeError::Withdrawn { job: ticket.job, cycle: ticket.cycle });
         }
@@ -201,19 +202,19 @@ impl Outbox {
     }
 
     /// Renames a hand-over so that its name shows its standing.
-    pub(super) fn mark(&self, job: Job, standing: Standing) -> Result<(), ExchangeError> {
+    pub(super) fn mark(&self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError> {
         let stored = self.handed_over(job)?;
         let ending = ENDINGS.iter().find(|(s, _)| *s == standing).map_or("", |(_, e)| *e);
-        let target = self.folder.join(base_name(&stored.ticket.part, stored.ticket.job()) + ending);
+        let target = self.folder.join(base_name(&stored.header.part, stored.header.job()) + ending);
         if target != stored.path { Ok(rename(&stored.path, &target)?) } else { Ok(()) }
     }
 
     /// Records which files were accepted as the answer.
-    pub(super) fn note_taken(&self, stored: &StoredHandover, taken: &Taken) -> Result<(), ExchangeError> {
-        if stored.taken.as_ref() == Some(taken) {
+    pub(super) fn record_accepted(&self, stored: &StoredHandover, taken: &AcceptedFiles) -> Result<(), ExchangeError> {
+        if stored.accepted.as_ref() == Some(taken) {
             return Ok(());
         }
-        Ok(write_json_atomic(stored.path.join(TAKEN), taken)?)
+        Ok(write_json_atomic(stored.path.join(ACCEPTED_FILE), taken)?)
     }
 }
 
@@ -250,7 +251,7 @@ fn rename(from: &Path, to: &Path) -> Result<(), FormatError> {
 
 /// Reads a small JSON file.
 pub(super) fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> Result<T, FormatError> {
-    let bytes = read_whole(path, MOST_BYTES)?;
+    let bytes = read_whole(path, MAX_BYTES)?;
     serde_json::from_slice(&bytes).map_err(|error| FormatError::Unexpected {
         path: path.to_owned(),
         place: format!("line {}", error.line()),

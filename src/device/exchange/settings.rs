@@ -11,15 +11,15 @@ use super::grinder::{GrinderExchange, GrinderFolders};
 use super::machine::ExchangeMachine;
 use super::pattern::Pattern;
 use crate::MachineKind;
-use crate::place::Place;
-use crate::wiring::{Making, MakingError, Wired};
+use crate::place::MachineTable;
+use crate::wiring::{DriverContext, DriverError, DriverFactory};
 use regrind_document::Document;
 use regrind_formats::references::read_references;
 use regrind_formats::result::{Content, Coordinates, DecimalMark};
 use regrind_formats::{Columns, Unit};
 
 /// Timeout for a folder, which may be on another computer, including the read of a large file.
-const ANSWERS_WITHIN: Duration = Duration::from_secs(30);
+const FOLDER_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// Files in two folders, and a person.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
@@ -35,7 +35,7 @@ pub struct ExchangeWire {
     #[schemars(range(min = 0.05, max = 3600.0))]
     pub stable_for_s: f64,
     /// What the coordinates of results are, where the files do not say so themselves; said nowhere, they are refused.
-    pub what: Option<Coordinates>,
+    pub coordinates: Option<Coordinates>,
     /// Decimal mark of results.
     pub decimal: DecimalMark,
     /// Unit of length of results.
@@ -61,7 +61,7 @@ pub struct ExchangeWire {
     #[schemars(length(min = 1, max = 200))]
     pub result: String,
     /// Whether files may be taken that lay in the inbox before the plan was handed over.
-    pub take_earlier: bool,
+    pub accept_earlier_files: bool,
     /// By how much the probe radius that a file states may differ from the recipe's.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub probe_tolerance_mm: f64,
@@ -69,7 +69,7 @@ pub struct ExchangeWire {
     #[schemars(length(min = 1, max = 40), example = &"PROBE6")]
     pub dmis_sensor: Option<String>,
     /// Whether the machine stands apart and cannot reach the part where the other one works: then nobody is asked whether it is clear.
-    pub apart: bool,
+    pub cannot_reach_part: bool,
 }
 
 impl Default for ExchangeWire {
@@ -78,7 +78,7 @@ impl Default for ExchangeWire {
             outbox: String::new(),
             inbox: String::new(),
             stable_for_s: 2.0,
-            what: None,
+            coordinates: None,
             decimal: DecimalMark::Auto,
             unit: Unit::Millimetre,
             height_unit: None,
@@ -88,10 +88,10 @@ impl Default for ExchangeWire {
             reference_group: None,
             reference_limit_mm: 0.1,
             result: "{part}_c{cycle}.*".to_owned(),
-            take_earlier: false,
+            accept_earlier_files: false,
             probe_tolerance_mm: 0.001,
             dmis_sensor: None,
-            apart: false,
+            cannot_reach_part: false,
         }
     }
 }
@@ -108,12 +108,12 @@ pub struct StationTable {
     pub reference: String,
 }
 
-impl Wired for ExchangeWire {
+impl DriverFactory for ExchangeWire {
     type Cmm = ExchangeMachine<CmmFolders>;
     type Grinder = ExchangeMachine<GrinderFolders>;
     const BY_PERSON: bool = true;
 
-    fn check(&self, place: &Place<'_>, document: &mut Document) {
+    fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         if self.outbox == self.inbox && !self.outbox.is_empty() {
             let allowed = "what is written and what is awaited must be told apart";
             document.report(&place.key("wire.inbox"), "is the same folder as `outbox`", allowed, "give each a folder");
@@ -123,7 +123,7 @@ impl Wired for ExchangeWire {
         self.check_dmis(place, document);
     }
 
-    fn check_beside(&self, grinder: &Self, document: &mut Document) {
+    fn check_against_grinder(&self, grinder: &Self, document: &mut Document) {
         if self.inbox == grinder.inbox && !self.inbox.is_empty() {
             let allowed = "a result must be told to one machine";
             document.report("grinder.wire.inbox", "is the inbox of the CMM too", allowed, "give each machine its own");
@@ -131,15 +131,15 @@ impl Wired for ExchangeWire {
     }
 
     fn coordinates(&self) -> Option<Coordinates> {
-        self.what
+        self.coordinates
     }
 
-    fn cmm(&self, making: &Making<'_>) -> Result<Self::Cmm, MakingError> {
+    fn create_cmm(&self, making: &DriverContext<'_>) -> Result<Self::Cmm, DriverError> {
         let [outbox, inbox] = self.folders(making, MachineKind::Cmm)?;
         let settings = CmmExchange {
             stable_for: Duration::from_secs_f64(self.stable_for_s),
             content: Content {
-                coordinates: self.what,
+                coordinates: self.coordinates,
                 decimal: self.decimal,
                 unit: self.unit,
                 height_unit: self.height_unit,
@@ -147,11 +147,11 @@ impl Wired for ExchangeWire {
             },
             result: Pattern::new(&*self.result),
             stations: self.stations(making)?,
-            free_count: making.free_points.is_some(),
-            least_points: making.free_points.unwrap_or(1),
-            least_found: making.least_found,
+            free_count: making.min_free_points.is_some(),
+            min_points: making.min_free_points.unwrap_or(1),
+            min_coverage: making.min_coverage,
             rehearsal: making.rehearsal,
-            take_earlier: self.take_earlier,
+            accept_earlier_files: self.accept_earlier_files,
             probe_tolerance_mm: self.probe_tolerance_mm,
             dmis_sensor: self.dmis_sensor.clone(),
             ..CmmExchange::new(making.part, outbox, &inbox)
@@ -159,7 +159,7 @@ impl Wired for ExchangeWire {
         Ok(self.machine(MachineKind::Cmm, &inbox, CmmFolders::new(settings)))
     }
 
-    fn grinder(&self, making: &Making<'_>) -> Result<Self::Grinder, MakingError> {
+    fn create_grinder(&self, making: &DriverContext<'_>) -> Result<Self::Grinder, DriverError> {
         let [outbox, inbox] = self.folders(making, MachineKind::Grinder)?;
         let stable_for = Duration::from_secs_f64(self.stable_for_s);
         let settings = GrinderExchange { part: making.part.to_owned(), outbox, inbox: inbox.clone(), stable_for };
@@ -170,18 +170,18 @@ impl Wired for ExchangeWire {
 impl ExchangeWire {
     fn machine<M: super::Exchange>(&self, kind: MachineKind, inbox: &Path, folders: M) -> ExchangeMachine<M> {
         let name = format!("{} by files, {}", kind.name(), inbox.display());
-        ExchangeMachine::new(name, kind, folders, ANSWERS_WITHIN).apart(self.apart)
+        ExchangeMachine::new(name, kind, folders, FOLDER_TIMEOUT).apart(self.cannot_reach_part)
     }
 
     /// Returns the two folders. Both must exist: Regrind does not create them, because nobody would look into a folder
     /// that it created itself.
-    fn folders(&self, making: &Making<'_>, machine: MachineKind) -> Result<[PathBuf; 2], MakingError> {
+    fn folders(&self, making: &DriverContext<'_>, machine: MachineKind) -> Result<[PathBuf; 2], DriverError> {
         let table = machine.name();
         let folder = |name: &str, path: &String| {
             let path = making.cell_folder.join(path);
             match path.is_dir() {
                 true => Ok(path),
-                false => Err(MakingError::Folder { key: format!("{table}.wire.{name}"), path, machine }),
+                false => Err(DriverError::Folder { key: format!("{table}.wire.{name}"), path, machine }),
             }
         };
         Ok([folder("outbox", &self.outbox)?, folder("inbox", &self.inbox)?])
@@ -189,13 +189,13 @@ impl ExchangeWire {
 
     /// Returns the settings of the stations. Reads the reference points at once, so that an error in them does not
     /// appear only after a day of measuring.
-    fn stations(&self, making: &Making<'_>) -> Result<Option<Stations>, MakingError> {
+    fn stations(&self, making: &DriverContext<'_>) -> Result<Option<Stations>, DriverError> {
         let Some(nominal) = self.reference_points.as_ref().map(|file| making.cell_folder.join(file)) else {
             return Ok(None);
         };
         let group = self.reference_group.clone();
         read_references(&nominal, group.as_deref())
-            .map_err(|source| MakingError::References { source: Box::new(source) })?;
+            .map_err(|source| DriverError::References { source: Box::new(source) })?;
         let files = self.stations.iter().map(|station| StationFiles {
             points: Pattern::new(&*station.points),
             references: Pattern::new(&*station.reference),
@@ -203,7 +203,7 @@ impl ExchangeWire {
         Ok(Some(Stations { files: files.collect(), nominal, group, limit_mm: self.reference_limit_mm }))
     }
 
-    fn check_result(&self, place: &Place<'_>, document: &mut Document) {
+    fn check_result(&self, place: &MachineTable<'_>, document: &mut Document) {
         let name = &self.result;
         let mut plain = name.to_owned();
         for word in ["{part}", "{job}", "{cycle}"] {
@@ -217,7 +217,7 @@ impl ExchangeWire {
         }
     }
 
-    fn check_dmis(&self, place: &Place<'_>, document: &mut Document) {
+    fn check_dmis(&self, place: &MachineTable<'_>, document: &mut Document) {
         let Some(sensor) = &self.dmis_sensor else { return };
         let key = place.key("wire.dmis_sensor");
         if place.table == "grinder" {
@@ -228,13 +228,18 @@ impl ExchangeWire {
             let allowed = "it must be a label of DMIS: letters, digits, _ and -";
             document.report(&key, format!("is {sensor:?}"), allowed, "write it as S(...) has it");
         }
-        if self.what.is_none() {
+        if self.coordinates.is_none() {
             let allowed = "a DMIS program says whether the radius of the probe is taken off";
-            document.report(&place.key("wire.what"), "is missing beside `dmis_sensor`", allowed, "centres or contacts");
+            document.report(
+                &place.key("wire.coordinates"),
+                "is missing beside `dmis_sensor`",
+                allowed,
+                "centres or contacts",
+            );
         }
     }
 
-    fn check_stations(&self, place: &Place<'_>, document: &mut Document) {
+    fn check_stations(&self, place: &MachineTable<'_>, document: &mut Document) {
         let (stations, reference) = (place.key("wire.stations"), place.key("wire.reference_points"));
         match (self.stations.is_empty(), self.reference_points.is_some()) {
             (false, false) if !document.has_problem(&reference) => {

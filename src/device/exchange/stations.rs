@@ -9,7 +9,7 @@ use regrind_core::geometry::{Point, Pose, RigidFit, Vector, fit_rigid};
 use regrind_formats::references::{Reference, References};
 
 /// Maximum number of nominal points for which subsets are tried, if a station names none.
-const MOST_NOMINAL: usize = 12;
+const MAX_NOMINAL: usize = 12;
 
 /// Pose of a station.
 #[derive(Clone, Debug, PartialEq)]
@@ -30,7 +30,7 @@ pub struct PlacedStation {
 
 impl PlacedStation {
     /// Returns in words the fit of this station and its missing points.
-    pub fn words(&self) -> String {
+    pub fn summary(&self) -> String {
         let each: Vec<String> = self.residuals.iter().map(|(name, r)| format!("{name} {:.3}", r.norm())).collect();
         let mut words = format!(
             "station {}: reference points fit to {:.3} mm rms ({} mm)",
@@ -126,13 +126,13 @@ fn match_points(
         seen: have,
         nominal: want,
         names: (0..want).map(|n| nominal.name(n)).collect::<Vec<_>>().join(", "),
-        why,
+        reason: why,
     };
     match have {
         _ if have == want => Ok(Matching { pairs: (0..have).map(|k| (k, k)).collect() }),
         _ if have > want => Err(refuse("it cannot be told which are extra")),
         _ if have < 3 => Err(refuse("3 are needed")),
-        _ if want > MOST_NOMINAL => Err(refuse("it cannot be told which are missing")),
+        _ if want > MAX_NOMINAL => Err(refuse("it cannot be told which are missing")),
         _ => match_subset(seen, nominal, limit_mm).map_err(refuse),
     }
 }
@@ -231,7 +231,7 @@ mod tests {
         let placed = place_station("3", &seen(&[3, 0, 4, 1], true), &nominal(4), 0.1).unwrap();
         assert!(is_planted(&placed));
         assert!(placed.missing == ["c"] && placed.extra == ["e"]);
-        assert!(placed.words().contains("does not see c; left out, not nominal: e"), "{}", placed.words());
+        assert!(placed.summary().contains("does not see c; left out, not nominal: e"), "{}", placed.summary());
         let placed = place_station("3", &seen(&[0, 2, 3, 4], false), &nominal(5), 0.1).unwrap();
         assert!(is_planted(&placed) && placed.missing == ["b"]);
     }

@@ -12,7 +12,7 @@ use regrind_formats::FormatError;
 
 /// Size and time of change of a file at one moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct FileLook {
+pub struct FileStamp {
     /// Length, in bytes.
     pub bytes: u64,
     /// Time of the last change, by the clock of its file system.
@@ -21,8 +21,8 @@ pub struct FileLook {
 
 /// File in the folder, and the time since which it has not changed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Known {
-    look: FileLook,
+struct KnownFile {
+    stamp: FileStamp,
     since: Duration,
 }
 
@@ -31,7 +31,7 @@ struct Known {
 pub struct Watch {
     folder: PathBuf,
     stable_for: Duration,
-    known: BTreeMap<String, Known>,
+    known: BTreeMap<String, KnownFile>,
 }
 
 /// File as found by the last look.
@@ -42,7 +42,7 @@ pub struct WatchedFile {
     /// Path of the file.
     pub path: PathBuf,
     /// Size and time of change.
-    pub look: FileLook,
+    pub stamp: FileStamp,
     /// True if it has not changed for long enough.
     pub settled: bool,
 }
@@ -64,7 +64,7 @@ impl Watch {
     ///
     /// # Errors
     /// The folder cannot be read.
-    pub fn look(&mut self, now: Duration) -> Result<Vec<WatchedFile>, FormatError> {
+    pub fn scan(&mut self, now: Duration) -> Result<Vec<WatchedFile>, FormatError> {
         let unreadable = |source| FormatError::Unreadable { path: self.folder.clone(), source };
         let mut known = BTreeMap::new();
         for entry in std::fs::read_dir(&self.folder).map_err(unreadable)? {
@@ -75,15 +75,15 @@ impl Watch {
             if name.starts_with('.') || !metadata.is_file() {
                 continue;
             }
-            let look = FileLook { bytes: metadata.len(), modified: metadata.modified().map_err(unreadable)? };
-            let before = self.known.get(&name).filter(|k| k.look == look);
-            known.insert(name, Known { look, since: before.map_or(now, |k| k.since) });
+            let look = FileStamp { bytes: metadata.len(), modified: metadata.modified().map_err(unreadable)? };
+            let before = self.known.get(&name).filter(|k| k.stamp == look);
+            known.insert(name, KnownFile { stamp: look, since: before.map_or(now, |k| k.since) });
         }
         self.known = known;
         let found = self.known.iter().map(|(name, known)| WatchedFile {
             name: name.clone(),
             path: self.folder.join(name),
-            look: known.look,
+            stamp: known.stamp,
             settled: now.saturating_sub(known.since) >= self.stable_for,
         });
         Ok(found.collect())
@@ -100,11 +100,11 @@ mod tests {
         let home = tempfile::tempdir().unwrap();
         let mut watch = Watch::new(home.path(), Duration::from_secs(2));
         let at = Duration::from_secs;
-        assert!(watch.look(at(0)).unwrap().is_empty());
+        assert!(watch.scan(at(0)).unwrap().is_empty());
         fs::write(home.path().join("a.csv"), "1,2,3\n").unwrap();
         fs::write(home.path().join(".hidden"), "").unwrap();
         fs::create_dir(home.path().join("folder")).unwrap();
-        let settled = |watch: &mut Watch, s| watch.look(at(s)).unwrap().iter().map(|f| f.settled).collect::<Vec<_>>();
+        let settled = |watch: &mut Watch, s| watch.scan(at(s)).unwrap().iter().map(|f| f.settled).collect::<Vec<_>>();
         assert_eq!(settled(&mut watch, 1), [false]);
         assert_eq!(settled(&mut watch, 2), [false]);
         // It grows, so the time starts again.
@@ -114,6 +114,6 @@ mod tests {
         assert_eq!(settled(&mut watch, 5), [true]);
         fs::remove_file(home.path().join("a.csv")).unwrap();
         assert!(settled(&mut watch, 6).is_empty());
-        assert!(matches!(Watch::new("/nowhere/at/all", at(1)).look(at(0)), Err(FormatError::Unreadable { .. })));
+        assert!(matches!(Watch::new("/nowhere/at/all", at(1)).scan(at(0)), Err(FormatError::Unreadable { .. })));
     }
 }

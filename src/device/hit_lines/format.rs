@@ -13,10 +13,10 @@ use serde::Deserialize;
 /// Letters of the axes, in order.
 const LETTERS: [char; 4] = ['X', 'Y', 'Z', 'W'];
 /// Maximum coordinate and angle that are accepted.
-const LARGEST_MM: f64 = 1e5;
-const LARGEST_DEG: f64 = 36_000.0;
+const MAX_COORDINATE_MM: f64 = 1e5;
+const MAX_ANGLE_DEG: f64 = 36_000.0;
 /// Maximum number of digits before the decimal mark, and after it.
-const MOST_DIGITS: usize = 9;
+const MAX_DIGITS: usize = 9;
 
 /// How a machine writes a hit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
@@ -91,7 +91,7 @@ pub enum Separator {
 
 /// Parameters of the parsing of lines.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Reading {
+pub struct LineParser {
     /// Format of a line.
     pub format: LineFormat,
     /// Separator between two values.
@@ -106,7 +106,7 @@ pub struct Reading {
     pub axes: [usize; 3],
 }
 
-impl Default for Reading {
+impl Default for LineParser {
     fn default() -> Self {
         Self {
             format: LineFormat::Decimal,
@@ -123,44 +123,44 @@ impl Default for Reading {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
     /// Position of the touch in the machine's frame, in mm.
-    pub at_mm: [f64; 3],
+    pub position_mm: [f64; 3],
     /// Angle of the rotary table, in degrees.
     pub rotary_deg: Option<f64>,
 }
 
 /// Reason why a line is refused.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct LineFlaw {
+pub struct LineError {
     /// Number of the value, from 1; 0 for the whole line.
     pub value: usize,
     /// Explanation in words.
-    pub why: String,
+    pub reason: String,
 }
 
-impl LineFlaw {
-    pub(super) fn of_line(why: impl Into<String>) -> Self {
-        Self { value: 0, why: why.into() }
+impl LineError {
+    pub(super) fn whole_line(why: impl Into<String>) -> Self {
+        Self { value: 0, reason: why.into() }
     }
 }
 
-impl fmt::Display for LineFlaw {
+impl fmt::Display for LineError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.value {
-            0 => f.write_str(&self.why),
-            value => write!(f, "its value {value} {}", self.why),
+            0 => f.write_str(&self.reason),
+            value => write!(f, "its value {value} {}", self.reason),
         }
     }
 }
 
-impl Reading {
+impl LineParser {
     /// Parses a line without its line end.
     ///
     /// # Errors
     /// Returns an error if the line is not exactly of the format.
-    pub fn read(&self, line: &str) -> Result<Hit, LineFlaw> {
+    pub fn read(&self, line: &str) -> Result<Hit, LineError> {
         if let Some((at, c)) = line.chars().enumerate().find(|(_, c)| !matches!(c, '\t' | ' '..='~')) {
             let why = format!("its character {} is {c:?}, which is no plain text", at + 1);
-            return Err(LineFlaw::of_line(why));
+            return Err(LineError::whole_line(why));
         }
         let fields = self.fields(line)?;
         let mut at_mm = [0.0; 3];
@@ -168,10 +168,10 @@ impl Reading {
             at_mm[self.axes[k]] = self.coordinate(k, field)?;
         }
         let rotary_deg = fields.get(3).map(|field| self.angle(field)).transpose()?;
-        Ok(Hit { at_mm, rotary_deg })
+        Ok(Hit { position_mm: at_mm, rotary_deg })
     }
 
-    fn fields<'l>(&self, line: &'l str) -> Result<Vec<&'l str>, LineFlaw> {
+    fn fields<'l>(&self, line: &'l str) -> Result<Vec<&'l str>, LineError> {
         let line = line.trim_matches(' ');
         let fields: Vec<&str> = match self.separator {
             Separator::Comma => line.split(',').collect(),
@@ -185,23 +185,23 @@ impl Reading {
             found if found > expected => "two lines have run together, or it is in another format",
             _ => return Ok(fields),
         };
-        Err(LineFlaw::of_line(format!("it has {} values where {expected} belong: {why}", fields.len())))
+        Err(LineError::whole_line(format!("it has {} values where {expected} belong: {why}", fields.len())))
     }
 
     /// Removes the letter from a value, if the format requires one.
-    fn number<'f>(&self, k: usize, field: &'f str) -> Result<&'f str, LineFlaw> {
+    fn number<'f>(&self, k: usize, field: &'f str) -> Result<&'f str, LineError> {
         let field = field.trim_matches(' ');
         if !self.format.is_lettered() {
             return Ok(field);
         }
         let letter = LETTERS[k];
         let number = field.strip_prefix(letter).or(field.strip_prefix(letter.to_ascii_lowercase()));
-        number.ok_or_else(|| LineFlaw { value: k + 1, why: format!("is {field:?}, and begins with no {letter}") })
+        number.ok_or_else(|| LineError { value: k + 1, reason: format!("is {field:?}, and begins with no {letter}") })
     }
 
-    fn coordinate(&self, k: usize, field: &str) -> Result<f64, LineFlaw> {
+    fn coordinate(&self, k: usize, field: &str) -> Result<f64, LineError> {
         let number = self.number(k, field)?;
-        let flaw = |why: String| LineFlaw { value: k + 1, why: format!("is {field:?}, {why}") };
+        let flaw = |why: String| LineError { value: k + 1, reason: format!("is {field:?}, {why}") };
         let (digits, scale_mm) = match self.format.is_integer() {
             true => (0, 1e-3),
             false => (self.decimals, self.unit_mm),
@@ -211,21 +211,21 @@ impl Reading {
             _ => flaw(format!("and not a number with {digits} digits behind a {:?}", self.mark)),
         })?;
         let value_mm = if scale_mm == 1e-3 { value / 1e3 } else { value * scale_mm };
-        if value_mm.abs() > LARGEST_MM {
-            return Err(flaw(format!("and {LARGEST_MM} mm is the most")));
+        if value_mm.abs() > MAX_COORDINATE_MM {
+            return Err(flaw(format!("and {MAX_COORDINATE_MM} mm is the most")));
         }
         Ok(value_mm)
     }
 
-    fn angle(&self, field: &str) -> Result<f64, LineFlaw> {
+    fn angle(&self, field: &str) -> Result<f64, LineError> {
         let number = self.number(3, field)?;
-        let flaw = |why: &str| LineFlaw { value: 4, why: format!("is {field:?}, {why}") };
+        let flaw = |why: &str| LineError { value: 4, reason: format!("is {field:?}, {why}") };
         let angle = match self.format.is_integer() {
             true => exact(number, self.mark, 0, 0).map(|tenths| tenths / 10.0),
-            false => exact(number, self.mark, 1, MOST_DIGITS),
+            false => exact(number, self.mark, 1, MAX_DIGITS),
         };
         let angle = angle.ok_or_else(|| flaw("and not an angle"))?;
-        if angle.abs() > LARGEST_DEG {
+        if angle.abs() > MAX_ANGLE_DEG {
             return Err(flaw("and 36000 degrees are the most"));
         }
         Ok(angle)
@@ -254,7 +254,7 @@ impl Reading {
     }
 }
 
-impl fmt::Display for Reading {
+impl fmt::Display for LineParser {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "format = {:?}", self.format.name())?;
         if !self.format.is_integer() {
@@ -282,7 +282,7 @@ fn exact(text: &str, mark: char, least: usize, most: usize) -> Option<f64> {
         _ => return None,
     };
     let are_digits = |text: &str| text.bytes().all(|b| b.is_ascii_digit());
-    let fits = (1..=MOST_DIGITS).contains(&whole.len()) && (least..=most).contains(&behind.len());
+    let fits = (1..=MAX_DIGITS).contains(&whole.len()) && (least..=most).contains(&behind.len());
     if !fits || !are_digits(whole) || !are_digits(behind) {
         return None;
     }
@@ -310,24 +310,24 @@ mod tests {
     fn each_example_is_read_by_its_own_format_and_by_no_other() {
         for (format, line) in EXAMPLES {
             for (other, _) in EXAMPLES {
-                let read = Reading { format: other, ..Reading::default() }.read(line);
+                let read = LineParser { format: other, ..LineParser::default() }.read(line);
                 if other == format {
                     let rotary_deg = format.has_rotary().then_some(245.5);
-                    assert_eq!(read, Ok(Hit { at_mm: [100.0, 200.0, 300.0], rotary_deg }), "{line}");
+                    assert_eq!(read, Ok(Hit { position_mm: [100.0, 200.0, 300.0], rotary_deg }), "{line}");
                 } else {
                     assert!(read.is_err(), "{line} as {other:?}: {read:?}");
                 }
             }
-            let fitting = Reading::fitting(line);
+            let fitting = LineParser::fitting(line);
             assert_eq!(fitting.len(), 1, "{line}: {fitting:?}");
             assert_eq!(fitting[0].format, format);
         }
-        assert_eq!(Reading::fitting(EXAMPLES[0].1)[0].to_string(), "format = \"decimal\", decimals = 3");
+        assert_eq!(LineParser::fitting(EXAMPLES[0].1)[0].to_string(), "format = \"decimal\", decimals = 3");
     }
 
     #[test]
     fn a_line_that_lost_or_gained_anything_is_refused_with_the_place() {
-        let reading = Reading::default();
+        let reading = LineParser::default();
         for (line, why) in [
             ("100.000,200.000", "it has 2 values where 3 belong: it is cut short"),
             ("100.000,200.000,300.00", "its value 3 is \"300.00\", and not a number with 3 digits"),
@@ -348,23 +348,23 @@ mod tests {
             let flaw = reading.read(line).unwrap_err().to_string();
             assert!(flaw.contains(why), "{line:?}: {flaw}");
         }
-        let lettered = Reading { format: LineFormat::LetteredDecimal, ..reading };
+        let lettered = LineParser { format: LineFormat::LetteredDecimal, ..reading };
         for line in ["X1.000,Z2.000,Y3.000", "1.000,2.000,3.000", "X1.000,Y2.000,Z3.000,W1.0"] {
             assert!(lettered.read(line).is_err(), "{line}");
         }
-        assert_eq!(lettered.read(" x-1.000, y+2.000,  z0.500").unwrap().at_mm, [-1.0, 2.0, 0.5]);
+        assert_eq!(lettered.read(" x-1.000, y+2.000,  z0.500").unwrap().position_mm, [-1.0, 2.0, 0.5]);
     }
 
     #[test]
     fn no_character_of_a_line_can_be_lost_behind_the_mark_and_be_another_number() {
-        let reading = Reading::default();
+        let reading = LineParser::default();
         let line = "-12.345,0.007,123.400";
-        let whole = reading.read(line).unwrap().at_mm;
+        let whole = reading.read(line).unwrap().position_mm;
         for lost in 0..line.len() {
             let short: String = line.chars().enumerate().filter(|(k, _)| *k != lost).map(|(_, c)| c).collect();
             if let Ok(hit) = reading.read(&short) {
                 // A sign, or a digit before the mark, is missing: the error is then millimetres.
-                let away = (0..3).map(|k| (hit.at_mm[k] - whole[k]).abs()).fold(0.0, f64::max);
+                let away = (0..3).map(|k| (hit.position_mm[k] - whole[k]).abs()).fold(0.0, f64::max);
                 assert!(away >= 1.0, "{short}: {away}");
             }
         }
@@ -372,13 +372,13 @@ mod tests {
 
     #[test]
     fn marks_separators_units_and_axes_are_those_of_the_cell_file() {
-        let german = Reading { mark: ',', separator: Separator::Semicolon, ..Reading::default() };
-        assert_eq!(german.read("1,500;-2,250;0,125").unwrap().at_mm, [1.5, -2.25, 0.125]);
+        let german = LineParser { mark: ',', separator: Separator::Semicolon, ..LineParser::default() };
+        assert_eq!(german.read("1,500;-2,250;0,125").unwrap().position_mm, [1.5, -2.25, 0.125]);
         assert!(german.read("1.500;-2.250;0.125").is_err());
-        let blanks = Reading { separator: Separator::Blank, decimals: 4, unit_mm: 25.4, ..Reading::default() };
-        assert_eq!(blanks.read("  1.0000   2.0000 -0.5000 ").unwrap().at_mm, [25.4, 50.8, -12.7]);
-        let turned = Reading { axes: [1, 2, 0], ..Reading::default() };
-        assert_eq!(turned.read("1.000,2.000,3.000").unwrap().at_mm, [3.0, 1.0, 2.0]);
-        assert_eq!(Reading::fitting("1,500;-2,250;0,125")[0], german);
+        let blanks = LineParser { separator: Separator::Blank, decimals: 4, unit_mm: 25.4, ..LineParser::default() };
+        assert_eq!(blanks.read("  1.0000   2.0000 -0.5000 ").unwrap().position_mm, [25.4, 50.8, -12.7]);
+        let turned = LineParser { axes: [1, 2, 0], ..LineParser::default() };
+        assert_eq!(turned.read("1.000,2.000,3.000").unwrap().position_mm, [3.0, 1.0, 2.0]);
+        assert_eq!(LineParser::fitting("1,500;-2,250;0,125")[0], german);
     }
 }

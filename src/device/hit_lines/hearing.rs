@@ -11,20 +11,20 @@ use std::time::Duration;
 use serde::Serialize;
 use tokio::time::Instant;
 
-use super::format::{LineFlaw, Reading};
-use super::lines::Gathered;
-use super::list::{List, Touch};
+use super::format::{LineError, LineParser};
+use super::lines::ReceivedLine;
+use super::list::{TargetList, TouchAssignment};
 use crate::error::DeviceError;
 use crate::words::{Job, Outcome, State, hex};
 use regrind_formats::AddedLines;
 
 /// Number of refused lines kept for a person: the last ones.
-const SHOWN: usize = 4;
+const MAX_REFUSED_SHOWN: usize = 4;
 
 /// Parameters by which lines are judged.
 #[derive(Clone, Debug)]
-pub(super) struct Judging {
-    pub(super) reading: Reading,
+pub(super) struct LineRules {
+    pub(super) parser: LineParser,
     /// Required angle of the rotary table and its tolerance, in degrees.
     pub(super) rotary_deg: [f64; 2],
     /// Beginnings of lines that are ignored.
@@ -33,41 +33,41 @@ pub(super) struct Judging {
 
 /// Requested measurement, current or finished.
 #[derive(Debug)]
-pub(super) struct Asked {
+pub(super) struct RequestedMeasurement {
     pub(super) job: Job,
     pub(super) sequence: u32,
     pub(super) plan_identity: [u8; 32],
-    pub(super) list: List,
+    pub(super) list: TargetList,
     /// File that stores each line as it came.
-    pub(super) kept: Option<AddedLines>,
+    pub(super) line_log: Option<AddedLines>,
     pub(super) begun: Instant,
     pub(super) last_line: Instant,
     /// Number of lines since it began.
     lines: u32,
-    doubles: u32,
-    refused: VecDeque<String>,
+    duplicate_lines: u32,
+    refused_lines: VecDeque<String>,
 }
 
 /// State that the driver and the listening thread share.
 #[derive(Debug)]
-pub(super) struct Hearing {
-    judging: Judging,
+pub(super) struct MeasurementSession {
+    rules: LineRules,
     pub(super) state: State,
     pub(super) outcome: Outcome,
-    pub(super) asked: Option<Asked>,
+    pub(super) measurement: Option<RequestedMeasurement>,
     /// True if the probe is clear of the part, as a person confirmed or by the time in the cell file; `None` if
     /// unknown.
-    pub(super) clear: Option<bool>,
-    pub(super) worked: Duration,
+    pub(super) clear_of_part: Option<bool>,
+    pub(super) duration: Duration,
     /// Reason why the line is lost.
-    pub(super) lost: Option<DeviceError>,
+    pub(super) link_error: Option<DeviceError>,
     /// Number of lines that came without a request, and the last of them.
-    unasked: (u32, String),
+    unrequested_lines: (u32, String),
 }
 
 /// Line as it is stored.
 #[derive(Serialize)]
-struct Kept<'a> {
+struct LoggedLine<'a> {
     /// Seconds since the measurement began.
     at_s: f64,
     line: &'a str,
@@ -80,79 +80,92 @@ struct Kept<'a> {
 }
 
 /// Locks the shared state. A panic in another thread does not make it invalid, so a poisoned lock is ignored.
-pub(super) fn locked(hearing: &Mutex<Hearing>) -> MutexGuard<'_, Hearing> {
+pub(super) fn locked(hearing: &Mutex<MeasurementSession>) -> MutexGuard<'_, MeasurementSession> {
     hearing.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-impl Asked {
+impl RequestedMeasurement {
     pub(super) fn new(
         (job, sequence): (Job, u32),
         plan_identity: [u8; 32],
-        list: List,
+        list: TargetList,
         kept: Option<AddedLines>,
     ) -> Self {
         let (now, refused) = (Instant::now(), VecDeque::new());
-        Self { job, sequence, plan_identity, list, kept, begun: now, last_line: now, lines: 0, doubles: 0, refused }
+        Self {
+            job,
+            sequence,
+            plan_identity,
+            list,
+            line_log: kept,
+            begun: now,
+            last_line: now,
+            lines: 0,
+            duplicate_lines: 0,
+            refused_lines: refused,
+        }
     }
 
-    fn keep(&self, line: &str, target: Option<u32>, passed_over: Option<&str>, refused: Option<&str>) {
+    fn log_line(&self, line: &str, target: Option<u32>, passed_over: Option<&str>, refused: Option<&str>) {
         let at_s = self.begun.elapsed().as_secs_f64();
-        if let Some(kept) = &self.kept {
-            kept.add(&Kept { at_s, line, target, passed_over, refused });
+        if let Some(kept) = &self.line_log {
+            kept.add(&LoggedLine { at_s, line, target, passed_over, refused });
         }
     }
 
     fn refuse(&mut self, line: &str, why: &str) {
-        self.keep(line, None, None, Some(why));
+        self.log_line(line, None, None, Some(why));
         let shown: String = line.chars().take(80).collect();
-        self.refused.push_back(format!("REFUSED line {} of the measurement, {shown:?}: {why}", self.lines));
-        if self.refused.len() > SHOWN {
-            self.refused.pop_front();
+        self.refused_lines.push_back(format!("REFUSED line {} of the measurement, {shown:?}: {why}", self.lines));
+        if self.refused_lines.len() > MAX_REFUSED_SHOWN {
+            self.refused_lines.pop_front();
         }
     }
 }
 
-impl Hearing {
-    pub(super) fn new(judging: Judging) -> Self {
+impl MeasurementSession {
+    pub(super) fn new(judging: LineRules) -> Self {
         Self {
-            judging,
+            rules: judging,
             state: State::Idle,
             outcome: Outcome::None,
-            asked: None,
-            clear: None,
-            worked: Duration::ZERO,
-            lost: None,
-            unasked: (0, String::new()),
+            measurement: None,
+            clear_of_part: None,
+            duration: Duration::ZERO,
+            link_error: None,
+            unrequested_lines: (0, String::new()),
         }
     }
 
     /// Processes what came over the line.
-    pub(super) fn take(&mut self, gathered: Gathered) {
+    pub(super) fn process(&mut self, gathered: ReceivedLine) {
         match gathered {
-            Gathered::Line(line) => self.line(&line),
-            Gathered::Endless(text) => self.flawed(&text, "it does not end: see baud rate, parity and the cable"),
+            ReceivedLine::Line(line) => self.line(&line),
+            ReceivedLine::Endless(text) => {
+                self.reject_line(&text, "it does not end: see baud rate, parity and the cable")
+            }
         }
     }
 
     /// Processes a line that has begun and whose rest does not come.
     pub(super) fn cut_short(&mut self, text: &str) {
-        self.flawed(text, "its end did not come: it is cut short; touch that point again");
+        self.reject_line(text, "its end did not come: it is cut short; touch that point again");
     }
 
     fn line(&mut self, line: &str) {
-        let begins = self.judging.passed_over.iter().any(|beginning| line.trim_start().starts_with(beginning.as_str()));
+        let begins = self.rules.passed_over.iter().any(|beginning| line.trim_start().starts_with(beginning.as_str()));
         if begins {
-            if let Some(asked) = self.asked.as_mut().filter(|_| self.state.moves()) {
+            if let Some(asked) = self.measurement.as_mut().filter(|_| self.state.is_moving()) {
                 asked.lines += 1;
-                asked.keep(line, None, Some("it begins as the cell file says"), None);
+                asked.log_line(line, None, Some("it begins as the cell file says"), None);
             }
             return;
         }
-        let judging = &self.judging;
-        let read = judging.reading.read(line).map_err(|flaw| format!("{flaw}; touch that point again"));
+        let judging = &self.rules;
+        let read = judging.parser.read(line).map_err(|flaw| format!("{flaw}; touch that point again"));
         let hit = match read {
             Ok(hit) => hit,
-            Err(why) => return self.flawed(line, &why),
+            Err(why) => return self.reject_line(line, &why),
         };
         if let Some(stands_deg) = hit.rotary_deg
             && !(stands_deg - judging.rotary_deg[0]).abs().le(&judging.rotary_deg[1])
@@ -162,25 +175,29 @@ impl Hearing {
                 "the rotary table stands at {stands_deg} degrees, and {wanted_deg} within {within_deg} are wanted: turn it back, and touch the \
                  point again"
             );
-            return self.flawed(line, &why);
+            return self.reject_line(line, &why);
         }
-        let Some(asked) = self.asked.as_mut().filter(|_| self.state.moves()) else { return self.flawed(line, "") };
+        let Some(asked) = self.measurement.as_mut().filter(|_| self.state.is_moving()) else {
+            return self.reject_line(line, "");
+        };
         asked.lines += 1;
         asked.last_line = Instant::now();
-        match asked.list.take(line, hit.at_mm, asked.begun.elapsed()) {
-            Ok(Touch::Of(index) | Touch::Again(index)) => asked.keep(line, Some(index), None, None),
-            Ok(Touch::Double) => {
-                asked.doubles += 1;
-                asked.keep(line, None, Some("it is the line before, sent twice"), None);
+        match asked.list.assign(line, hit.position_mm, asked.begun.elapsed()) {
+            Ok(TouchAssignment::First(index) | TouchAssignment::Repeated(index)) => {
+                asked.log_line(line, Some(index), None, None)
+            }
+            Ok(TouchAssignment::DuplicateLine) => {
+                asked.duplicate_lines += 1;
+                asked.log_line(line, None, Some("it is the line before, sent twice"), None);
             }
             Err(why) => self.refuse(line, &why),
         }
     }
 
     /// Processes a line that is not a valid touch; without a request it is only noted.
-    fn flawed(&mut self, line: &str, why: &str) {
-        match (&mut self.asked, self.state) {
-            (Some(asked), state) if state.moves() => {
+    fn reject_line(&mut self, line: &str, why: &str) {
+        match (&mut self.measurement, self.state) {
+            (Some(asked), state) if state.is_moving() => {
                 asked.lines += 1;
                 asked.last_line = Instant::now();
                 self.refuse(line, why);
@@ -190,12 +207,12 @@ impl Hearing {
                 let held = "it came while the machine was confirmed to stand; go on, then touch that point again";
                 asked.refuse(line, held);
             }
-            _ => self.unasked = (self.unasked.0 + 1, line.chars().take(80).collect()),
+            _ => self.unrequested_lines = (self.unrequested_lines.0 + 1, line.chars().take(80).collect()),
         }
     }
 
     fn refuse(&mut self, line: &str, why: &str) {
-        if let Some(asked) = &mut self.asked {
+        if let Some(asked) = &mut self.measurement {
             asked.refuse(line, why);
         }
         if self.state == State::Execute {
@@ -204,67 +221,70 @@ impl Hearing {
     }
 
     /// Records that the line is lost: later touches are not received.
-    pub(super) fn is_lost(&mut self, error: DeviceError, begun: Option<String>) {
+    pub(super) fn link_lost(&mut self, error: DeviceError, begun: Option<String>) {
         if let Some(text) = begun {
             self.cut_short(&text);
         }
-        if let Some(asked) = self.asked.as_mut().filter(|_| self.state.moves()) {
+        if let Some(asked) = self.measurement.as_mut().filter(|_| self.state.is_moving()) {
             asked.refuse(
                 "",
                 "the connection was lost; what was touched meanwhile did not come, see the targets that are left",
             );
             self.state = if self.state == State::Execute { State::Holding } else { self.state };
         }
-        self.lost = Some(error);
+        self.link_error = Some(error);
     }
 
     /// Ends a complete measurement when `clear_after` has passed since its last line: the time that the probe needs to
     /// move clear.
-    pub(super) fn let_time_pass(&mut self, clear_after: Option<Duration>) {
-        let (Some(asked), Some(clear_after), State::Execute) = (&self.asked, clear_after, self.state) else { return };
-        if asked.list.is_whole() && asked.last_line.elapsed() >= clear_after {
+    pub(super) fn finish_if_clear(&mut self, clear_after: Option<Duration>) {
+        let (Some(asked), Some(clear_after), State::Execute) = (&self.measurement, clear_after, self.state) else {
+            return;
+        };
+        if asked.list.is_complete() && asked.last_line.elapsed() >= clear_after {
             self.finish(Outcome::Complete);
-            self.clear = Some(true);
+            self.clear_of_part = Some(true);
         }
     }
 
     pub(super) fn finish(&mut self, outcome: Outcome) {
         (self.state, self.outcome) = (State::Complete, outcome);
-        self.worked = self.asked.as_ref().map_or(Duration::ZERO, |asked| asked.begun.elapsed());
+        self.duration = self.measurement.as_ref().map_or(Duration::ZERO, |asked| asked.begun.elapsed());
     }
 
     pub(super) fn forget(&mut self) {
-        (self.asked, self.outcome) = (None, Outcome::None);
+        (self.measurement, self.outcome) = (None, Outcome::None);
     }
 
     // ---- words ------------------------------------------------------------------------------------------------------------------------
 
     /// Returns the last refused lines and other notes on lines.
     pub(super) fn refusals(&self) -> Vec<String> {
-        let asked = self.asked.as_ref();
-        let refused = asked.into_iter().flat_map(|asked| asked.refused.iter().cloned());
-        let doubles = asked.filter(|asked| asked.doubles > 0 && asked.list.is_whole());
-        let doubles = doubles.map(|asked| format!("{} lines came twice and were taken once", asked.doubles));
-        let (count, last) = &self.unasked;
-        let unasked = (*count > 0).then(|| {
-            let fitting = Reading::fitting(last);
+        let asked = self.measurement.as_ref();
+        let refused = asked.into_iter().flat_map(|asked| asked.refused_lines.iter().cloned());
+        let duplicate_lines = asked.filter(|asked| asked.duplicate_lines > 0 && asked.list.is_complete());
+        let duplicate_lines =
+            duplicate_lines.map(|asked| format!("{} lines came twice and were taken once", asked.duplicate_lines));
+        let (count, last) = &self.unrequested_lines;
+        let unrequested_lines = (*count > 0).then(|| {
+            let fitting = LineParser::fitting(last);
             let fits = match &fitting[..] {
                 [] => "it is in none of the eight formats".to_owned(),
                 several => format!("it fits {}", several.iter().map(ToString::to_string).collect::<Vec<_>>().join("; or ")),
             };
-            let ours = &self.judging.reading;
-            let (last, read) = (LineFlaw::of_line(format!("{last:?}")), ours.read(last).err());
+            let ours = &self.rules.parser;
+            let (last, read) = (LineError::whole_line(format!("{last:?}")), ours.read(last).err());
             let read = read.map_or("and is read".to_owned(), |flaw| format!("and is refused, for {flaw}"));
             format!("lines came while nothing was asked for, and were not taken; the last one is {last}: {fits}; the cell file says {ours}, {read}")
         });
-        refused.chain(doubles).chain(unasked).collect()
+        refused.chain(duplicate_lines).chain(unrequested_lines).collect()
     }
 
     /// Returns a short text of the remaining targets.
-    pub(super) fn left(&self) -> String {
+    pub(super) fn remaining_targets(&self) -> String {
         const SOME: usize = 12;
-        let Some(asked) = &self.asked else { return String::new() };
-        let left: Vec<u32> = asked.list.left().collect();
+        let Some(asked) = &self.measurement else { return String::new() };
+        let left: Vec<u32> = asked.list.remaining().collect();
         let first: Vec<String> = left.iter().take(SOME).map(ToString::to_string).collect();
         let more = if left.len() > SOME { ", ..." } else { "" };
         match left.len() {
@@ -274,38 +294,38 @@ impl Hearing {
     }
 
     pub(super) fn plan_digits(&self) -> String {
-        self.asked.as_ref().map_or(String::new(), |asked| hex(&asked.plan_identity[..4]))
+        self.measurement.as_ref().map_or(String::new(), |asked| hex(&asked.plan_identity[..4]))
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::list::tests::{TELLING, plan};
+    use super::super::list::tests::{RULES, plan};
     use super::*;
     use regrind_formats::result::Coordinates;
 
-    fn hearing(targets: u32) -> Hearing {
+    fn session(targets: u32) -> MeasurementSession {
         let judging =
-            Judging { reading: Reading::default(), rotary_deg: [0.0, 0.05], passed_over: vec!["PROBE".to_owned()] };
-        let mut hearing = Hearing::new(judging);
-        let list = List::new(&plan(targets), Coordinates::Centres, false, TELLING);
+            LineRules { parser: LineParser::default(), rotary_deg: [0.0, 0.05], passed_over: vec!["PROBE".to_owned()] };
+        let mut hearing = MeasurementSession::new(judging);
+        let list = TargetList::new(&plan(targets), Coordinates::Centres, false, RULES);
         let job = Job { job: 7, cycle: 1, digest: 1 };
-        hearing.asked = Some(Asked::new((job, 1), [0; 32], list, None));
+        hearing.measurement = Some(RequestedMeasurement::new((job, 1), [0; 32], list, None));
         hearing.state = State::Execute;
         hearing
     }
 
-    fn hear(hearing: &mut Hearing, line: &str) {
-        hearing.take(Gathered::Line(line.to_owned()));
+    fn hear(hearing: &mut MeasurementSession, line: &str) {
+        hearing.process(ReceivedLine::Line(line.to_owned()));
     }
 
-    fn touched(hearing: &Hearing) -> usize {
-        hearing.asked.as_ref().unwrap().list.progress().0
+    fn touched(hearing: &MeasurementSession) -> usize {
+        hearing.measurement.as_ref().unwrap().list.progress().0
     }
 
     #[test]
     fn a_refused_line_holds_and_takes_no_good_one_along() {
-        let mut heard = hearing(4);
+        let mut heard = session(4);
         hear(&mut heard, "0.000,0.000,1.500");
         hear(&mut heard, "PROBE 1");
         assert_eq!((heard.state, touched(&heard)), (State::Execute, 1));
@@ -316,7 +336,7 @@ mod tests {
         // The person who leads the probe does not know of the hold yet.
         hear(&mut heard, "15.000,0.000,1.500");
         assert_eq!((heard.state, touched(&heard)), (State::Holding, 2));
-        assert_eq!(heard.left(), "2 targets are left: 101, 102");
+        assert_eq!(heard.remaining_targets(), "2 targets are left: 101, 102");
         // A machine at rest touches nothing.
         heard.state = State::Held;
         hear(&mut heard, "5.000,0.000,1.500");
@@ -326,29 +346,29 @@ mod tests {
 
     #[test]
     fn a_whole_list_is_over_when_the_cell_file_says_that_the_probe_is_clear() {
-        let mut heard = hearing(1);
-        heard.let_time_pass(Some(Duration::ZERO));
+        let mut heard = session(1);
+        heard.finish_if_clear(Some(Duration::ZERO));
         assert_eq!(heard.state, State::Execute);
         hear(&mut heard, "0.000,0.000,1.500");
-        heard.let_time_pass(None);
-        heard.let_time_pass(Some(Duration::from_secs(3600)));
-        assert_eq!((heard.state, heard.clear), (State::Execute, None));
-        heard.let_time_pass(Some(Duration::ZERO));
-        assert_eq!((heard.state, heard.outcome, heard.clear), (State::Complete, Outcome::Complete, Some(true)));
+        heard.finish_if_clear(None);
+        heard.finish_if_clear(Some(Duration::from_secs(3600)));
+        assert_eq!((heard.state, heard.clear_of_part), (State::Execute, None));
+        heard.finish_if_clear(Some(Duration::ZERO));
+        assert_eq!((heard.state, heard.outcome, heard.clear_of_part), (State::Complete, Outcome::Complete, Some(true)));
     }
 
     #[test]
     fn a_table_that_was_turned_and_a_line_that_was_not_asked_for_are_told() {
-        let mut heard = hearing(2);
-        heard.judging.reading.format = super::super::LineFormat::DecimalRotary;
+        let mut heard = session(2);
+        heard.rules.parser.format = super::super::LineFormat::DecimalRotary;
         hear(&mut heard, "0.000,0.000,1.500,0.0");
         assert_eq!((heard.state, touched(&heard)), (State::Execute, 1));
         hear(&mut heard, "5.000,0.000,1.500,245.5");
         assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
         assert!(heard.refusals()[0].contains("stands at 245.5 degrees"));
-        let mut heard = hearing(2);
+        let mut heard = session(2);
         heard.state = State::Idle;
-        heard.asked = None;
+        heard.measurement = None;
         hear(&mut heard, "X1.0,Y2.0,Z3.0");
         let told = heard.refusals().pop().unwrap();
         assert!(
@@ -359,10 +379,10 @@ mod tests {
 
     #[test]
     fn a_lost_line_loses_no_point_that_there_is() {
-        let mut heard = hearing(3);
+        let mut heard = session(3);
         hear(&mut heard, "0.000,0.000,1.500");
-        let gone = DeviceError::Disconnected { machine: "x".into(), what: "reading" };
-        heard.is_lost(gone, Some("5.000,0.0".to_owned()));
+        let gone = DeviceError::Disconnected { machine: "x".into(), operation: "reading" };
+        heard.link_lost(gone, Some("5.000,0.0".to_owned()));
         assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
         assert!(heard.refusals()[0].contains("cut short") && heard.refusals()[1].contains("did not come"));
     }

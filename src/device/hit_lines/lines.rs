@@ -1,11 +1,11 @@
 //! Splitter of bytes into lines. CR, LF or both end a line; an empty line is ignored.
 
 /// Maximum length of a line, in bytes.
-const LONGEST: usize = 200;
+const MAX_LINE_LENGTH: usize = 200;
 
 /// Result of the received bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Gathered {
+pub enum ReceivedLine {
     /// Line without its line end.
     Line(String),
     /// Beginning of data that are longer than any line.
@@ -14,46 +14,46 @@ pub enum Gathered {
 
 /// Bytes of incomplete lines.
 #[derive(Clone, Debug, Default)]
-pub struct Lines {
-    begun: Vec<u8>,
+pub struct LineSplitter {
+    partial: Vec<u8>,
     /// True while the rest of an overlong line is skipped, up to the next line end.
     overlong: bool,
 }
 
-impl Lines {
+impl LineSplitter {
     /// Adds bytes and returns the lines completed by them.
-    pub fn take(&mut self, bytes: &[u8]) -> Vec<Gathered> {
+    pub fn push(&mut self, bytes: &[u8]) -> Vec<ReceivedLine> {
         let mut gathered = Vec::new();
         for &byte in bytes {
             match byte {
                 b'\r' | b'\n' if self.overlong => self.overlong = false,
                 b'\r' | b'\n' => {
-                    let line = std::mem::take(&mut self.begun);
+                    let line = std::mem::take(&mut self.partial);
                     // A line of blanks is ignored too.
                     if !line.trim_ascii().is_empty() {
-                        gathered.push(Gathered::Line(text(&line)));
+                        gathered.push(ReceivedLine::Line(text(&line)));
                     }
                 }
                 _ if self.overlong => {}
-                _ => self.begun.push(byte),
+                _ => self.partial.push(byte),
             }
-            if self.begun.len() > LONGEST {
+            if self.partial.len() > MAX_LINE_LENGTH {
                 self.overlong = true;
-                gathered.push(Gathered::Endless(text(&std::mem::take(&mut self.begun))));
+                gathered.push(ReceivedLine::Endless(text(&std::mem::take(&mut self.partial))));
             }
         }
         gathered
     }
 
     /// Returns true if a line has begun and not ended.
-    pub fn has_begun(&self) -> bool {
-        !self.begun.is_empty()
+    pub fn has_partial_line(&self) -> bool {
+        !self.partial.is_empty()
     }
 
     /// Discards an incomplete line and returns its text so far.
     pub fn give_up(&mut self) -> Option<String> {
         self.overlong = false;
-        let line = std::mem::take(&mut self.begun);
+        let line = std::mem::take(&mut self.partial);
         (!line.trim_ascii().is_empty()).then(|| text(&line))
     }
 }
@@ -67,31 +67,31 @@ fn text(bytes: &[u8]) -> String {
 mod tests {
     use super::*;
 
-    fn line(text: &str) -> Gathered {
-        Gathered::Line(text.to_owned())
+    fn line(text: &str) -> ReceivedLine {
+        ReceivedLine::Line(text.to_owned())
     }
 
     #[test]
     fn lines_are_the_same_however_their_bytes_come_and_whatever_ends_them() {
         let bytes = b"1,2,3\r\n4,5,6\r7,8,9\n\r\n  \r\n10,11";
         for piece in 1..bytes.len() {
-            let mut lines = Lines::default();
-            let gathered: Vec<Gathered> = bytes.chunks(piece).flat_map(|piece| lines.take(piece)).collect();
+            let mut lines = LineSplitter::default();
+            let gathered: Vec<ReceivedLine> = bytes.chunks(piece).flat_map(|piece| lines.push(piece)).collect();
             assert_eq!(gathered, [line("1,2,3"), line("4,5,6"), line("7,8,9")], "{piece}");
-            assert!(lines.has_begun());
+            assert!(lines.has_partial_line());
             assert_eq!(lines.give_up().as_deref(), Some("10,11"));
-            assert_eq!((lines.has_begun(), lines.give_up()), (false, None));
+            assert_eq!((lines.has_partial_line(), lines.give_up()), (false, None));
         }
     }
 
     #[test]
     fn what_never_ends_is_given_up_once_and_the_next_line_is_whole_again() {
-        let mut lines = Lines::default();
-        let gathered = lines.take(&[[b'7'; 1000].as_slice(), b"\r\n1,2,3\r\n"].concat());
+        let mut lines = LineSplitter::default();
+        let gathered = lines.push(&[[b'7'; 1000].as_slice(), b"\r\n1,2,3\r\n"].concat());
         assert!(
-            matches!(&gathered[..], [Gathered::Endless(_), Gathered::Line(line)] if line == "1,2,3"),
+            matches!(&gathered[..], [ReceivedLine::Endless(_), ReceivedLine::Line(line)] if line == "1,2,3"),
             "{gathered:?}"
         );
-        assert!(matches!(&lines.take(b"\xff\xfe\n")[..], [Gathered::Line(line)] if line.contains('\u{fffd}')));
+        assert!(matches!(&lines.push(b"\xff\xfe\n")[..], [ReceivedLine::Line(line)] if line.contains('\u{fffd}')));
     }
 }

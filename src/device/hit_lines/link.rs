@@ -13,25 +13,25 @@ use tokio::sync::oneshot;
 use tokio::time::{Instant, sleep_until, timeout};
 use tokio_serial::{SerialPort as _, SerialPortBuilderExt as _};
 
-use super::hearing::{Hearing, locked};
-use super::lines::Lines;
+use super::hearing::{MeasurementSession, locked};
+use super::lines::LineSplitter;
 use crate::error::DeviceError;
 use crate::modbus::Parity;
 
 /// Maximum time of waiting for silence; a line that sends for longer is an error.
-const LONGEST_DRAIN: Duration = Duration::from_secs(2);
+const MAX_DRAIN_TIME: Duration = Duration::from_secs(2);
 
 /// Source of the lines.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the fields are told above them")]
-pub enum HitLine {
+pub enum HitSource {
     /// Serial port: its name, bits a second, 7 or 8 data bits, parity, 1 or 2 stop bits.
     Serial { device: String, baud: u32, data_bits: u8, parity: Parity, stop_bits: u8 },
     /// Terminal server.
     Tcp { host: String, port: u16 },
 }
 
-impl std::fmt::Display for HitLine {
+impl std::fmt::Display for HitSource {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Serial { device, baud, .. } => write!(f, "{device} ({baud} baud)"),
@@ -45,7 +45,7 @@ impl<S: AsyncRead + Send + Unpin> Source for S {}
 
 /// Timeouts of the line.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Waits {
+pub(super) struct LinkTimeouts {
     /// Timeout of the connection.
     pub(super) connect: Duration,
     /// Duration of silence that ends the discarding of data sent before the connection was used.
@@ -64,11 +64,12 @@ impl Listener {
     /// Opens the line, discards the data that have gathered, and then listens.
     pub(super) async fn open(
         machine: &Arc<str>,
-        line: HitLine,
-        waits: Waits,
-        hearing: Arc<Mutex<Hearing>>,
+        line: HitSource,
+        waits: LinkTimeouts,
+        hearing: Arc<Mutex<MeasurementSession>>,
     ) -> Result<Self, DeviceError> {
-        let unreachable = |why| DeviceError::Unreachable { machine: Arc::clone(machine), why, limit: waits.connect };
+        let unreachable =
+            |why| DeviceError::Unreachable { machine: Arc::clone(machine), kind: why, limit: waits.connect };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
         let runtime = runtime.map_err(|error| unreachable(error.kind()))?;
         let (until, ended) = oneshot::channel();
@@ -87,14 +88,14 @@ impl Listener {
 
 async fn listen(
     machine: Arc<str>,
-    line: HitLine,
-    waits: Waits,
-    hearing: Arc<Mutex<Hearing>>,
+    line: HitSource,
+    waits: LinkTimeouts,
+    hearing: Arc<Mutex<MeasurementSession>>,
     opened: oneshot::Sender<io::Result<()>>,
     mut ended: oneshot::Receiver<()>,
 ) {
     let open = async {
-        let mut source = timeout(waits.connect, dial(&line)).await.unwrap_or(Err(io::ErrorKind::TimedOut.into()))?;
+        let mut source = timeout(waits.connect, connect(&line)).await.unwrap_or(Err(io::ErrorKind::TimedOut.into()))?;
         drain(source.as_mut(), waits.silence).await?;
         Ok(source)
     };
@@ -102,11 +103,11 @@ async fn listen(
         Ok(source) => source,
         Err(error) => return drop(opened.send(Err(error))),
     };
-    locked(&hearing).lost = None;
+    locked(&hearing).link_error = None;
     if opened.send(Ok(())).is_err() {
         return; // Nobody waits for it any more.
     }
-    let (mut lines, mut bytes, mut due) = (Lines::default(), [0; 512], None);
+    let (mut lines, mut bytes, mut due) = (LineSplitter::default(), [0; 512], None);
     loop {
         let read = tokio::select! {
             biased;
@@ -122,21 +123,21 @@ async fn listen(
                 }
             }
             Some(Ok(count)) if count > 0 => {
-                lines.take(&bytes[..count]).into_iter().for_each(|gathered| locked(&hearing).take(gathered));
-                due = lines.has_begun().then(|| Instant::now() + waits.rest);
+                lines.push(&bytes[..count]).into_iter().for_each(|gathered| locked(&hearing).process(gathered));
+                due = lines.has_partial_line().then(|| Instant::now() + waits.rest);
             }
             Some(_) => {
-                let lost = DeviceError::Disconnected { machine, what: "listening" };
-                return locked(&hearing).is_lost(lost, lines.give_up());
+                let lost = DeviceError::Disconnected { machine, operation: "listening" };
+                return locked(&hearing).link_lost(lost, lines.give_up());
             }
         }
     }
 }
 
-async fn dial(line: &HitLine) -> io::Result<Box<dyn Source>> {
+async fn connect(line: &HitSource) -> io::Result<Box<dyn Source>> {
     match line {
-        HitLine::Tcp { host, port } => Ok(Box::new(TcpStream::connect((host.as_str(), *port)).await?)),
-        HitLine::Serial { device, baud, data_bits, parity, stop_bits } => {
+        HitSource::Tcp { host, port } => Ok(Box::new(TcpStream::connect((host.as_str(), *port)).await?)),
+        HitSource::Serial { device, baud, data_bits, parity, stop_bits } => {
             let port = tokio_serial::new(device, *baud)
                 .data_bits(if *data_bits == 7 { tokio_serial::DataBits::Seven } else { tokio_serial::DataBits::Eight })
                 .parity(match parity {
@@ -154,7 +155,7 @@ async fn dial(line: &HitLine) -> io::Result<Box<dyn Source>> {
 
 /// Discards incoming data until the line has been silent for `silence`.
 async fn drain(source: &mut dyn Source, silence: Duration) -> io::Result<()> {
-    let until = Instant::now() + LONGEST_DRAIN;
+    let until = Instant::now() + MAX_DRAIN_TIME;
     let mut bytes = [0; 512];
     while Instant::now() < until {
         match timeout(silence, source.read(&mut bytes)).await {

@@ -21,7 +21,7 @@ pub enum Repeated {
 
 /// Rules that distinguish touches.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Telling {
+pub(super) struct TouchRules {
     /// Maximum distance of a point from its target, in mm; a point farther from every target belongs to none.
     pub(super) limit_mm: f64,
     /// Time within which an identical line is the same touch.
@@ -31,31 +31,31 @@ pub(super) struct Telling {
 
 /// List of targets and of their touches.
 #[derive(Clone, Debug)]
-pub(super) struct List {
+pub(super) struct TargetList {
     /// Expected position of each target; empty if any points are accepted.
     expected_mm: Vec<[f64; 3]>,
     /// Indices of the targets.
     indices: Vec<u32>,
     points: Vec<Option<MeasuredPoint>>,
-    telling: Telling,
+    rules: TouchRules,
     /// Previous line and its time.
     last: Option<(String, Duration)>,
 }
 
 /// Meaning of a valid line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Touch {
+pub(super) enum TouchAssignment {
     /// First touch of this target.
-    Of(u32),
+    First(u32),
     /// Repeated touch of this target, which replaces the earlier one.
-    Again(u32),
+    Repeated(u32),
     /// Repetition of the previous line.
-    Double,
+    DuplicateLine,
 }
 
-impl List {
+impl TargetList {
     /// Creates a list of the targets of a plan; without targets if any points are accepted.
-    pub(super) fn new(plan: &Plan, what: Coordinates, is_free: bool, telling: Telling) -> Self {
+    pub(super) fn new(plan: &Plan, what: Coordinates, is_free: bool, telling: TouchRules) -> Self {
         let reach_mm = if what == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
         let targets = if is_free { &[][..] } else { &plan.targets[..] };
         let expected = |k: usize| std::array::from_fn(|i| targets[k].point_mm[i] + reach_mm * targets[k].normal[i]);
@@ -63,7 +63,7 @@ impl List {
             expected_mm: (0..targets.len()).map(expected).collect(),
             indices: targets.iter().map(|target| target.index).collect(),
             points: vec![None; targets.len()],
-            telling,
+            rules: telling,
             last: None,
         }
     }
@@ -76,32 +76,32 @@ impl List {
     ///
     /// # Errors
     /// Returns the reason, as text, why the point is not a touch of a target.
-    pub(super) fn take(&mut self, line: &str, at_mm: [f64; 3], came: Duration) -> Result<Touch, String> {
+    pub(super) fn assign(&mut self, line: &str, at_mm: [f64; 3], came: Duration) -> Result<TouchAssignment, String> {
         let before = self.last.replace((line.to_owned(), came));
-        let within = |at: Duration| came.saturating_sub(at) < self.telling.double_within;
+        let within = |at: Duration| came.saturating_sub(at) < self.rules.double_within;
         if before.is_some_and(|(text, at)| text == line && within(at)) {
-            return Ok(Touch::Double);
+            return Ok(TouchAssignment::DuplicateLine);
         }
-        let point = |index| MeasuredPoint { index, status: PointStatus::Touched, quality: 0, at_mm };
+        let point = |index| MeasuredPoint { index, status: PointStatus::Touched, quality: 0, position_mm: at_mm };
         if self.is_free() {
             let index = self.points.len() as u32;
             self.points.push(Some(point(index)));
-            return Ok(Touch::Of(index));
+            return Ok(TouchAssignment::First(index));
         }
         let (k, away_mm) = self.nearest(at_mm);
-        let (index, limit_mm) = (self.indices[k], self.telling.limit_mm);
+        let (index, limit_mm) = (self.indices[k], self.rules.limit_mm);
         if away_mm > limit_mm {
             return Err(format!(
                 "it is {away_mm:.3} mm from target {index}, the nearest one, and limit_mm is {limit_mm}: see that the right part lies where the \
                  cell file has it, and touch the target again"
             ));
         }
-        match (self.points[k].replace(point(index)), self.telling.repeated) {
-            (None, _) => Ok(Touch::Of(index)),
-            (Some(_), Repeated::Replace) => Ok(Touch::Again(index)),
+        match (self.points[k].replace(point(index)), self.rules.repeated) {
+            (None, _) => Ok(TouchAssignment::First(index)),
+            (Some(_), Repeated::Replace) => Ok(TouchAssignment::Repeated(index)),
             (Some(first), Repeated::Refuse) => {
                 self.points[k] = Some(first);
-                let apart_mm = distance(first.at_mm, at_mm);
+                let apart_mm = distance(first.position_mm, at_mm);
                 Err(format!(
                     "target {index} was touched before, {apart_mm:.4} mm from here, and that touch stands: go on with the targets that are left, \
                      or say repeated = \"replace\" in the cell file"
@@ -121,12 +121,12 @@ impl List {
     }
 
     /// Returns true if every target was touched.
-    pub(super) fn is_whole(&self) -> bool {
+    pub(super) fn is_complete(&self) -> bool {
         !self.is_free() && self.points.iter().all(Option::is_some)
     }
 
     /// Returns the indices of the remaining targets.
-    pub(super) fn left(&self) -> impl Iterator<Item = u32> + '_ {
+    pub(super) fn remaining(&self) -> impl Iterator<Item = u32> + '_ {
         self.indices.iter().zip(&self.points).filter(|(_, point)| point.is_none()).map(|(index, _)| *index)
     }
 
@@ -136,7 +136,7 @@ impl List {
             index: self.indices.get(k).copied().unwrap_or_default(),
             status: PointStatus::NotFound,
             quality: 100,
-            at_mm: [0.0; 3],
+            position_mm: [0.0; 3],
         };
         self.points.iter().enumerate().map(|(k, point)| point.unwrap_or_else(|| missed(k))).collect()
     }
@@ -160,7 +160,7 @@ pub(super) mod tests {
     pub(in super::super) fn plan(targets: u32) -> Plan {
         let target = |k: u32| Target {
             index: 100 + k,
-            what: TargetKind::Part,
+            kind: TargetKind::Part,
             point_mm: [5.0 * f64::from(k), 0.0, 0.0],
             normal: [0.0, 0.0, 1.0],
         };
@@ -171,12 +171,12 @@ pub(super) mod tests {
             search_mm: 2.0,
             speed_mm_s: 5.0,
             safe_height_mm: 50.0,
-            careful: None,
+            careful_start: None,
         }
     }
 
-    pub(in super::super) const TELLING: Telling =
-        Telling { limit_mm: 1.0, double_within: Duration::from_millis(200), repeated: Repeated::Refuse };
+    pub(in super::super) const RULES: TouchRules =
+        TouchRules { limit_mm: 1.0, double_within: Duration::from_millis(200), repeated: Repeated::Refuse };
 
     fn at(ms: u64) -> Duration {
         Duration::from_millis(ms)
@@ -184,50 +184,50 @@ pub(super) mod tests {
 
     #[test]
     fn a_point_belongs_to_the_nearest_target_and_to_none_beyond_the_limit() {
-        let mut list = List::new(&plan(3), Coordinates::Centres, false, TELLING);
+        let mut list = TargetList::new(&plan(3), Coordinates::Centres, false, RULES);
         // Centre of a ball of 1.5 mm radius.
-        assert_eq!(list.take("a", [5.2, 0.1, 1.6], at(0)), Ok(Touch::Of(101)));
-        assert!(list.take("b", [5.2, 0.1, 0.0], at(10)).unwrap_err().contains("target 101"));
-        assert!(list.take("c", [12.5, 0.0, 1.5], at(20)).unwrap_err().contains("2.500 mm from target"));
-        assert_eq!(list.take("d", [10.0, 0.0, 1.5], at(30)), Ok(Touch::Of(102)));
-        assert_eq!((list.progress(), list.is_whole()), ((2, Some(3)), false));
-        assert_eq!(list.left().collect::<Vec<_>>(), [100]);
+        assert_eq!(list.assign("a", [5.2, 0.1, 1.6], at(0)), Ok(TouchAssignment::First(101)));
+        assert!(list.assign("b", [5.2, 0.1, 0.0], at(10)).unwrap_err().contains("target 101"));
+        assert!(list.assign("c", [12.5, 0.0, 1.5], at(20)).unwrap_err().contains("2.500 mm from target"));
+        assert_eq!(list.assign("d", [10.0, 0.0, 1.5], at(30)), Ok(TouchAssignment::First(102)));
+        assert_eq!((list.progress(), list.is_complete()), ((2, Some(3)), false));
+        assert_eq!(list.remaining().collect::<Vec<_>>(), [100]);
         let points = list.points();
         assert_eq!(points.iter().map(|p| p.index).collect::<Vec<_>>(), [100, 101, 102]);
-        assert_eq!((points[0].status, points[1].at_mm), (PointStatus::NotFound, [5.2, 0.1, 1.6]));
-        assert_eq!(list.take("e", [0.0, 0.0, 1.5], at(40)), Ok(Touch::Of(100)));
-        assert!(list.is_whole());
+        assert_eq!((points[0].status, points[1].position_mm), (PointStatus::NotFound, [5.2, 0.1, 1.6]));
+        assert_eq!(list.assign("e", [0.0, 0.0, 1.5], at(40)), Ok(TouchAssignment::First(100)));
+        assert!(list.is_complete());
         // Contact coordinates do not include the radius.
-        let mut contacts = List::new(&plan(3), Coordinates::Contacts, false, TELLING);
-        assert_eq!(contacts.take("a", [5.0, 0.0, 0.1], at(0)), Ok(Touch::Of(101)));
-        assert!(contacts.take("b", [10.0, 0.0, 1.5], at(10)).is_err());
+        let mut contacts = TargetList::new(&plan(3), Coordinates::Contacts, false, RULES);
+        assert_eq!(contacts.assign("a", [5.0, 0.0, 0.1], at(0)), Ok(TouchAssignment::First(101)));
+        assert!(contacts.assign("b", [10.0, 0.0, 1.5], at(10)).is_err());
     }
 
     #[test]
     fn the_same_line_at_once_is_one_touch_and_later_another_one() {
-        let mut list = List::new(&plan(2), Coordinates::Centres, false, TELLING);
+        let mut list = TargetList::new(&plan(2), Coordinates::Centres, false, RULES);
         let centre = [0.0, 0.0, 1.5];
-        assert_eq!(list.take("a", centre, at(0)), Ok(Touch::Of(100)));
-        assert_eq!(list.take("a", centre, at(150)), Ok(Touch::Double));
+        assert_eq!(list.assign("a", centre, at(0)), Ok(TouchAssignment::First(100)));
+        assert_eq!(list.assign("a", centre, at(150)), Ok(TouchAssignment::DuplicateLine));
         // A line that is repeated again and again does not become a new touch by its age.
-        assert_eq!(list.take("a", centre, at(300)), Ok(Touch::Double));
-        let repeated = list.take("a", centre, at(600)).unwrap_err();
+        assert_eq!(list.assign("a", centre, at(300)), Ok(TouchAssignment::DuplicateLine));
+        let repeated = list.assign("a", centre, at(600)).unwrap_err();
         assert!(repeated.contains("target 100 was touched before, 0.0000 mm"), "{repeated}");
-        assert!(list.take("b", [0.01, 0.0, 1.5], at(601)).unwrap_err().contains("that touch stands"));
-        assert_eq!(list.points()[0].at_mm, centre);
-        let telling = Telling { repeated: Repeated::Replace, ..TELLING };
-        let mut list = List::new(&plan(2), Coordinates::Centres, false, telling);
-        assert_eq!(list.take("a", centre, at(0)), Ok(Touch::Of(100)));
-        assert_eq!(list.take("b", [0.01, 0.0, 1.5], at(1)), Ok(Touch::Again(100)));
-        assert_eq!(list.points()[0].at_mm, [0.01, 0.0, 1.5]);
+        assert!(list.assign("b", [0.01, 0.0, 1.5], at(601)).unwrap_err().contains("that touch stands"));
+        assert_eq!(list.points()[0].position_mm, centre);
+        let telling = TouchRules { repeated: Repeated::Replace, ..RULES };
+        let mut list = TargetList::new(&plan(2), Coordinates::Centres, false, telling);
+        assert_eq!(list.assign("a", centre, at(0)), Ok(TouchAssignment::First(100)));
+        assert_eq!(list.assign("b", [0.01, 0.0, 1.5], at(1)), Ok(TouchAssignment::Repeated(100)));
+        assert_eq!(list.points()[0].position_mm, [0.01, 0.0, 1.5]);
     }
 
     #[test]
     fn where_any_points_will_do_each_touch_is_one() {
-        let mut list = List::new(&plan(2), Coordinates::Centres, true, TELLING);
-        assert_eq!(list.take("a", [900.0, 0.0, 0.0], at(0)), Ok(Touch::Of(0)));
-        assert_eq!(list.take("a", [900.0, 0.0, 0.0], at(1)), Ok(Touch::Double));
-        assert_eq!(list.take("b", [901.0, 0.0, 0.0], at(2)), Ok(Touch::Of(1)));
-        assert_eq!((list.progress(), list.is_whole(), list.points().len()), ((2, None), false, 2));
+        let mut list = TargetList::new(&plan(2), Coordinates::Centres, true, RULES);
+        assert_eq!(list.assign("a", [900.0, 0.0, 0.0], at(0)), Ok(TouchAssignment::First(0)));
+        assert_eq!(list.assign("a", [900.0, 0.0, 0.0], at(1)), Ok(TouchAssignment::DuplicateLine));
+        assert_eq!(list.assign("b", [901.0, 0.0, 0.0], at(2)), Ok(TouchAssignment::First(1)));
+        assert_eq!((list.progress(), list.is_complete(), list.points().len()), ((2, None), false, 2));
     }
 }

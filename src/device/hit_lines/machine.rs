@@ -11,17 +11,18 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
-use super::hearing::{Asked, Hearing, locked};
+use super::hearing::{MeasurementSession, RequestedMeasurement, locked};
 use super::link::Listener;
-use super::list::List;
+use super::list::TargetList;
 use super::settings::HitLinesSettings;
-use crate::error::{Answered, DeviceError};
+use crate::error::{DeviceError, DeviceResult};
 use crate::exchange::plan_csv;
-use crate::kept::Kept;
+use crate::kept::JobMemory;
 use crate::machine::{Cmm, Interrupt, Machine};
-use crate::payload::{Identified, Measurement, Plan, Preliminary};
+use crate::payload::{Identified, Measurement, Plan, PreliminaryPoints};
 use crate::words::{
-    Answer, Armed, Command, Identity, Job, MachineKind, Outcome, Reconciled, Started, State, Status, Word, digest, hex,
+    Answer, Armed, Command, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled, Started, State,
+    Status, digest, hex,
 };
 use regrind_formats::{AddedLines, FormatError, ResultFolder, write_atomic};
 
@@ -30,46 +31,46 @@ use regrind_formats::{AddedLines, FormatError, ResultFolder, write_atomic};
 pub struct HitLinesCmm {
     name: Arc<str>,
     settings: HitLinesSettings,
-    hearing: Arc<Mutex<Hearing>>,
+    session: Arc<Mutex<MeasurementSession>>,
     listener: Option<Listener>,
-    kept: Kept<Plan>,
+    memory: JobMemory<Plan>,
 }
 
 impl HitLinesCmm {
     /// Creates a machine; does not listen yet.
     pub fn new(settings: HitLinesSettings) -> Self {
-        let hearing = Arc::new(Mutex::new(Hearing::new(settings.judging())));
-        let name = format!("cmm by hit lines, {}", settings.line).into();
-        Self { name, settings, hearing, listener: None, kept: Kept::none() }
+        let hearing = Arc::new(Mutex::new(MeasurementSession::new(settings.line_rules())));
+        let name = format!("cmm by hit lines, {}", settings.source).into();
+        Self { name, settings, session: hearing, listener: None, memory: JobMemory::new() }
     }
 
-    fn told(&self) -> Answered<Status> {
-        let mut hearing = locked(&self.hearing);
-        if let Some(error) = &hearing.lost {
+    fn current_status(&self) -> DeviceResult<Status> {
+        let mut hearing = locked(&self.session);
+        if let Some(error) = &hearing.link_error {
             return Err(error.clone());
         }
         if self.listener.is_none() {
-            return Err(DeviceError::NotConnected { machine: Arc::clone(&self.name), what: "its status" });
+            return Err(DeviceError::NotConnected { machine: Arc::clone(&self.name), operation: "its status" });
         }
-        hearing.let_time_pass(self.settings.clear_after);
+        hearing.finish_if_clear(self.settings.clear_after);
         Ok(status_of(&hearing))
     }
 
     fn refused(&self, command: Command, answer: Answer) -> DeviceError {
-        let state = locked(&self.hearing).state;
+        let state = locked(&self.session).state;
         DeviceError::Refused { machine: Arc::clone(&self.name), command, answer, state }
     }
 
-    fn not_taken(&self, why: impl ToString) -> DeviceError {
-        DeviceError::NotTaken { machine: Arc::clone(&self.name), why: why.to_string() }
+    fn not_accepted(&self, why: impl ToString) -> DeviceError {
+        DeviceError::NotAccepted { machine: Arc::clone(&self.name), reason: why.to_string() }
     }
 
     /// Changes the state to `to` and returns the status.
     ///
     /// # Errors
     /// Refuses with [`Answer::WrongState`] if the current state is not in `from`.
-    fn go(&self, command: Command, from: &[State], to: State) -> Answered<Status> {
-        let mut hearing = locked(&self.hearing);
+    fn transition(&self, command: Command, from: &[State], to: State) -> DeviceResult<Status> {
+        let mut hearing = locked(&self.session);
         if !from.contains(&hearing.state) {
             drop(hearing);
             return Err(self.refused(command, Answer::WrongState));
@@ -79,8 +80,8 @@ impl HitLinesCmm {
     }
 
     /// Returns what to do now, and what to type then.
-    fn prompt(&self, hearing: &Hearing) -> Vec<String> {
-        let Some(asked) = &hearing.asked else { return Vec::new() };
+    fn prompt(&self, hearing: &MeasurementSession) -> Vec<String> {
+        let Some(asked) = &hearing.measurement else { return Vec::new() };
         let folder = &self.settings.run_folder;
         let run = match folder.parent() == Some(Path::new("runs")) {
             true => String::new(),
@@ -88,14 +89,15 @@ impl HitLinesCmm {
         };
         let then = |word: &str| format!("then: regrind confirm {word} --machine cmm{run}");
         let part = &self.settings.part;
-        let stop = |what: &str| vec![format!("{what} it at its own panel; {}", hearing.left()), then("still")];
+        let stop =
+            |what: &str| vec![format!("{what} it at its own panel; {}", hearing.remaining_targets()), then("still")];
         match hearing.state {
-            State::Execute if asked.list.is_whole() => match self.settings.clear_after {
+            State::Execute if asked.list.is_complete() => match self.settings.clear_after {
                 None => vec!["every target is touched; when the probe is clear of the part,".to_owned(), then("done")],
                 Some(_) => Vec::new(),
             },
             State::Execute => {
-                let points = match (self.settings.free_points, asked.list.progress().1) {
+                let points = match (self.settings.min_free_points, asked.list.progress().1) {
                     (Some(least), _) => format!("at least {least} points"),
                     (None, count) => {
                         let list = folder.join(plan_file(asked.job));
@@ -103,7 +105,11 @@ impl HitLinesCmm {
                     }
                 };
                 let mut prompt = vec![
-                    format!("MEASURE {part}, cycle {}: {points} (plan {})", asked.job.number(), hearing.plan_digits()),
+                    format!(
+                        "MEASURE {part}, cycle {}: {points} (plan {})",
+                        asked.job.batch_id(),
+                        hearing.plan_digits()
+                    ),
                     "check: right part, clean, clamped; wheel clear of it; the probe that the list names".to_owned(),
                 ];
                 if self.settings.clear_after.is_none() {
@@ -114,17 +120,17 @@ impl HitLinesCmm {
             }
             State::Holding => stop("HOLD"),
             State::Stopping => stop("STOP"),
-            State::Held => vec![format!("{}; regrind resume goes on", hearing.left())],
+            State::Held => vec![format!("{}; regrind resume goes on", hearing.remaining_targets())],
             State::Aborting => vec!["ABORT: stop it at its own panel NOW; nothing here can".to_owned()],
             _ => Vec::new(),
         }
     }
 
     /// Ends the measurement on a person's confirmation. Returns the files that are kept.
-    fn take_done(&self, hearing: &mut Hearing) -> Result<Vec<String>, String> {
-        let Some(asked) = &hearing.asked else { return Err("no measurement is asked for".to_owned()) };
+    fn finish_measurement(&self, hearing: &mut MeasurementSession) -> Result<Vec<String>, String> {
+        let Some(asked) = &hearing.measurement else { return Err("no measurement is asked for".to_owned()) };
         let (there, _) = asked.list.progress();
-        if let Some(least) = self.settings.free_points.filter(|least| there < *least) {
+        if let Some(least) = self.settings.min_free_points.filter(|least| there < *least) {
             return Err(format!("{there} points came, and at least {least} are wanted: go on measuring"));
         }
         if there == 0 {
@@ -132,33 +138,39 @@ impl HitLinesCmm {
         }
         let kept = vec![plan_file(asked.job), hits_file(asked.job)];
         hearing.finish(Outcome::Complete);
-        hearing.clear = Some(true);
+        hearing.clear_of_part = Some(true);
         Ok(kept)
     }
 
-    fn take_word(&self, word: Word) -> Answered<Vec<String>> {
-        let mut hearing = locked(&self.hearing);
+    fn accept_confirmation(&self, word: OperatorConfirmation) -> DeviceResult<Vec<String>> {
+        let mut hearing = locked(&self.session);
         let taken = match (word, hearing.state) {
-            (Word::Done { file: Some(_), .. }, _) => Err("its points come by the line: leave --file out".to_owned()),
-            (Word::Done { .. }, State::Execute | State::Holding | State::Held) => self.take_done(&mut hearing),
-            (Word::Still, State::Holding) => {
+            (OperatorConfirmation::Done { file: Some(_), .. }, _) => {
+                Err("its points come by the line: leave --file out".to_owned())
+            }
+            (OperatorConfirmation::Done { .. }, State::Execute | State::Holding | State::Held) => {
+                self.finish_measurement(&mut hearing)
+            }
+            (OperatorConfirmation::Still, State::Holding) => {
                 hearing.state = State::Held;
                 Ok(Vec::new())
             }
-            (Word::Still, State::Stopping) => {
+            (OperatorConfirmation::Still, State::Stopping) => {
                 hearing.finish(Outcome::Stopped);
                 Ok(Vec::new())
             }
-            (Word::Started { .. }, _) => Err("nothing is started here; measure, and confirm done".to_owned()),
+            (OperatorConfirmation::Started { .. }, _) => {
+                Err("nothing is started here; measure, and confirm done".to_owned())
+            }
             (_, state) => Err(format!("it is {state}, and nothing of that kind is asked")),
         };
         drop(hearing);
-        taken.map_err(|why| self.not_taken(why))
+        taken.map_err(|why| self.not_accepted(why))
     }
 }
 
-fn status_of(hearing: &Hearing) -> Status {
-    let asked = hearing.asked.as_ref();
+fn status_of(hearing: &MeasurementSession) -> Status {
+    let asked = hearing.measurement.as_ref();
     let progress = asked.map(|asked| {
         let (there, of) = asked.list.progress();
         (there as u32, of.unwrap_or(there) as u32)
@@ -167,23 +179,23 @@ fn status_of(hearing: &Hearing) -> Status {
         job: asked.map(|asked| asked.job),
         done: asked.filter(|_| hearing.outcome != Outcome::None).map_or(0, |asked| asked.sequence),
         outcome: hearing.outcome,
-        clear_of_part: hearing.clear,
+        clear_of_part: hearing.clear_of_part,
         progress,
-        ..Status::of(hearing.state)
+        ..Status::from_state(hearing.state)
     }
 }
 
 /// Returns the path of the list of a job, relative to the folder of its run.
 fn plan_file(job: Job) -> String {
-    format!("cycle-{}/plan{}.csv", job.number().cycle, of_batch(job))
+    format!("cycle-{}/plan{}.csv", job.batch_id().cycle, batch_suffix(job))
 }
 
 fn hits_file(job: Job) -> String {
-    format!("cycle-{}/hits{}.jsonl", job.number().cycle, of_batch(job))
+    format!("cycle-{}/hits{}.jsonl", job.batch_id().cycle, batch_suffix(job))
 }
 
-fn of_batch(job: Job) -> String {
-    match job.number().batch {
+fn batch_suffix(job: Job) -> String {
+    match job.batch_id().batch {
         0 => String::new(),
         before => format!("-{}", before + 1),
     }
@@ -211,64 +223,66 @@ impl Machine for HitLinesCmm {
     }
 
     fn notes(&self) -> Vec<String> {
-        let hearing = locked(&self.hearing);
+        let hearing = locked(&self.session);
         hearing.refusals().into_iter().chain(self.prompt(&hearing)).collect()
     }
 
-    async fn connect(&mut self) -> Answered<Identity> {
-        let lost = locked(&self.hearing).lost.is_some();
+    async fn connect(&mut self) -> DeviceResult<Identity> {
+        let lost = locked(&self.session).link_error.is_some();
         if self.listener.is_none() || lost {
             // Close the port first: an open port cannot be opened again.
             self.listener = None;
-            let (line, waits) = (self.settings.line.clone(), self.settings.waits());
-            let opened = Listener::open(&self.name, line, waits, Arc::clone(&self.hearing)).await?;
+            let (line, waits) = (self.settings.source.clone(), self.settings.timeouts());
+            let opened = Listener::open(&self.name, line, waits, Arc::clone(&self.session)).await?;
             self.listener = Some(opened);
         }
         // Printed lines do not identify the machine: only the cell file says what it is.
         let simulation = self.settings.simulated;
-        Ok(Identity { simulation, ..Identity::by_person(MachineKind::Cmm, &self.name) })
+        Ok(Identity { simulation, ..Identity::for_manual_machine(MachineKind::Cmm, &self.name) })
     }
 
-    async fn status(&mut self) -> Answered<Status> {
-        self.told()
+    async fn status(&mut self) -> DeviceResult<Status> {
+        self.current_status()
     }
 
     fn restore(&mut self, intended: &Armed) {
-        self.kept.restore(intended);
+        self.memory.restore(intended);
     }
 
-    async fn claim(&mut self) -> Answered<Status> {
-        self.told()
+    async fn claim(&mut self) -> DeviceResult<Status> {
+        self.current_status()
     }
 
-    async fn prepare(&mut self, job: Job) -> Answered<Armed> {
-        let Some(plan) = self.kept.ready_for(job) else {
+    async fn prepare(&mut self, job: Job) -> DeviceResult<Armed> {
+        let Some(plan) = self.memory.payload_for(job) else {
             return Err(self.refused(Command::Prepare, Answer::PayloadMissing));
         };
-        self.told()?;
-        if locked(&self.hearing).state != State::Idle {
+        self.current_status()?;
+        if locked(&self.session).state != State::Idle {
             return Err(self.refused(Command::Prepare, Answer::WrongState));
         }
         let (settings, owned) = (self.settings.clone(), Arc::clone(&plan));
         let written = tokio::task::spawn_blocking(move || write_list(&settings, &owned, job));
-        let kept = written.await.map_err(|e| self.not_taken(e))?.map_err(|e| self.not_taken(e))?;
-        let is_free = self.settings.free_points.is_some();
-        let list = List::new(&plan, self.settings.what, is_free, self.settings.telling());
-        let mut hearing = locked(&self.hearing);
-        let armed = self.kept.prepared(job);
-        hearing.asked = Some(Asked::new((job, armed.start_sequence), plan.identity(), list, Some(kept)));
+        let kept = written.await.map_err(|e| self.not_accepted(e))?.map_err(|e| self.not_accepted(e))?;
+        let is_free = self.settings.min_free_points.is_some();
+        let list = TargetList::new(&plan, self.settings.coordinates, is_free, self.settings.touch_rules());
+        let mut hearing = locked(&self.session);
+        let armed = self.memory.arm(job);
+        hearing.measurement =
+            Some(RequestedMeasurement::new((job, armed.start_sequence), plan.identity(), list, Some(kept)));
         (hearing.state, hearing.outcome) = (State::Prepared, Outcome::None);
         Ok(armed)
     }
 
-    async fn start(&mut self, armed: Armed) -> Answered<Started> {
+    async fn start(&mut self, armed: Armed) -> DeviceResult<Started> {
         let Armed { job, start_sequence, .. } = armed;
-        self.told()?;
-        let plan = self.kept.loaded.as_ref().map(|(plan, _)| Arc::clone(plan));
+        self.current_status()?;
+        let plan = self.memory.loaded.as_ref().map(|(plan, _)| Arc::clone(plan));
         let status = {
-            let mut hearing = locked(&self.hearing);
+            let mut hearing = locked(&self.session);
             let is_prepared = hearing.state == State::Prepared;
-            let asked = hearing.asked.as_mut().filter(|asked| (asked.job, asked.sequence) == (job, start_sequence));
+            let asked =
+                hearing.measurement.as_mut().filter(|asked| (asked.job, asked.sequence) == (job, start_sequence));
             let Some(asked) = asked.filter(|_| is_prepared) else {
                 drop(hearing);
                 return Err(self.refused(Command::Start, Answer::OtherJob));
@@ -276,106 +290,106 @@ impl Machine for HitLinesCmm {
             let now = tokio::time::Instant::now();
             (asked.begun, asked.last_line) = (now, now);
             // Lines are accepted before anybody can see the list.
-            (hearing.state, hearing.clear) = (State::Execute, None);
+            (hearing.state, hearing.clear_of_part) = (State::Execute, None);
             status_of(&hearing)
         };
-        self.kept.begun = start_sequence;
+        self.memory.last_start_sequence = start_sequence;
         if let Some(plan) = plan {
             let settings = self.settings.clone();
             let shown = tokio::task::spawn_blocking(move || show_list(&settings, &plan, job));
             let shown =
-                shown.await.map_err(|e| self.not_taken(e)).and_then(|shown| shown.map_err(|e| self.not_taken(e)));
+                shown.await.map_err(|e| self.not_accepted(e)).and_then(|shown| shown.map_err(|e| self.not_accepted(e)));
             if let Err(error) = shown {
                 // The list was shown to nobody.
-                locked(&self.hearing).state = State::Prepared;
+                locked(&self.session).state = State::Prepared;
                 return Err(error);
             }
         }
         Ok(Started { job, start_sequence, status })
     }
 
-    async fn hold(&mut self) -> Answered<Status> {
-        self.told()?;
-        self.go(Command::Hold, &[State::Execute], State::Holding)
+    async fn hold(&mut self) -> DeviceResult<Status> {
+        self.current_status()?;
+        self.transition(Command::Hold, &[State::Execute], State::Holding)
     }
 
-    async fn resume(&mut self) -> Answered<Status> {
-        self.told()?;
-        self.go(Command::Resume, &[State::Held], State::Execute)
+    async fn resume(&mut self) -> DeviceResult<Status> {
+        self.current_status()?;
+        self.transition(Command::Resume, &[State::Held], State::Execute)
     }
 
-    async fn stop(&mut self) -> Answered<Status> {
-        self.told()?;
-        if let Some((job, sequence)) = self.kept.untold.take() {
-            let mut hearing = locked(&self.hearing);
-            let list = List::new(&no_plan(), self.settings.what, false, self.settings.telling());
-            hearing.asked = Some(Asked::new((job, sequence), [0; 32], list, None));
+    async fn stop(&mut self) -> DeviceResult<Status> {
+        self.current_status()?;
+        if let Some((job, sequence)) = self.memory.unresolved.take() {
+            let mut hearing = locked(&self.session);
+            let list = TargetList::new(&no_plan(), self.settings.coordinates, false, self.settings.touch_rules());
+            hearing.measurement = Some(RequestedMeasurement::new((job, sequence), [0; 32], list, None));
             hearing.state = State::Stopping;
             return Ok(status_of(&hearing));
         }
-        let state = locked(&self.hearing).state;
+        let state = locked(&self.session).state;
         match state {
             State::Prepared => {
-                locked(&self.hearing).forget();
-                self.go(Command::Stop, &[State::Prepared], State::Idle)
+                locked(&self.session).forget();
+                self.transition(Command::Stop, &[State::Prepared], State::Idle)
             }
             // A person has confirmed that it does not move.
             State::Held => {
-                let mut hearing = locked(&self.hearing);
+                let mut hearing = locked(&self.session);
                 hearing.finish(Outcome::Stopped);
                 Ok(status_of(&hearing))
             }
-            _ => self.go(Command::Stop, &[State::Execute, State::Holding], State::Stopping),
+            _ => self.transition(Command::Stop, &[State::Execute, State::Holding], State::Stopping),
         }
     }
 
-    async fn abort(&mut self) -> Answered<Status> {
-        let untold = self.kept.untold.take();
-        let mut hearing = locked(&self.hearing);
-        let may_move = hearing.state.moves() || untold.is_some();
+    async fn abort(&mut self) -> DeviceResult<Status> {
+        let untold = self.memory.unresolved.take();
+        let mut hearing = locked(&self.session);
+        let may_move = hearing.state.is_moving() || untold.is_some();
         hearing.state = if may_move { State::Aborting } else { State::Aborted };
         hearing.outcome = Outcome::Aborted;
         Ok(status_of(&hearing))
     }
 
-    async fn clear(&mut self) -> Answered<Status> {
-        if locked(&self.hearing).state == State::Aborted {
-            locked(&self.hearing).forget();
+    async fn clear(&mut self) -> DeviceResult<Status> {
+        if locked(&self.session).state == State::Aborted {
+            locked(&self.session).forget();
         }
-        self.go(Command::Clear, &[State::Aborted], State::Idle)
+        self.transition(Command::Clear, &[State::Aborted], State::Idle)
     }
 
-    async fn acknowledge(&mut self, done: u32) -> Answered<Status> {
-        if locked(&self.hearing).asked.as_ref().is_none_or(|asked| asked.sequence != done) {
+    async fn acknowledge(&mut self, done: u32) -> DeviceResult<Status> {
+        if locked(&self.session).measurement.as_ref().is_none_or(|asked| asked.sequence != done) {
             return Err(self.refused(Command::Acknowledge, Answer::OtherResult));
         }
-        self.go(Command::Acknowledge, &[State::Complete], State::Idle)?;
-        let mut hearing = locked(&self.hearing);
+        self.transition(Command::Acknowledge, &[State::Complete], State::Idle)?;
+        let mut hearing = locked(&self.session);
         hearing.forget();
         Ok(status_of(&hearing))
     }
 
-    async fn release(&mut self) -> Answered<Status> {
-        let status = self.told()?;
+    async fn release(&mut self) -> DeviceResult<Status> {
+        let status = self.current_status()?;
         // The thread ends and frees the port for other programs.
         self.listener = None;
         Ok(status)
     }
 
-    async fn reconcile(&mut self, intended: &Armed) -> Answered<Reconciled> {
-        self.told()?;
-        let hearing = locked(&self.hearing);
-        let ours = hearing.asked.as_ref().map(|asked| (asked.job, asked.sequence))
+    async fn reconcile(&mut self, intended: &Armed) -> DeviceResult<Reconciled> {
+        self.current_status()?;
+        let hearing = locked(&self.session);
+        let ours = hearing.measurement.as_ref().map(|asked| (asked.job, asked.sequence))
             == Some((intended.job, intended.start_sequence));
         Ok(match hearing.state {
             State::Complete | State::Aborted if ours => Reconciled::Finished(status_of(&hearing)),
-            state if ours && (state.moves() || state == State::Held) => Reconciled::Running(status_of(&hearing)),
-            _ => Reconciled::Unknown { why: "only who was asked to do it can tell what became of it".to_owned() },
+            state if ours && (state.is_moving() || state == State::Held) => Reconciled::Running(status_of(&hearing)),
+            _ => Reconciled::Unknown { reason: "only who was asked to do it can tell what became of it".to_owned() },
         })
     }
 
-    async fn confirm(&mut self, word: Word) -> Answered<Vec<String>> {
-        self.take_word(word)
+    async fn confirm(&mut self, word: OperatorConfirmation) -> DeviceResult<Vec<String>> {
+        self.accept_confirmation(word)
     }
 }
 
@@ -388,38 +402,38 @@ fn no_plan() -> Plan {
         search_mm: 0.0,
         speed_mm_s: 0.0,
         safe_height_mm: 0.0,
-        careful: None,
+        careful_start: None,
     }
 }
 
 impl Cmm for HitLinesCmm {
-    async fn load_plan(&mut self, plan: &Plan, _: &Interrupt) -> Answered<()> {
-        self.kept.loaded = Some((Arc::new(plan.clone()), digest(&[plan.identity()])));
+    async fn load_plan(&mut self, plan: &Plan, _: &Interrupt) -> DeviceResult<()> {
+        self.memory.loaded = Some((Arc::new(plan.clone()), digest(&[plan.identity()])));
         Ok(())
     }
 
-    async fn read_ahead(&mut self, job: Job, _: &Interrupt) -> Option<Preliminary> {
-        let hearing = locked(&self.hearing);
-        let asked = hearing.asked.as_ref().filter(|asked| asked.job == job)?;
-        let (from, points) = (self.kept.told_ahead, asked.list.ready(self.kept.told_ahead));
+    async fn read_ahead(&mut self, job: Job, _: &Interrupt) -> Option<PreliminaryPoints> {
+        let hearing = locked(&self.session);
+        let asked = hearing.measurement.as_ref().filter(|asked| asked.job == job)?;
+        let (from, points) = (self.memory.reported_points, asked.list.ready(self.memory.reported_points));
         drop(hearing);
-        self.kept.told_ahead += points.len();
+        self.memory.reported_points += points.len();
         let there = !points.is_empty();
-        there.then_some(Preliminary { job, from, points, coordinates: self.settings.what })
+        there.then_some(PreliminaryPoints { job, first_index: from, points, coordinates: self.settings.coordinates })
     }
 
-    async fn collect(&mut self, job: Job, _: &Interrupt) -> Answered<Measurement> {
-        let hearing = locked(&self.hearing);
+    async fn collect(&mut self, job: Job, _: &Interrupt) -> DeviceResult<Measurement> {
+        let hearing = locked(&self.session);
         let complete = hearing.state == State::Complete && hearing.outcome == Outcome::Complete;
-        let Some(asked) = hearing.asked.as_ref().filter(|asked| asked.job == job && complete) else {
+        let Some(asked) = hearing.measurement.as_ref().filter(|asked| asked.job == job && complete) else {
             return Err(DeviceError::NoResult { machine: Arc::clone(&self.name), job, state: hearing.state });
         };
         Ok(Measurement {
             points: asked.list.points(),
-            coordinates: self.settings.what,
+            coordinates: self.settings.coordinates,
             probe_radius_mm: None,
             temperature_c: None,
-            duration_s: Some(hearing.worked.as_secs_f64()),
+            duration_s: Some(hearing.duration.as_secs_f64()),
             plan_identity: asked.plan_identity,
             job: job.job,
             cycle: job.cycle,

@@ -21,9 +21,9 @@ mod list;
 mod machine;
 mod settings;
 
-pub use format::{Hit, LineFlaw, LineFormat, Reading, Separator};
-pub use lines::{Gathered, Lines};
-pub use link::HitLine;
+pub use format::{Hit, LineError, LineFormat, LineParser, Separator};
+pub use lines::{LineSplitter, ReceivedLine};
+pub use link::HitSource;
 pub use list::Repeated;
 pub use machine::HitLinesCmm;
 pub use settings::{Axes, DataBits, HitLinesSettings, HitLinesWire, Mark};

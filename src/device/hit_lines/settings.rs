@@ -7,14 +7,14 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::HitLinesCmm;
-use super::format::{LineFormat, Reading, Separator};
-use super::hearing::Judging;
-use super::link::{HitLine, Waits};
-use super::list::{Repeated, Telling};
+use super::format::{LineFormat, LineParser, Separator};
+use super::hearing::LineRules;
+use super::link::{HitSource, LinkTimeouts};
+use super::list::{Repeated, TouchRules};
 use crate::modbus::{Parity, port};
 use crate::no_machine::NoMachine;
-use crate::place::Place;
-use crate::wiring::{Making, MakingError, Wired};
+use crate::place::MachineTable;
+use crate::wiring::{DriverContext, DriverError, DriverFactory};
 use regrind_document::Document;
 use regrind_formats::Unit;
 use regrind_formats::result::Coordinates;
@@ -50,7 +50,7 @@ pub struct HitLinesWire {
     pub format: Option<LineFormat>,
     /// What the coordinates are: centres of the probe, or contacts.
     #[schemars(extend("x-required" = true), example = &"centres")]
-    pub what: Option<Coordinates>,
+    pub coordinates: Option<Coordinates>,
     /// How many digits stand behind the decimal mark of a coordinate, in each of them; a line with another number is refused.
     #[schemars(range(min = 1, max = 9))]
     pub decimals: u8,
@@ -73,15 +73,15 @@ pub struct HitLinesWire {
     pub limit_mm: f64,
     /// The same line, to the last digit, within this is the same touch, sent twice.
     #[schemars(range(min = 0, max = 10000))]
-    pub double_within_ms: u32,
+    pub duplicate_window_ms: u32,
     /// What becomes of a second touch of a target.
-    pub repeated: Repeated,
+    pub repeated_touch: Repeated,
     /// For the rest of a line that has begun.
     #[schemars(range(min = 10, max = 60000))]
-    pub line_within_ms: u32,
+    pub line_timeout_ms: u32,
     /// Beginnings of lines that mean nothing, such as headers.
     #[schemars(length(max = 32), inner(length(min = 1, max = 80)))]
-    pub passed_over: Vec<String>,
+    pub ignored_prefixes: Vec<String>,
     /// Where the machine's own part program leads the probe clear of the part behind its last point: so long after it, it is. Left out, a person
     /// is asked.
     #[schemars(range(min = 0.1, max = 3600.0))]
@@ -149,7 +149,7 @@ impl Default for HitLinesWire {
             host: None,
             port: 0,
             format: None,
-            what: None,
+            coordinates: None,
             decimals: 3,
             decimal: Mark::Point,
             separator: Separator::Comma,
@@ -158,10 +158,10 @@ impl Default for HitLinesWire {
             rotary_deg: 0.0,
             rotary_tolerance_deg: 0.05,
             limit_mm: 1.0,
-            double_within_ms: 200,
-            repeated: Repeated::Refuse,
-            line_within_ms: 1000,
-            passed_over: Vec::new(),
+            duplicate_window_ms: 200,
+            repeated_touch: Repeated::Refuse,
+            line_timeout_ms: 1000,
+            ignored_prefixes: Vec::new(),
             clear_after_s: None,
             plan_folder: None,
         }
@@ -178,11 +178,11 @@ pub struct HitLinesSettings {
     /// Folder in which a part program reads the list.
     pub plan_folder: Option<PathBuf>,
     /// Source of the lines.
-    pub line: HitLine,
+    pub source: HitSource,
     /// Parameters of the parsing of lines.
-    pub reading: Reading,
+    pub parser: LineParser,
     /// Meaning of the coordinates: centres of the probe, or contacts.
-    pub what: Coordinates,
+    pub coordinates: Coordinates,
     /// Required angle of the rotary table and its tolerance, in degrees.
     pub rotary_deg: [f64; 2],
     /// Maximum distance of a point from its target, in mm.
@@ -192,15 +192,15 @@ pub struct HitLinesSettings {
     /// Handling of a second touch of a target.
     pub repeated: Repeated,
     /// Timeout of the rest of a line.
-    pub line_within: Duration,
+    pub line_timeout: Duration,
     /// Beginnings of lines that are ignored.
     pub passed_over: Vec<String>,
     /// Time after the last point at which the probe is clear of the part; `None` if a person confirms it.
     pub clear_after: Option<Duration>,
     /// Minimum number of points, if any points are accepted.
-    pub free_points: Option<usize>,
+    pub min_free_points: Option<usize>,
     /// Timeout of the connection.
-    pub connect_within: Duration,
+    pub connect_timeout: Duration,
     /// Duration of silence that ends the discarding of data sent before the connection was used.
     pub silence: Duration,
     /// True if the cell is a simulation.
@@ -208,28 +208,28 @@ pub struct HitLinesSettings {
 }
 
 impl HitLinesSettings {
-    pub(super) fn judging(&self) -> Judging {
+    pub(super) fn line_rules(&self) -> LineRules {
         let passed_over = self.passed_over.clone();
-        Judging { reading: self.reading, rotary_deg: self.rotary_deg, passed_over }
+        LineRules { parser: self.parser, rotary_deg: self.rotary_deg, passed_over }
     }
 
-    pub(super) fn telling(&self) -> Telling {
+    pub(super) fn touch_rules(&self) -> TouchRules {
         let Self { limit_mm, double_within, repeated, .. } = *self;
-        Telling { limit_mm, double_within, repeated }
+        TouchRules { limit_mm, double_within, repeated }
     }
 
-    pub(super) fn waits(&self) -> Waits {
-        Waits { connect: self.connect_within, silence: self.silence, rest: self.line_within }
+    pub(super) fn timeouts(&self) -> LinkTimeouts {
+        LinkTimeouts { connect: self.connect_timeout, silence: self.silence, rest: self.line_timeout }
     }
 }
 
-impl Wired for HitLinesWire {
+impl DriverFactory for HitLinesWire {
     type Cmm = HitLinesCmm;
     type Grinder = NoMachine;
     const BY_PERSON: bool = true;
-    const TELLS_TEMPERATURE: bool = false;
+    const REPORTS_TEMPERATURE: bool = false;
 
-    fn check(&self, place: &Place<'_>, document: &mut Document) {
+    fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         if place.table == "grinder" {
             let allowed = "hit lines are those of measuring machines";
             return document.report("grinder.wire.kind", "is \"hit-lines\"", allowed, "name another wire");
@@ -243,77 +243,77 @@ impl Wired for HitLinesWire {
     }
 
     fn coordinates(&self) -> Option<Coordinates> {
-        self.what
+        self.coordinates
     }
 
-    fn cmm(&self, making: &Making<'_>) -> Result<HitLinesCmm, MakingError> {
+    fn create_cmm(&self, making: &DriverContext<'_>) -> Result<HitLinesCmm, DriverError> {
         if let Some(missing) = self.missing() {
-            return Err(MakingError::NoPort { missing });
+            return Err(DriverError::NoPort { missing });
         }
         let plan_folder = self.plan_folder.as_ref().map(|folder| making.cell_folder.join(folder));
         if let Some(path) = plan_folder.as_ref().filter(|path| !path.is_dir()) {
             let machine = crate::MachineKind::Cmm;
-            return Err(MakingError::Folder { key: "cmm.wire.plan_folder".to_owned(), path: path.clone(), machine });
+            return Err(DriverError::Folder { key: "cmm.wire.plan_folder".to_owned(), path: path.clone(), machine });
         }
         let ms = |ms: u32| Duration::from_millis(ms.into());
         Ok(HitLinesCmm::new(HitLinesSettings {
             part: making.part.to_owned(),
             run_folder: making.run_folder.to_owned(),
             plan_folder,
-            line: self.line(),
-            reading: self.reading(),
+            source: self.source(),
+            parser: self.parser(),
             // A cell file without this key is refused.
-            what: self.what.unwrap_or(Coordinates::Centres),
+            coordinates: self.coordinates.unwrap_or(Coordinates::Centres),
             rotary_deg: [self.rotary_deg, self.rotary_tolerance_deg],
             limit_mm: self.limit_mm,
-            double_within: ms(self.double_within_ms),
-            repeated: self.repeated,
-            line_within: ms(self.line_within_ms),
-            passed_over: self.passed_over.clone(),
+            double_within: ms(self.duplicate_window_ms),
+            repeated: self.repeated_touch,
+            line_timeout: ms(self.line_timeout_ms),
+            passed_over: self.ignored_prefixes.clone(),
             clear_after: self.clear_after_s.map(Duration::from_secs_f64),
-            free_points: making.free_points,
-            connect_within: making.timing.lost_after,
+            min_free_points: making.min_free_points,
+            connect_timeout: making.timing.lost_after,
             silence: making.timing.quarantine,
             simulated: making.simulated,
         }))
     }
 
-    fn grinder(&self, _: &Making<'_>) -> Result<NoMachine, MakingError> {
-        Err(MakingError::NoDriver { table: "grinder", kind: "hit-lines" })
+    fn create_grinder(&self, _: &DriverContext<'_>) -> Result<NoMachine, DriverError> {
+        Err(DriverError::NoDriver { table: "grinder", kind: "hit-lines" })
     }
 
-    fn hit_line(&self) -> Option<HitLine> {
-        Some(self.line())
+    fn hit_source(&self) -> Option<HitSource> {
+        Some(self.source())
     }
 }
 
 impl HitLinesWire {
     /// Returns the source of the lines.
-    pub fn line(&self) -> HitLine {
+    pub fn source(&self) -> HitSource {
         let Self { device, host, port, .. } = self.clone();
         match (device, host) {
-            (Some(device), _) => HitLine::Serial {
+            (Some(device), _) => HitSource::Serial {
                 device,
                 baud: self.baud,
                 data_bits: if self.data_bits == DataBits::Seven { 7 } else { 8 },
                 parity: self.parity,
                 stop_bits: self.stop_bits,
             },
-            (None, host) => HitLine::Tcp { host: host.unwrap_or_default(), port },
+            (None, host) => HitSource::Tcp { host: host.unwrap_or_default(), port },
         }
     }
 
     /// Returns true if the name of the other end is only known once it is simulated in this process.
-    pub fn is_open(&self) -> bool {
-        match self.line() {
-            HitLine::Serial { device, .. } => device == AUTO,
-            HitLine::Tcp { port, .. } => port == 0,
+    pub fn has_dynamic_address(&self) -> bool {
+        match self.source() {
+            HitSource::Serial { device, .. } => device == AUTO,
+            HitSource::Tcp { port, .. } => port == 0,
         }
     }
 
     /// Returns the parameters of the parsing of lines.
-    pub fn reading(&self) -> Reading {
-        Reading {
+    pub fn parser(&self) -> LineParser {
+        LineParser {
             // A cell file without this key is refused.
             format: self.format.unwrap_or(LineFormat::Decimal),
             separator: self.separator,
@@ -329,7 +329,7 @@ impl HitLinesWire {
         port::missing(device)
     }
 
-    fn check_line(&self, place: &Place<'_>, document: &mut Document) {
+    fn check_line(&self, place: &MachineTable<'_>, document: &mut Document) {
         let one = "it is heard on a serial port or through a terminal server";
         match (&self.device, &self.host) {
             (None, None) => {

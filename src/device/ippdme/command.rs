@@ -3,10 +3,10 @@
 use std::fmt;
 
 use super::grammar;
-use super::text::{Flaw, Item, Reader, Strictness, Tag, arguments, has_stray_blank, list};
+use super::text::{Item, Reader, Strictness, SyntaxError, Tag, arguments, has_stray_blank, list};
 
 /// Maximum number of characters in a line, without the line end.
-pub const LONGEST_LINE: usize = 65_536;
+pub const MAX_LINE_LENGTH: usize = 65_536;
 
 /// Command without its tag.
 #[derive(Clone, Debug, PartialEq)]
@@ -33,12 +33,12 @@ impl Command {
     ///
     /// # Errors
     /// Returns the error number of the standard with which a server refuses the line.
-    pub fn read(line: &str) -> Result<(Tag, Self), Flaw> {
-        if line.len() > LONGEST_LINE {
-            return Err(Flaw { number: 8, why: "a line of more than 65536 characters" });
+    pub fn read(line: &str) -> Result<(Tag, Self), SyntaxError> {
+        if line.len() > MAX_LINE_LENGTH {
+            return Err(SyntaxError { number: 8, reason: "a line of more than 65536 characters" });
         }
         if !line.bytes().all(|b| (32..=126).contains(&b)) {
-            return Err(Flaw { number: 7, why: "a character that is not ASCII 32 to 126" });
+            return Err(SyntaxError { number: 7, reason: "a character that is not ASCII 32 to 126" });
         }
         let (tag, rest) = tagged(line)?;
         if has_stray_blank(rest) {
@@ -47,17 +47,17 @@ impl Command {
         let mut reader = Reader::new(rest, Strictness::Strict);
         let command = Self::untagged(&mut reader)?;
         if !reader.is_at_end() {
-            return Err(Flaw { number: 507, why: "something stands behind the command" });
+            return Err(SyntaxError { number: 507, reason: "something stands behind the command" });
         }
         if command.is_event() != matches!(tag, Tag::Event(_)) {
-            return Err(Flaw { number: 1, why: "commands that end in E have event tags, and no others" });
+            return Err(SyntaxError { number: 1, reason: "commands that end in E have event tags, and no others" });
         }
         grammar::check(&command)?;
         Ok((tag, command))
     }
 
-    fn untagged(reader: &mut Reader<'_>) -> Result<Self, Flaw> {
-        let illegal = |why| Flaw { number: 507, why };
+    fn untagged(reader: &mut Reader<'_>) -> Result<Self, SyntaxError> {
+        let illegal = |why| SyntaxError { number: 507, reason: why };
         let text = reader.rest();
         let end = text.bytes().position(|b| !b.is_ascii_alphanumeric()).unwrap_or(text.len());
         let name = &text[..end];
@@ -84,12 +84,12 @@ impl fmt::Display for Command {
 }
 
 /// Splits a line into its tag and the rest after the blank.
-fn tagged(line: &str) -> Result<(Tag, &str), Flaw> {
-    let illegal = Flaw { number: 1, why: "a tag that is none" };
+fn tagged(line: &str) -> Result<(Tag, &str), SyntaxError> {
+    let illegal = SyntaxError { number: 1, reason: "a tag that is none" };
     let tag = line.get(..5).and_then(Tag::read).ok_or(illegal)?;
     if matches!(tag, Tag::Command(0) | Tag::Event(0)) {
-        return Err(Flaw { number: 1, why: "tags count from 1" });
+        return Err(SyntaxError { number: 1, reason: "tags count from 1" });
     }
-    let rest = line[5..].strip_prefix(' ').ok_or(Flaw { number: 2, why: "no blank behind the tag" })?;
+    let rest = line[5..].strip_prefix(' ').ok_or(SyntaxError { number: 2, reason: "no blank behind the tag" })?;
     Ok((tag, rest))
 }

@@ -2,7 +2,7 @@
 //! the grammar is not refused for its arguments.
 
 use super::command::Command;
-use super::text::{Flaw, Item, Tag, arguments, bad};
+use super::text::{Item, SyntaxError, Tag, arguments, bad};
 
 const PART_AXES: &[&str] = &["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C"];
 const CSYS: &[&str] = &["JogDisplayCsy", "JogMoveCsy", "MoveableMachineCsy", "MultipleArmCsy", "PartCsy", "SensorCsy"];
@@ -13,7 +13,7 @@ const PARAMETERS: &[&str] = &["Accel", "Speed", "Approach", "Search", "Retract"]
 enum Shape {
     Nothing,
     /// Numbers: the allowed counts, and which of the numbers must be positive or also whole.
-    Numbers(&'static [usize], &'static [Wanted]),
+    Numbers(&'static [usize], &'static [NumberCondition]),
     /// String.
     Text,
     /// Positive number.
@@ -27,7 +27,7 @@ enum Shape {
     /// The frame and six numbers.
     Transformation,
     /// Requested properties, each once.
-    Asked(&'static [&'static str]),
+    Queries(&'static [&'static str]),
     /// Requested properties, with a time and a distance.
     Daemonised,
     /// Axes with values.
@@ -36,21 +36,21 @@ enum Shape {
     Touch,
     /// Properties of tools: enumerate the parts of one, read several, set several.
     Enumerated,
-    Told,
+    ReadProperties,
     Set,
 }
 
-/// Condition on one of the numbers, by index: `Positive`, or `Through` (positive and whole).
-enum Wanted {
+/// Condition on one of the numbers, by index: `Positive`, or `PositiveWhole` (positive and whole).
+enum NumberCondition {
     Positive(usize),
-    Through(usize),
+    PositiveWhole(usize),
 }
 
+use NumberCondition::{Positive as P, PositiveWhole as T};
 use Shape::{
-    Asked, Axes, Daemon, Daemonised, Enumerated, Nothing, Numbers, OneOf, Positive, Set, Text, Told, Touch,
+    Axes, Daemon, Daemonised, Enumerated, Nothing, Numbers, OneOf, Positive, Queries, ReadProperties, Set, Text, Touch,
     Transformation, Whole,
 };
-use Wanted::{Positive as P, Through as T};
 
 const COMMANDS: &[(&str, Shape)] = &[
     ("AbortE", Nothing),
@@ -66,7 +66,7 @@ const COMMANDS: &[(&str, Shape)] = &[
     ("EnumProp", Enumerated),
     ("EnumTools", Nothing),
     ("FindTool", Text),
-    ("Get", Asked(PART_AXES)),
+    ("Get", Queries(PART_AXES)),
     ("GetChangeToolAction", Text),
     ("GetCoordSystem", Nothing),
     ("GetCsyTransformation", OneOf(CSYS)),
@@ -74,18 +74,18 @@ const COMMANDS: &[(&str, Shape)] = &[
     ("GetErrStatusE", Nothing),
     ("GetErrorInfo", Whole),
     ("GetMachineClass", Nothing),
-    ("GetProp", Told),
-    ("GetPropE", Told),
+    ("GetProp", ReadProperties),
+    ("GetPropE", ReadProperties),
     ("GetXtdErrStatus", Nothing),
     ("GoTo", Axes),
     ("Home", Nothing),
     ("IsHomed", Nothing),
     ("IsUserEnabled", Nothing),
-    ("LockAxis", Asked(&["X", "Y", "Z", "R", "C", "Phi", "A", "B"])),
+    ("LockAxis", Queries(&["X", "Y", "Z", "R", "C", "Phi", "A", "B"])),
     ("OnMoveReportE", Daemonised),
     // The quality came with a later version than 1.4, the version of this grammar.
-    ("OnPtMeasReport", Asked(&["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C", "ER", "IJK"])),
-    ("OnScanReport", Asked(&["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C", "ER", "IJK", "Q"])),
+    ("OnPtMeasReport", Queries(&["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C", "ER", "IJK"])),
+    ("OnScanReport", Queries(&["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C", "ER", "IJK", "Q"])),
     ("PtMeas", Touch),
     ("ReQualify", Nothing),
     ("ScanInCylEndIsPlane", Numbers(&[26], &[P(15), T(22)])),
@@ -123,9 +123,9 @@ pub(super) fn is_known(name: &str) -> bool {
 ///
 /// # Errors
 /// Returns the error with which a server refuses the arguments.
-pub(super) fn check(command: &Command) -> Result<(), Flaw> {
+pub(super) fn check(command: &Command) -> Result<(), SyntaxError> {
     let Some((_, shape)) = COMMANDS.iter().find(|(name, _)| *name == command.name) else {
-        return Err(Flaw { number: 507, why: "a command that nobody knows" });
+        return Err(SyntaxError { number: 507, reason: "a command that nobody knows" });
     };
     let items = &command.arguments[..];
     let values_are_numbers = |item: &Item| match item {
@@ -153,7 +153,7 @@ pub(super) fn check(command: &Command) -> Result<(), Flaw> {
         },
         Numbers(counts, wanted) => numbers(items, counts, wanted),
         Transformation => transformation(items),
-        Asked(names) => properties(items, &|name, values| names.contains(&name) && values.is_empty()),
+        Queries(names) => properties(items, &|name, values| names.contains(&name) && values.is_empty()),
         Daemonised => daemonised(items),
         Axes => properties(items, &|name, values| match name {
             "IJK" => values.len() == 3,
@@ -161,12 +161,12 @@ pub(super) fn check(command: &Command) -> Result<(), Flaw> {
         }),
         Touch => touch(items),
         Enumerated => one().and_then(|item| enumerated(item, items)).or_else(|flaw| trailing(items, flaw)),
-        Told => each_property(items, told),
+        ReadProperties => each_property(items, check_read_property),
         Set => each_property(items, set),
     }
 }
 
-fn numbers(items: &[Item], counts: &[usize], wanted: &[Wanted]) -> Result<(), Flaw> {
+fn numbers(items: &[Item], counts: &[usize], wanted: &[NumberCondition]) -> Result<(), SyntaxError> {
     let numbers: Option<Vec<f64>> = items.iter().map(Item::number).collect();
     let numbers = numbers.filter(|numbers| counts.contains(&numbers.len()));
     let numbers = numbers.ok_or(arguments("it has another number of numbers"))?;
@@ -182,7 +182,7 @@ fn numbers(items: &[Item], counts: &[usize], wanted: &[Wanted]) -> Result<(), Fl
     Ok(())
 }
 
-fn transformation(items: &[Item]) -> Result<(), Flaw> {
+fn transformation(items: &[Item]) -> Result<(), SyntaxError> {
     let [Item::Name(csy), rest @ ..] = items else { return Err(arguments("it has a name and six numbers")) };
     if rest.len() != 6 || rest.iter().any(|item| item.number().is_none()) {
         return Err(arguments("it has a name and six numbers"));
@@ -192,12 +192,12 @@ fn transformation(items: &[Item]) -> Result<(), Flaw> {
     }
     match rest[3].number() {
         Some(theta) if (0.0..=180.0).contains(&theta) => Ok(()),
-        _ => Err(Flaw { number: 1007, why: "theta is 0 to 180 degrees" }),
+        _ => Err(SyntaxError { number: 1007, reason: "theta is 0 to 180 degrees" }),
     }
 }
 
 /// Checks that every property is of the right kind and occurs once.
-fn properties(items: &[Item], fits: &dyn Fn(&str, &[Item]) -> bool) -> Result<(), Flaw> {
+fn properties(items: &[Item], fits: &dyn Fn(&str, &[Item]) -> bool) -> Result<(), SyntaxError> {
     if items.is_empty() {
         return Err(arguments("it has at least one argument"));
     }
@@ -211,12 +211,12 @@ fn properties(items: &[Item], fits: &dyn Fn(&str, &[Item]) -> bool) -> Result<()
     Ok(())
 }
 
-fn once(before: &[Item], name: &str) -> Result<(), Flaw> {
+fn once(before: &[Item], name: &str) -> Result<(), SyntaxError> {
     let twice = before.iter().any(|item| matches!(item, Item::Call(other, _) if other == name));
     if twice { Err(arguments("a property stands there twice")) } else { Ok(()) }
 }
 
-fn daemonised(items: &[Item]) -> Result<(), Flaw> {
+fn daemonised(items: &[Item]) -> Result<(), SyntaxError> {
     if items.is_empty() {
         return Ok(());
     }
@@ -231,7 +231,7 @@ fn daemonised(items: &[Item]) -> Result<(), Flaw> {
     })
 }
 
-fn touch(items: &[Item]) -> Result<(), Flaw> {
+fn touch(items: &[Item]) -> Result<(), SyntaxError> {
     for item in items {
         if matches!(item, Item::Call(name, values) if matches!(name.as_str(), "X" | "Y" | "Z") && values.is_empty()) {
             return Err(bad("a coordinate has a number"));
@@ -249,14 +249,14 @@ fn touch(items: &[Item]) -> Result<(), Flaw> {
 
 /// Returns the error for a trailing comma: a name, then a comma with nothing after it, is refused as a property without
 /// parentheses. Otherwise returns `otherwise`.
-fn trailing(items: &[Item], otherwise: Flaw) -> Result<(), Flaw> {
+fn trailing(items: &[Item], otherwise: SyntaxError) -> Result<(), SyntaxError> {
     match items {
         [.., Item::Name(_), Item::Nothing] => Err(bad("a property ends with its parentheses")),
         _ => Err(otherwise),
     }
 }
 
-fn each_property(items: &[Item], check: fn(&[&str], &[Item]) -> Result<(), Flaw>) -> Result<(), Flaw> {
+fn each_property(items: &[Item], check: fn(&[&str], &[Item]) -> Result<(), SyntaxError>) -> Result<(), SyntaxError> {
     let all_calls = !items.is_empty() && items.iter().all(|item| matches!(item, Item::Call(..)));
     if !all_calls {
         return trailing(items, arguments("an argument is no property"));
@@ -269,7 +269,7 @@ fn each_property(items: &[Item], check: fn(&[&str], &[Item]) -> Result<(), Flaw>
     Ok(())
 }
 
-fn enumerated(item: &Item, items: &[Item]) -> Result<(), Flaw> {
+fn enumerated(item: &Item, items: &[Item]) -> Result<(), SyntaxError> {
     let Item::Call(name, values) = item else { return trailing(items, arguments("the argument is no property")) };
     let parts: Vec<&str> = name.split('.').collect();
     if !values.is_empty() {
@@ -282,11 +282,11 @@ fn enumerated(item: &Item, items: &[Item]) -> Result<(), Flaw> {
     third_and_fourth(&parts, &["Act", "Def", "Max", "Min"])
 }
 
-fn tool(parts: &[&str]) -> Result<(), Flaw> {
+fn tool(parts: &[&str]) -> Result<(), SyntaxError> {
     if matches!(parts[0], "Tool" | "FoundTool") { Ok(()) } else { Err(bad("the first part is Tool or FoundTool")) }
 }
 
-fn third_and_fourth(parts: &[&str], fourth: &[&str]) -> Result<(), Flaw> {
+fn third_and_fourth(parts: &[&str], fourth: &[&str]) -> Result<(), SyntaxError> {
     if parts.get(2).is_some_and(|part| !PARAMETERS.contains(part)) {
         return Err(bad("the third part is no parameter"));
     }
@@ -296,7 +296,7 @@ fn third_and_fourth(parts: &[&str], fourth: &[&str]) -> Result<(), Flaw> {
     if parts.len() > 4 { Err(arguments("a property has four parts at most")) } else { Ok(()) }
 }
 
-fn told(parts: &[&str], values: &[Item]) -> Result<(), Flaw> {
+fn check_read_property(parts: &[&str], values: &[Item]) -> Result<(), SyntaxError> {
     if !values.is_empty() {
         return Err(arguments("a property is asked for with empty parentheses"));
     }
@@ -313,7 +313,7 @@ fn told(parts: &[&str], values: &[Item]) -> Result<(), Flaw> {
     }
 }
 
-fn set(parts: &[&str], values: &[Item]) -> Result<(), Flaw> {
+fn set(parts: &[&str], values: &[Item]) -> Result<(), SyntaxError> {
     tool(parts)?;
     match parts {
         [_] | [_, _] => Err(arguments("a property that is set has three parts or four")),

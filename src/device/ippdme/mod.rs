@@ -22,14 +22,14 @@ mod settings;
 mod text;
 mod work;
 
-pub use command::{Command, LONGEST_LINE};
+pub use command::{Command, MAX_LINE_LENGTH};
 pub use machine::IppdmeCmm;
-pub use response::{Response, Said, ServerError, value, values};
+pub use response::{Response, ResponseContent, ServerError, value, values};
 pub use session::Limits;
 pub use settings::{IppdmeSettings, IppdmeWire, Scanning};
-pub use text::{Flaw, Item, Tag, number};
+pub use text::{Item, SyntaxError, Tag, number};
 
 /// Returns the static name of a command, for messages that hold no owned strings; `"a command"` for an unknown name.
-fn known(name: &str) -> &'static str {
+fn static_command_name(name: &str) -> &'static str {
     grammar::names().find(|known| *known == name).unwrap_or("a command")
 }

@@ -3,7 +3,7 @@
 
 use std::fmt;
 
-use super::text::{Flaw, Item, Reader, Strictness, Tag};
+use super::text::{Item, Reader, Strictness, SyntaxError, Tag};
 
 /// Line from a server.
 #[derive(Clone, Debug, PartialEq)]
@@ -11,12 +11,12 @@ pub struct Response {
     /// Tag of the command that it answers.
     pub tag: Tag,
     /// Content of the line.
-    pub said: Said,
+    pub content: ResponseContent,
 }
 
 /// Content of a line from a server.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Said {
+pub enum ResponseContent {
     /// Acknowledgement: the command is in the queue.
     Acknowledged,
     /// Data of the command.
@@ -60,23 +60,25 @@ impl Response {
     ///
     /// # Errors
     /// Returns an error if the line is not a valid answer.
-    pub fn read(line: &str) -> Result<Self, Flaw> {
-        let none = |why| Flaw { number: 8, why };
+    pub fn read(line: &str) -> Result<Self, SyntaxError> {
+        let none = |why| SyntaxError { number: 8, reason: why };
         let tag = line.get(..5).and_then(Tag::read).ok_or(none("no tag"))?;
         let rest = line[5..].trim_start_matches(' ');
         let mut characters = rest.chars();
         let said = match characters.next() {
-            Some('&') if characters.as_str().trim().is_empty() => Said::Acknowledged,
-            Some('%') if characters.as_str().trim().is_empty() => Said::Complete,
-            Some('#') => Said::Data(data(characters.as_str())?),
-            Some('!') => Said::Error(error(characters.as_str()).ok_or(none("an error without its numbers"))?),
+            Some('&') if characters.as_str().trim().is_empty() => ResponseContent::Acknowledged,
+            Some('%') if characters.as_str().trim().is_empty() => ResponseContent::Complete,
+            Some('#') => ResponseContent::Data(data(characters.as_str())?),
+            Some('!') => {
+                ResponseContent::Error(error(characters.as_str()).ok_or(none("an error without its numbers"))?)
+            }
             _ => return Err(none("none of & # ! %")),
         };
-        Ok(Self { tag, said })
+        Ok(Self { tag, content: said })
     }
 }
 
-fn data(text: &str) -> Result<Vec<Item>, Flaw> {
+fn data(text: &str) -> Result<Vec<Item>, SyntaxError> {
     let mut reader = Reader::new(text, Strictness::Lenient);
     // A list in parentheses may come without a name.
     if reader.eat('(') {
@@ -87,9 +89,9 @@ fn data(text: &str) -> Result<Vec<Item>, Flaw> {
     ended(reader, items)
 }
 
-fn ended(mut reader: Reader<'_>, items: Vec<Item>) -> Result<Vec<Item>, Flaw> {
+fn ended(mut reader: Reader<'_>, items: Vec<Item>) -> Result<Vec<Item>, SyntaxError> {
     let whole = reader.is_at_end() && !items.contains(&Item::Nothing);
-    if whole { Ok(items) } else { Err(Flaw { number: 8, why: "something stands between the data" }) }
+    if whole { Ok(items) } else { Err(SyntaxError { number: 8, reason: "something stands between the data" }) }
 }
 
 /// Parses `Error(severity, number, cause, text)`. Cause and text may lack their quotes and may contain any characters.
@@ -131,15 +133,15 @@ pub fn values(data: &[Item], name: &str) -> Option<Vec<Item>> {
 mod tests {
     use super::*;
 
-    fn said(line: &str) -> Said {
-        Response::read(line).unwrap().said
+    fn said(line: &str) -> ResponseContent {
+        Response::read(line).unwrap().content
     }
 
     #[test]
     fn the_four_kinds_are_told_apart() {
-        assert_eq!(said("00001 &"), Said::Acknowledged);
-        assert_eq!(said("00001 % "), Said::Complete);
-        assert_eq!(Response::read("E0000 # KeyPress(\"Done\")").unwrap().tag, Tag::UNASKED);
+        assert_eq!(said("00001 &"), ResponseContent::Acknowledged);
+        assert_eq!(said("00001 % "), ResponseContent::Complete);
+        assert_eq!(Response::read("E0000 # KeyPress(\"Done\")").unwrap().tag, Tag::UNSOLICITED);
         for nothing in ["", "00001", "00001 ?", "0001 &", "00001 & more", "00001 # X(1) Y(2)", "00001 ! Error(x)"] {
             assert!(Response::read(nothing).is_err(), "{nothing}");
         }
@@ -147,7 +149,8 @@ mod tests {
 
     #[test]
     fn properties_are_found_by_their_names() {
-        let Said::Data(data) = said("00014 # Q(0), Z(5.12) ,X( 1.5E1),IJK(0,0,1), Tool.AvrRadius(1.5)") else {
+        let ResponseContent::Data(data) = said("00014 # Q(0), Z(5.12) ,X( 1.5E1),IJK(0,0,1), Tool.AvrRadius(1.5)")
+        else {
             panic!()
         };
         assert_eq!((value(&data, "X"), value(&data, "Z"), value(&data, "Y")), (Some(15.0), Some(5.12), None));
@@ -157,7 +160,7 @@ mod tests {
 
     #[test]
     fn a_property_that_comes_twice_is_none() {
-        let Said::Data(data) = said("00014 # X(1), X(2)") else { panic!() };
+        let ResponseContent::Data(data) = said("00014 # X(1), X(2)") else { panic!() };
         assert_eq!(value(&data, "X"), None);
     }
 
@@ -183,7 +186,7 @@ mod tests {
     #[test]
     fn errors_are_read_however_they_are_quoted() {
         let read = |line: &str| match said(line) {
-            Said::Error(error) => (error.severity, error.number, error.cause, error.text),
+            ResponseContent::Error(error) => (error.severity, error.number, error.cause, error.text),
             other => panic!("{other:?}"),
         };
         let (cause, text) = ("00070 GoTo(X(2), Y(3))".to_owned(), "Transaction aborted".to_owned());

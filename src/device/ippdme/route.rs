@@ -10,17 +10,17 @@ use crate::payload::{Plan, Target, TargetKind};
 
 /// Maximum number of targets that are reordered. More targets are touched in the plan's order: the search for a better
 /// order would take longer than it saves.
-const MOST_ORDERED: usize = 6000;
+const MAX_ORDERED: usize = 6000;
 /// Minimum z component of a normal. A target whose normal points further down is not reachable from above.
-const LEAST_UP: f64 = -0.2;
+const MIN_NORMAL_Z: f64 = -0.2;
 /// Maximum number of targets in one scan, so that its line is not too long for servers.
-const MOST_SCANNED: usize = 400;
+const MAX_SCAN_TARGETS: usize = 400;
 /// Maximum duration of a scan, in s. A scan cannot be interrupted, so a hold waits for its end.
-const LONGEST_SCAN_S: f64 = 30.0;
+const MAX_SCAN_S: f64 = 30.0;
 /// Minimum number of targets in a scan; a shorter row is touched.
-const LEAST_SCANNED: usize = 4;
+const MIN_SCAN_TARGETS: usize = 4;
 /// Minimum cosine between two successive steps of a scan (45 degrees). A row that turns by more is split.
-const LEAST_AHEAD: f64 = 0.707;
+const MIN_STEP_COSINE: f64 = 0.707;
 
 /// Part of the route between two rises to the clearance height, with indices into the plan.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -38,7 +38,7 @@ pub(super) struct Route {
     pub(super) clearance_mm: f64,
     /// Length of the horizontal way in this order and in the plan's order, in m.
     pub(super) travel_m: f64,
-    pub(super) plain_m: f64,
+    pub(super) plan_order_m: f64,
 }
 
 impl Route {
@@ -46,7 +46,7 @@ impl Route {
     ///
     /// # Errors
     /// Returns an error for a target that is not reachable from above, or for a position outside of the volume.
-    pub(super) fn over(
+    pub(super) fn find(
         plan: &Plan,
         scan: Option<Scanning>,
         volume_mm: &[[f64; 3]; 2],
@@ -62,8 +62,8 @@ impl Route {
         let legs = rows.unwrap_or_else(|| order(plan).into_iter().map(Leg::Touch).collect());
         let order: Vec<usize> = legs.iter().flat_map(Leg::targets).collect();
         let plain: Vec<usize> = (0..plan.targets.len()).collect();
-        let [travel_m, plain_m] = [&order, &plain].map(|order| 1e-3 * length(&order_places(plan, order)));
-        Ok(Self { legs, clearance_mm, travel_m, plain_m })
+        let [travel_m, plan_order_m] = [&order, &plain].map(|order| 1e-3 * length(&order_places(plan, order)));
+        Ok(Self { legs, clearance_mm, travel_m, plan_order_m })
     }
 }
 
@@ -80,13 +80,13 @@ impl Leg {
 /// Splits a plan, in its own order, into rows that are scanned and targets that are touched. Touched are the slow first
 /// targets of a careful plan, the reference sphere, and targets in no row.
 fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
-    let careful = plan.careful.map_or(0, |careful| careful.targets as usize).min(plan.targets.len());
+    let careful = plan.careful_start.map_or(0, |careful| careful.target_count as usize).min(plan.targets.len());
     let mut legs: Vec<Leg> = (0..careful).map(Leg::Touch).collect();
     let mut from = careful;
     while from < plan.targets.len() {
         let row = from..row_end(plan, from, scan);
         from = row.end;
-        if row.len() >= LEAST_SCANNED {
+        if row.len() >= MIN_SCAN_TARGETS {
             legs.push(Leg::Scan(row));
         } else {
             legs.extend(row.map(Leg::Touch));
@@ -97,30 +97,30 @@ fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
 
 /// Returns the end of the row that begins at `from`, exclusive.
 fn row_end(plan: &Plan, from: usize, scan: Scanning) -> usize {
-    let targets = &plan.targets[from..plan.targets.len().min(from + MOST_SCANNED)];
+    let targets = &plan.targets[from..plan.targets.len().min(from + MAX_SCAN_TARGETS)];
     let step = |k: usize| -> [f64; 3] {
         std::array::from_fn(|axis| targets[k].point_mm[axis] - targets[k - 1].point_mm[axis])
     };
     let dot = |a: [f64; 3], b: [f64; 3]| (0..3).map(|axis| a[axis] * b[axis]).sum::<f64>();
-    let mut left_mm = LONGEST_SCAN_S * scan.speed_mm_s;
+    let mut left_mm = MAX_SCAN_S * scan.speed_mm_s;
     let mut goes_on = |k: &usize| {
         let (k, here) = (*k, step(*k));
         let far = dot(here, here).sqrt();
         left_mm -= far;
         let near = far > 0.0 && far <= scan.step_mm && left_mm >= 0.0;
-        let ahead = k == 1 || dot(here, step(k - 1)) >= LEAST_AHEAD * far * dot(step(k - 1), step(k - 1)).sqrt();
-        near && ahead && [0, k].iter().all(|k| targets[*k].what == TargetKind::Part)
+        let ahead = k == 1 || dot(here, step(k - 1)) >= MIN_STEP_COSINE * far * dot(step(k - 1), step(k - 1)).sqrt();
+        near && ahead && [0, k].iter().all(|k| targets[*k].kind == TargetKind::Part)
     };
     from + 1 + (1..targets.len()).take_while(|k| goes_on(k)).count()
 }
 
 /// Returns the position of the probe's centre at which it turns into the normal of the target.
 pub(super) fn approach(target: &Target, plan: &Plan) -> [f64; 3] {
-    along(target, plan.approach_mm + plan.probe_radius_mm)
+    point_on_normal(target, plan.approach_mm + plan.probe_radius_mm)
 }
 
 /// Returns the point on the normal of a target at a distance of `mm` from the surface.
-pub(super) fn along(target: &Target, mm: f64) -> [f64; 3] {
+pub(super) fn point_on_normal(target: &Target, mm: f64) -> [f64; 3] {
     std::array::from_fn(|k| target.point_mm[k] + mm * target.normal[k])
 }
 
@@ -131,10 +131,10 @@ fn check(
     volume_mm: &[[f64; 3]; 2],
     machine: &Arc<str>,
 ) -> Result<(), DeviceError> {
-    if target.normal[2] < LEAST_UP {
+    if target.normal[2] < MIN_NORMAL_Z {
         return Err(DeviceError::BadPayload {
             machine: Arc::clone(machine),
-            what: "plan",
+            payload: "plan",
             field: format!("the height of the normal of target {}", target.index),
             value: target.normal[2],
             limit: "-0.2 or more: the probe comes from above; turn the part, or leave the target out",
@@ -142,19 +142,19 @@ fn check(
     }
     let start = approach(target, plan);
     let over = [start[0], start[1], clearance_mm];
-    let end = along(target, plan.probe_radius_mm - plan.search_mm);
+    let end = point_on_normal(target, plan.probe_radius_mm - plan.search_mm);
     for (what, at) in [("travel over", over), ("approach to", start), ("search at", end)] {
         for axis in 0..3 {
             let [least, most] = volume_mm.map(|corner| corner[axis]);
             if !(least..=most).contains(&at[axis]) {
                 return Err(DeviceError::OutOfVolume {
                     machine: Arc::clone(machine),
-                    what,
+                    motion: what,
                     target: target.index,
                     axis: ['x', 'y', 'z'][axis],
                     value_mm: at[axis],
-                    least_mm: least,
-                    most_mm: most,
+                    min_mm: least,
+                    max_mm: most,
                 });
             }
         }
@@ -166,14 +166,14 @@ fn check(
 /// not mixed with the part.
 fn order(plan: &Plan) -> Vec<usize> {
     let mut order: Vec<usize> = (0..plan.targets.len()).collect();
-    if plan.targets.len() > MOST_ORDERED {
+    if plan.targets.len() > MAX_ORDERED {
         return order;
     }
-    let careful = plan.careful.map_or(0, |careful| careful.targets as usize).min(order.len());
+    let careful = plan.careful_start.map_or(0, |careful| careful.target_count as usize).min(order.len());
     let mut from = careful;
     while from < order.len() {
-        let what = plan.targets[from].what;
-        let alike = plan.targets[from..].iter().take_while(|target| target.what == what).count();
+        let what = plan.targets[from].kind;
+        let alike = plan.targets[from..].iter().take_while(|target| target.kind == what).count();
         shorten(plan, &mut order, from..from + alike);
         from += alike;
     }
@@ -226,7 +226,7 @@ fn improve(places: &[[f64; 2]], order: &mut [usize]) {
     for _ in 0..PASSES {
         let mut better = false;
         for stop in 0..places.len() {
-            better |= tour.turn_behind(stop) || tour.turn_before(stop) || tour.carry(stop);
+            better |= tour.reverse_after(stop) || tour.reverse_before(stop) || tour.move_segment(stop);
         }
         if !better {
             break;
@@ -267,13 +267,13 @@ impl<'a> Tour<'a> {
         b.map_or(0.0, |b| self.apart(a, *b))
     }
 
-    fn turn(&mut self, stretch: Range<usize>) {
+    fn reverse(&mut self, stretch: Range<usize>) {
         self.order[stretch.clone()].reverse();
         self.note(stretch);
     }
 
     /// Reverses a stretch after a stop so that one of its neighbours comes next, if that shortens the way.
-    fn turn_behind(&mut self, stop: usize) -> bool {
+    fn reverse_after(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         let Some(&next) = self.order.get(i + 1) else { return false };
         let now = self.apart(stop, next);
@@ -285,7 +285,7 @@ impl<'a> Tour<'a> {
             }
             let behind = self.order.get(j + 1);
             if j > i && saved + self.to(other, behind) - self.to(next, behind) > 1e-9 {
-                self.turn(i + 1..j + 1);
+                self.reverse(i + 1..j + 1);
                 return true;
             }
         }
@@ -294,7 +294,7 @@ impl<'a> Tour<'a> {
 
     /// Reverses a stretch before a stop so that one of its neighbours comes directly before it, if that shortens the
     /// way.
-    fn turn_before(&mut self, stop: usize) -> bool {
+    fn reverse_before(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         if i < 2 {
             return false;
@@ -310,7 +310,7 @@ impl<'a> Tour<'a> {
             if (1..i).contains(&j) {
                 let before = self.order[j - 1];
                 if saved + self.apart(before, other) - self.apart(before, last) > 1e-9 {
-                    self.turn(j..i);
+                    self.reverse(j..i);
                     return true;
                 }
             }
@@ -320,7 +320,7 @@ impl<'a> Tour<'a> {
 
     /// Moves a stretch of one to three stops that begins with this stop to directly after one of its neighbours, if
     /// that shortens the way (Or-opt).
-    fn carry(&mut self, stop: usize) -> bool {
+    fn move_segment(&mut self, stop: usize) -> bool {
         let i = self.at[stop];
         for size in 1..=3 {
             if i == 0 || i + size > self.order.len() {
@@ -387,12 +387,12 @@ fn length(places: &[[f64; 2]]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::payload::Careful;
+    use crate::payload::CarefulStart;
 
     fn plan(points: impl Iterator<Item = [f64; 3]>) -> Plan {
         let target = |(index, point_mm)| Target {
             index: index as u32,
-            what: TargetKind::Part,
+            kind: TargetKind::Part,
             point_mm,
             normal: [0.0, 0.0, 1.0],
         };
@@ -403,7 +403,7 @@ mod tests {
             search_mm: 2.0,
             speed_mm_s: 3.0,
             safe_height_mm: 20.0,
-            careful: None,
+            careful_start: None,
         }
     }
 
@@ -424,8 +424,8 @@ mod tests {
 
     #[test]
     fn a_shuffled_grid_is_walked_almost_without_a_step_too_many() {
-        let route = Route::over(&shuffled(), None, &VOLUME, &machine()).unwrap();
-        assert!(route.travel_m < 0.107 && route.plain_m > 0.3, "{} and {}", route.travel_m, route.plain_m);
+        let route = Route::find(&shuffled(), None, &VOLUME, &machine()).unwrap();
+        assert!(route.travel_m < 0.107 && route.plan_order_m > 0.3, "{} and {}", route.travel_m, route.plan_order_m);
         let mut all: Vec<usize> = route.legs.iter().flat_map(Leg::targets).collect();
         all.sort_unstable();
         assert_eq!(all, (0..100).collect::<Vec<_>>());
@@ -433,8 +433,9 @@ mod tests {
 
     #[test]
     fn a_careful_beginning_stays_the_beginning() {
-        let careful = Careful { targets: 5, speed_mm_s: 0.5 };
-        let route = Route::over(&Plan { careful: Some(careful), ..shuffled() }, None, &VOLUME, &machine()).unwrap();
+        let careful = CarefulStart { target_count: 5, speed_mm_s: 0.5 };
+        let route =
+            Route::find(&Plan { careful_start: Some(careful), ..shuffled() }, None, &VOLUME, &machine()).unwrap();
         assert_eq!(route.legs[..5], [0, 1, 2, 3, 4].map(Leg::Touch));
     }
 
@@ -442,7 +443,7 @@ mod tests {
     fn a_position_outside_of_the_volume_is_named_before_anything_moves() {
         let outside = plan([[0.0, 0.0, 0.0], [99.0, 0.0, 77.0]].into_iter());
         let Err(DeviceError::OutOfVolume { axis, target, value_mm, .. }) =
-            Route::over(&Plan { safe_height_mm: 30.0, ..outside }, None, &VOLUME, &machine())
+            Route::find(&Plan { safe_height_mm: 30.0, ..outside }, None, &VOLUME, &machine())
         else {
             panic!()
         };
@@ -456,25 +457,25 @@ mod tests {
         let spread = [[30.0, 0.0, 0.0], [40.0, 9.0, 0.0]].into_iter();
         let points = spread.chain(row(0.0, true)).chain(row(2.0, false)).chain([[60.0, 0.0, 0.0]]);
         let mut plan = plan(points.chain([[70.0, 0.0, 5.0], [70.5, 0.0, 5.0], [71.0, 0.0, 5.0]]));
-        plan.targets[19..].iter_mut().for_each(|target| target.what = TargetKind::ReferenceSphere);
-        plan.careful = Some(Careful { targets: 2, speed_mm_s: 0.5 });
-        let route = Route::over(&plan, scanning(1.5), &VOLUME, &machine()).unwrap();
+        plan.targets[19..].iter_mut().for_each(|target| target.kind = TargetKind::ReferenceSphere);
+        plan.careful_start = Some(CarefulStart { target_count: 2, speed_mm_s: 0.5 });
+        let route = Route::find(&plan, scanning(1.5), &VOLUME, &machine()).unwrap();
         let touched = |targets: Range<usize>| targets.map(Leg::Touch);
         let rows = [Leg::Scan(2..10), Leg::Scan(10..18)];
         assert_eq!(route.legs, touched(0..2).chain(rows).chain(touched(18..22)).collect::<Vec<_>>());
         // A scan step shorter than that of the rows scans nothing, and the way is as short as without scanning.
-        let [none, short] = [None, scanning(0.4)].map(|scan| Route::over(&plan, scan, &VOLUME, &machine()).unwrap());
+        let [none, short] = [None, scanning(0.4)].map(|scan| Route::find(&plan, scan, &VOLUME, &machine()).unwrap());
         assert_eq!(short.legs, none.legs);
     }
 
     #[test]
     fn a_long_row_is_several_scans() {
         let plan = plan((0..1000).map(|k| [0.01 * f64::from(k), 0.0, 0.0]));
-        let route = Route::over(&plan, scanning(1.0), &VOLUME, &machine()).unwrap();
+        let route = Route::find(&plan, scanning(1.0), &VOLUME, &machine()).unwrap();
         assert_eq!(route.legs, [Leg::Scan(0..400), Leg::Scan(400..800), Leg::Scan(800..1000)]);
         // At 1 mm/s no scan may be longer than 30 mm.
         let plan = super::tests::plan((0..80).map(|k| [f64::from(k), 0.0, 0.0]));
-        let route = Route::over(&plan, scanning(1.0), &VOLUME, &machine()).unwrap();
+        let route = Route::find(&plan, scanning(1.0), &VOLUME, &machine()).unwrap();
         assert_eq!(route.legs, [Leg::Scan(0..31), Leg::Scan(31..62), Leg::Scan(62..80)]);
     }
 }

@@ -10,10 +10,10 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use super::response::ServerError;
-use super::route::{Leg, along};
+use super::route::{Leg, point_on_normal};
 use super::session::Failure;
 use super::text::Item;
-use super::work::{MISSES, Work, Worker, distance, locked};
+use super::work::{MISS_ERRORS, RoutedPlan, Worker, distance, locked};
 use crate::error::DeviceError;
 use crate::payload::{MeasuredPoint, Plan, PointStatus, Target};
 
@@ -23,7 +23,7 @@ const STRAIGHT_MM: f64 = 1e4;
 impl Worker {
     /// Configures the server for scanning: speed, retract, and points at the targets. Does nothing if the cell does not
     /// scan, or if the tool radius is unknown: then rows are touched.
-    pub(super) async fn set_up_scans(&mut self, work: &Work) -> Result<(), Failure> {
+    pub(super) async fn set_up_scans(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         let Some(scan) = self.settings.scan else { return Ok(()) };
         if locked(&self.shared).radius_mm.is_none() {
             // A point of a scan does not report the radius either.
@@ -33,37 +33,38 @@ impl Worker {
         }
         let wanted = [("ScanPar.Speed", scan.speed_mm_s), ("ScanPar.Retract", work.plan.approach_mm)];
         self.speeds_mm_s[2] = self.set(&wanted).await?[0];
-        self.session.ask("OnScanReport", ["X", "Y", "Z"].map(Item::asked).to_vec()).await?;
-        let hint = [work.plan.search_mm, smallest_radius_mm(work)].map(Item::Number).to_vec();
+        self.session.ask("OnScanReport", ["X", "Y", "Z"].map(Item::property_query).to_vec()).await?;
+        let hint = [work.plan.search_mm, min_radius_mm(work)].map(Item::Number).to_vec();
         // The hint only makes the scan faster, and not every server supports it.
-        self.ask_if_there("ScanOnCurveHint", hint).await?;
-        self.session.ask("ScanOnCurveDensity", vec![Item::with("AtNominals", 1.0)]).await?;
+        self.request_if_supported("ScanOnCurveHint", hint).await?;
+        self.session.ask("ScanOnCurveDensity", vec![Item::property("AtNominals", 1.0)]).await?;
         Ok(())
     }
 
     /// Scans a row. Returns false if the tool radius is unknown, or if the probe lost the surface or met it elsewhere:
     /// then the targets must be touched one by one.
-    pub(super) async fn scan(&mut self, work: &Work, row: Range<usize>) -> Result<bool, Failure> {
+    pub(super) async fn scan(&mut self, work: &RoutedPlan, row: Range<usize>) -> Result<bool, Failure> {
         if locked(&self.shared).radius_mm.is_none() {
             return Ok(false);
         }
         let targets = &work.plan.targets[row.clone()];
-        self.keep_speeds(work, row.start).await?;
-        self.go_over(work, &targets[0]).await?;
+        self.set_speeds(work, row.start).await?;
+        self.move_above(work, &targets[0]).await?;
         let way_mm: f64 = targets.windows(2).map(|pair| distance(pair[0].point_mm, pair[1].point_mm)).sum();
-        let touch = self.lasts(2.0 * (work.plan.approach_mm + work.plan.search_mm), 1);
-        let scanned = self.session.move_by("ScanOnCurve", curve(targets), touch + self.lasts(way_mm, 2)).await;
+        let touch = self.motion_time(2.0 * (work.plan.approach_mm + work.plan.search_mm), 1);
+        let scanned =
+            self.session.request_motion("ScanOnCurve", curve(targets), touch + self.motion_time(way_mm, 2)).await;
         let points = match scanned {
             Ok(answer) if answer.data.is_empty() && answer.warnings.iter().any(is_missed) => None,
-            Ok(answer) => Some(self.scanned(work, targets, &answer.data)?),
-            Err(Failure::No(error)) if is_missed(&error) && error.severity <= 2 => {
+            Ok(answer) => Some(self.decode_scan(work, targets, &answer.data)?),
+            Err(Failure::Refused(error)) if is_missed(&error) && error.severity <= 2 => {
                 self.session.note(format!("the row from target {} on is touched: {error}", targets[0].index));
                 self.session.clear_errors(1).await?;
                 None
             }
             Err(other) => return Err(other),
         };
-        self.find_place().await?;
+        self.read_position().await?;
         self.rise(work).await?;
         let is_there = points.is_some();
         let mut shared = locked(&self.shared);
@@ -74,7 +75,12 @@ impl Worker {
     }
 
     /// Returns the numbers of a scan as measured points, one for each target, if they are plausible.
-    fn scanned(&self, work: &Work, targets: &[Target], data: &[Vec<Item>]) -> Result<Vec<MeasuredPoint>, Failure> {
+    fn decode_scan(
+        &self,
+        work: &RoutedPlan,
+        targets: &[Target],
+        data: &[Vec<Item>],
+    ) -> Result<Vec<MeasuredPoint>, Failure> {
         let mut lines: Vec<&Vec<Item>> = data.iter().collect();
         // A repeated line counts once: the probe is never at one place twice.
         lines.dedup();
@@ -83,12 +89,14 @@ impl Worker {
         let numbers = numbers
             .filter(|numbers| matches!(width, 3 | 4) && numbers.len() == width * targets.len())
             .filter(|_| lines.iter().all(|line| line.len().is_multiple_of(width)))
-            .ok_or_else(|| Failure::Wrong(self.untold("ScanOnCurve", "one point at each target of the scan")))?;
+            .ok_or_else(|| {
+                Failure::Implausible(self.missing_value("ScanOnCurve", "one point at each target of the scan"))
+            })?;
         let places = |first: usize| -> Vec<[f64; 3]> {
             numbers.chunks_exact(width).map(|point| std::array::from_fn(|k| point[first + k])).collect()
         };
-        let mut found = self.hold_row(work, targets, &places(0)).map(|()| 0);
-        if width == 4 && found.is_err() && self.hold_row(work, targets, &places(1)).is_ok() {
+        let mut found = self.check_row(work, targets, &places(0)).map(|()| 0);
+        if width == 4 && found.is_err() && self.check_row(work, targets, &places(1)).is_ok() {
             found = Ok(1);
         }
         let first = found?;
@@ -97,25 +105,25 @@ impl Worker {
         Ok(points
             .map(|((target, at_mm), said)| {
                 let (index, status) = (target.index, PointStatus::Touched);
-                MeasuredPoint { index, status, quality: quality(said), at_mm }
+                MeasuredPoint { index, status, quality: quality(said), position_mm: at_mm }
             })
             .collect())
     }
 
     /// Checks every point of a row against its target: no farther away than the probe may search, and sideways no
     /// farther than half of the distance to the nearest neighbour in the row.
-    fn hold_row(&self, work: &Work, targets: &[Target], places: &[[f64; 3]]) -> Result<(), Failure> {
+    fn check_row(&self, work: &RoutedPlan, targets: &[Target], places: &[[f64; 3]]) -> Result<(), Failure> {
         for (k, (target, at_mm)) in targets.iter().zip(places).enumerate() {
-            self.hold_place(work, target, *at_mm)?;
+            self.check_touch_position(work, target, *at_mm)?;
             let near = [k.checked_sub(1), Some(k + 1)].into_iter().flatten().filter_map(|k| targets.get(k));
             let steps = near.map(|other| distance(other.point_mm, target.point_mm));
             let most = 0.5 * steps.fold(f64::INFINITY, f64::min);
-            let aside_mm = aside(target, &work.plan, *at_mm);
+            let aside_mm = lateral_distance_mm(target, &work.plan, *at_mm);
             if aside_mm > most {
                 let field = format!("how far beside target {} its point of the scan lies", target.index);
                 let (machine, unit) = (Arc::clone(&self.session.machine), "mm".to_owned());
-                let error = DeviceError::OutOfRange { machine, field, value: aside_mm, least: 0.0, most, unit };
-                return Err(Failure::Wrong(error));
+                let error = DeviceError::OutOfRange { machine, field, value: aside_mm, min: 0.0, max: most, unit };
+                return Err(Failure::Implausible(error));
             }
         }
         Ok(())
@@ -123,23 +131,23 @@ impl Worker {
 }
 
 fn is_missed(error: &ServerError) -> bool {
-    MISSES.contains(&error.number)
+    MISS_ERRORS.contains(&error.number)
 }
 
 /// Returns the arguments for a scan of the curve through these targets: open, with the normal of each target, all on
 /// the surface.
 fn curve(targets: &[Target]) -> Vec<Item> {
     let call = |name: &str, items: Vec<Item>| Item::Call(name.to_owned(), items);
-    let mut format = ["X", "Y", "Z", "IJK"].map(Item::asked).to_vec();
+    let mut format = ["X", "Y", "Z", "IJK"].map(Item::property_query).to_vec();
     format.push(Item::Name("tag".to_owned()));
     let numbers = targets.iter().flat_map(|target| target.point_mm.into_iter().chain(target.normal).chain([1.0]));
     let data = numbers.map(Item::Number).collect();
-    vec![Item::with("Closed", 0.0), call("Format", format), call("Data", data)]
+    vec![Item::property("Closed", 0.0), call("Format", format), call("Data", data)]
 }
 
 /// Returns the distance of a place from the normal of a target, in mm.
-fn aside(target: &Target, plan: &Plan, at_mm: [f64; 3]) -> f64 {
-    let centre = along(target, plan.probe_radius_mm);
+fn lateral_distance_mm(target: &Target, plan: &Plan, at_mm: [f64; 3]) -> f64 {
+    let centre = point_on_normal(target, plan.probe_radius_mm);
     let off: [f64; 3] = std::array::from_fn(|k| at_mm[k] - centre[k]);
     let along_mm: f64 = (0..3).map(|k| off[k] * target.normal[k]).sum();
     (0..3).map(|k| (off[k] - along_mm * target.normal[k]).powi(2)).sum::<f64>().sqrt()
@@ -147,7 +155,7 @@ fn aside(target: &Target, plan: &Plan, at_mm: [f64; 3]) -> f64 {
 
 /// Returns the smallest radius of curvature along the rows, in mm, estimated from the change of the normal between
 /// neighbouring targets; at most `STRAIGHT_MM`.
-fn smallest_radius_mm(work: &Work) -> f64 {
+fn min_radius_mm(work: &RoutedPlan) -> f64 {
     let rows = work.route.legs.iter().filter_map(|leg| if let Leg::Scan(row) = leg { Some(row.clone()) } else { None });
     let pairs = rows.flat_map(|row| work.plan.targets[row].windows(2));
     let radii = pairs.map(|pair| {

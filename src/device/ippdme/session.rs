@@ -13,11 +13,11 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
-use super::command::{Command, LONGEST_LINE};
-use super::response::{Response, Said, ServerError, value};
+use super::command::{Command, MAX_LINE_LENGTH};
+use super::response::{Response, ResponseContent, ServerError, value};
 use super::text::{Item, Tag};
 use crate::error::DeviceError;
-use crate::{Dial, Line};
+use crate::{Connector, LineAddress};
 
 /// Timeouts and intervals of a session.
 #[derive(Clone, Copy, Debug)]
@@ -38,7 +38,7 @@ pub struct Limits {
 /// Number of attempts to clear the server's errors after an abort.
 const CLEARING_TRIES: u32 = 20;
 /// Number of notes kept for a person: the last ones.
-const NOTES: usize = 8;
+const MAX_NOTES: usize = 8;
 
 /// Reason why a command failed.
 #[derive(Debug)]
@@ -46,11 +46,11 @@ pub(super) enum Failure {
     /// The connection failed, or the data on it are invalid; the session must not be used any more.
     Link(DeviceError),
     /// The server refused the command or reported an error.
-    No(ServerError),
+    Refused(ServerError),
     /// The command was aborted, and the server has cleared its errors.
     Aborted,
     /// The answer is not plausible.
-    Wrong(DeviceError),
+    Implausible(DeviceError),
 }
 
 /// Byte stream to a server.
@@ -67,21 +67,21 @@ pub(super) struct Session {
     last: u32,
     last_event: u16,
     /// Number of aborts ordered, and (`aborted`) number of aborts sent.
-    aborts: watch::Receiver<u64>,
-    aborted: u64,
+    ordered_aborts: watch::Receiver<u64>,
+    sent_aborts: u64,
     notes: VecDeque<String>,
 }
 
 /// Answer to a command.
 #[derive(Debug, Default)]
-pub(super) struct Answer {
+pub(super) struct CommandReply {
     /// Data, one list for each line.
     pub(super) data: Vec<Vec<Item>>,
     /// Warnings of the server.
     pub(super) warnings: Vec<ServerError>,
 }
 
-impl Answer {
+impl CommandReply {
     /// Returns the number of a property in the only line of data.
     pub(super) fn value(&self, name: &str) -> Option<f64> {
         value(self.line()?, name)
@@ -100,26 +100,27 @@ struct Pending<'a> {
     tag: Tag,
     command: &'a Command,
     acknowledged: bool,
-    answer: Answer,
+    answer: CommandReply,
     error: Option<ServerError>,
 }
 
 impl Session {
     /// Opens the connection; sends nothing yet.
-    pub(super) async fn dial(
+    pub(super) async fn connect(
         machine: Arc<str>,
-        (line, dial): (&Line, &mut dyn Dial),
+        (line, dial): (&LineAddress, &mut dyn Connector),
         limits: Limits,
         (aborts, aborted): (watch::Receiver<u64>, u64),
     ) -> Result<Self, DeviceError> {
-        let unreachable = |why| DeviceError::Unreachable { machine: Arc::clone(&machine), why, limit: limits.answer };
-        let dialled = timeout(limits.answer, dial.dial(line)).await;
+        let unreachable =
+            |why| DeviceError::Unreachable { machine: Arc::clone(&machine), kind: why, limit: limits.answer };
+        let dialled = timeout(limits.answer, dial.connect(line)).await;
         let stream = dialled.unwrap_or(Err(std::io::ErrorKind::TimedOut.into())).map_err(|e| unreachable(e.kind()))?;
-        Ok(Self::on(aborted, Arc::clone(&machine), Box::new(stream), limits, aborts))
+        Ok(Self::from_stream(aborted, Arc::clone(&machine), Box::new(stream), limits, aborts))
     }
 
     /// Creates a session after `aborted` aborts; an abort ordered since then is sent first.
-    fn on(
+    fn from_stream(
         aborted: u64,
         machine: Arc<str>,
         stream: Box<dyn Stream>,
@@ -127,7 +128,17 @@ impl Session {
         aborts: watch::Receiver<u64>,
     ) -> Self {
         let (unread, notes) = (Vec::new(), VecDeque::new());
-        Self { machine, stream, unread, limits, last: 0, last_event: 0, aborts, aborted, notes }
+        Self {
+            machine,
+            stream,
+            unread,
+            limits,
+            last: 0,
+            last_event: 0,
+            ordered_aborts: aborts,
+            sent_aborts: aborted,
+            notes,
+        }
     }
 
     /// Starts a new session, whatever the server is doing. It first ends a session that may be left over, and waits for
@@ -139,7 +150,7 @@ impl Session {
     pub(super) async fn open(&mut self, ours_within: Option<Duration>) -> Result<(), Failure> {
         const LEFT_OVER: [u16; 4] = [8, 507, 508, 514];
         if self.is_abort_ordered() {
-            self.aborted = *self.aborts.borrow();
+            self.sent_aborts = *self.ordered_aborts.borrow();
             self.send_abort(true).await?;
         }
         for again in [true, false] {
@@ -148,13 +159,13 @@ impl Session {
                 None => Some(self.ask("EndSession", Vec::new()).await),
             };
             match ended {
-                Some(Ok(_) | Err(Failure::No(_))) => {}
+                Some(Ok(_) | Err(Failure::Refused(_))) => {}
                 Some(Err(other)) => return Err(other),
                 None => self.send_abort(true).await?,
             }
             match self.ask("StartSession", Vec::new()).await {
-                Err(Failure::No(error)) if again && LEFT_OVER.contains(&error.number) => {
-                    if let Err(failure @ (Failure::Link(_) | Failure::Wrong(_) | Failure::Aborted)) =
+                Err(Failure::Refused(error)) if again && LEFT_OVER.contains(&error.number) => {
+                    if let Err(failure @ (Failure::Link(_) | Failure::Implausible(_) | Failure::Aborted)) =
                         self.ask("ClearAllErrors", Vec::new()).await
                     {
                         return Err(failure);
@@ -167,17 +178,17 @@ impl Session {
     }
 
     /// Sends a command without motion and waits for its end.
-    pub(super) async fn ask(&mut self, name: &str, arguments: Vec<Item>) -> Result<Answer, Failure> {
-        self.move_by(name, arguments, Duration::ZERO).await
+    pub(super) async fn ask(&mut self, name: &str, arguments: Vec<Item>) -> Result<CommandReply, Failure> {
+        self.request_motion(name, arguments, Duration::ZERO).await
     }
 
     /// Sends a command whose motion takes at most `motion`, and waits for its end.
-    pub(super) async fn move_by(
+    pub(super) async fn request_motion(
         &mut self,
         name: &str,
         arguments: Vec<Item>,
         motion: Duration,
-    ) -> Result<Answer, Failure> {
+    ) -> Result<CommandReply, Failure> {
         if self.is_abort_ordered() {
             return Err(self.abort().await);
         }
@@ -185,11 +196,11 @@ impl Session {
         let tag = if command.is_event() { self.next_event() } else { self.next_command() };
         self.write(&command, tag).await.map_err(Failure::Link)?;
         let mut pending =
-            Pending { tag, command: &command, acknowledged: false, answer: Answer::default(), error: None };
+            Pending { tag, command: &command, acknowledged: false, answer: CommandReply::default(), error: None };
         self.await_end(&mut pending, motion).await
     }
 
-    async fn await_end(&mut self, pending: &mut Pending<'_>, motion: Duration) -> Result<Answer, Failure> {
+    async fn await_end(&mut self, pending: &mut Pending<'_>, motion: Duration) -> Result<CommandReply, Failure> {
         let began = Instant::now();
         let mut alive_at = began + self.limits.alive;
         let mut asked_alive: Option<(Tag, Instant)> = None;
@@ -211,10 +222,10 @@ impl Session {
                 (asked_alive, alive_at) = (Some((tag, limit)), limit);
                 continue;
             };
-            let response = self.understood(line)?;
+            let response = self.parse_response(line)?;
             alive_at = Instant::now() + self.limits.alive;
             if response.tag == pending.tag {
-                if let Some(answer) = self.take(pending, response.said)? {
+                if let Some(answer) = self.process_own_line(pending, response.content)? {
                     return Ok(answer);
                 }
                 due = match (&pending.error, pending.acknowledged) {
@@ -223,28 +234,32 @@ impl Session {
                     (None, true) => began + self.limits.answer + motion + self.limits.completion,
                 };
             } else if asked_alive.is_some_and(|(tag, _)| tag == response.tag) {
-                asked_alive = asked_alive.filter(|_| response.said != Said::Complete);
+                asked_alive = asked_alive.filter(|_| response.content != ResponseContent::Complete);
             } else {
-                self.beside(response)?;
+                self.process_other_line(response)?;
             }
         }
     }
 
     /// Processes a line of the command itself. Returns the answer if the command is over.
-    fn take(&mut self, pending: &mut Pending<'_>, said: Said) -> Result<Option<Answer>, Failure> {
+    fn process_own_line(
+        &mut self,
+        pending: &mut Pending<'_>,
+        said: ResponseContent,
+    ) -> Result<Option<CommandReply>, Failure> {
         match said {
-            Said::Acknowledged => pending.acknowledged = true,
-            Said::Data(data) => pending.answer.data.push(data),
-            Said::Error(error) if is_passing(&error) => {
+            ResponseContent::Acknowledged => pending.acknowledged = true,
+            ResponseContent::Data(data) => pending.answer.data.push(data),
+            ResponseContent::Error(error) if is_harmless(&error) => {
                 self.note(format!("{}: {error}", pending.command.name));
                 pending.answer.warnings.push(error);
             }
-            Said::Error(error) => {
+            ResponseContent::Error(error) => {
                 pending.error.get_or_insert(error);
             }
-            Said::Complete => {
+            ResponseContent::Complete => {
                 return match pending.error.take() {
-                    Some(error) => Err(Failure::No(error)),
+                    Some(error) => Err(Failure::Refused(error)),
                     None => Ok(Some(std::mem::take(&mut pending.answer))),
                 };
             }
@@ -253,25 +268,25 @@ impl Session {
     }
 
     /// Processes a line of another tag: a message of the server itself, or a late line of a finished command.
-    fn beside(&mut self, response: Response) -> Result<(), Failure> {
-        match (response.tag, response.said) {
-            (Tag::UNASKED, Said::Error(error)) if !is_passing(&error) => Err(Failure::No(error)),
-            (Tag::UNASKED, Said::Error(error)) => {
+    fn process_other_line(&mut self, response: Response) -> Result<(), Failure> {
+        match (response.tag, response.content) {
+            (Tag::UNSOLICITED, ResponseContent::Error(error)) if !is_harmless(&error) => Err(Failure::Refused(error)),
+            (Tag::UNSOLICITED, ResponseContent::Error(error)) => {
                 self.note(format!("unasked: {error}"));
                 Ok(())
             }
-            (Tag::UNASKED, Said::Data(data)) => {
+            (Tag::UNSOLICITED, ResponseContent::Data(data)) => {
                 self.note(format!("somebody at the machine: {}", super::text::list(&data)));
                 Ok(())
             }
-            (Tag::UNASKED, _) => Ok(()),
-            (Tag::Command(number), _) if self.was_given(number) => Ok(()),
+            (Tag::UNSOLICITED, _) => Ok(()),
+            (Tag::Command(number), _) if self.was_sent(number) => Ok(()),
             (Tag::Event(number), _) if number <= self.last_event => Ok(()),
             (tag, _) => Err(Failure::Link(self.unreadable(tag.to_string(), "it answers what was not asked"))),
         }
     }
 
-    fn was_given(&self, number: u32) -> bool {
+    fn was_sent(&self, number: u32) -> bool {
         // Tags restart after 99999; commands with earlier tags are long over.
         number != 0 && (number <= self.last || number > 99_999 - 1_000 && self.last < 1_000)
     }
@@ -292,25 +307,25 @@ impl Session {
         written.unwrap_or(Err(std::io::ErrorKind::TimedOut.into())).map_err(|_| self.disconnected("writing"))
     }
 
-    fn understood(&mut self, line: std::io::Result<String>) -> Result<Response, Failure> {
+    fn parse_response(&mut self, line: std::io::Result<String>) -> Result<Response, Failure> {
         let line = line.map_err(|e| match e.kind() {
             std::io::ErrorKind::InvalidData => {
                 Failure::Link(self.unreadable(String::new(), "a line that does not end, or is not ASCII"))
             }
             _ => Failure::Link(self.disconnected("reading")),
         })?;
-        Response::read(&line).map_err(|flaw| Failure::Link(self.unreadable(line, flaw.why)))
+        Response::read(&line).map_err(|flaw| Failure::Link(self.unreadable(line, flaw.reason)))
     }
 
     // ---- the end of everything ------------------------------------------------------------------------------------------------------
 
     pub(super) fn is_abort_ordered(&self) -> bool {
-        *self.aborts.borrow() > self.aborted
+        *self.ordered_aborts.borrow() > self.sent_aborts
     }
 
     /// Waits until an abort is ordered; waits forever if nobody is left to order one.
     pub(super) fn abort_ordered(&self) -> impl Future<Output = ()> + Send + use<> {
-        let (mut aborts, aborted) = (self.aborts.clone(), self.aborted);
+        let (mut aborts, aborted) = (self.ordered_aborts.clone(), self.sent_aborts);
         async move {
             if aborts.wait_for(|ordered| *ordered > aborted).await.is_err() {
                 std::future::pending::<()>().await;
@@ -321,14 +336,14 @@ impl Session {
     /// Aborts the running and waiting commands and makes the server ready again. Returns [`Failure::Aborted`] on
     /// success.
     pub(super) async fn abort(&mut self) -> Failure {
-        self.aborted = *self.aborts.borrow();
-        match self.aborts_now().await {
+        self.sent_aborts = *self.ordered_aborts.borrow();
+        match self.run_abort().await {
             Ok(()) => Failure::Aborted,
             Err(failure) => failure,
         }
     }
 
-    async fn aborts_now(&mut self) -> Result<(), Failure> {
+    async fn run_abort(&mut self) -> Result<(), Failure> {
         self.send_abort(false).await?;
         self.clear_errors(CLEARING_TRIES).await
     }
@@ -346,10 +361,10 @@ impl Session {
                 line = read_line(&mut self.stream, &mut self.unread) => line,
                 () = sleep_until(over) => return Err(Failure::Link(self.timed_out(&command, self.limits.abort))),
             };
-            let response = self.understood(line)?;
-            match response.said {
-                Said::Complete if response.tag == tag => return Ok(()),
-                Said::Error(error) if response.tag == tag && !is_passing(&error) && !may_refuse => {
+            let response = self.parse_response(line)?;
+            match response.content {
+                ResponseContent::Complete if response.tag == tag => return Ok(()),
+                ResponseContent::Error(error) if response.tag == tag && !is_harmless(&error) && !may_refuse => {
                     let why = "it does not carry out AbortE";
                     self.note(format!("AbortE: {error}"));
                     return Err(Failure::Link(self.unreadable(error.to_string(), why)));
@@ -365,7 +380,7 @@ impl Session {
         for left in (0..tries).rev() {
             match Box::pin(self.ask("ClearAllErrors", Vec::new())).await {
                 Ok(_) => return Ok(()),
-                Err(Failure::No(_)) if left > 0 => sleep(self.limits.after_abort).await,
+                Err(Failure::Refused(_)) if left > 0 => sleep(self.limits.after_abort).await,
                 Err(other) => return Err(other),
             }
         }
@@ -377,7 +392,7 @@ impl Session {
     pub(super) fn note(&mut self, note: String) {
         if !self.notes.contains(&note) {
             self.notes.push_back(note);
-            if self.notes.len() > NOTES {
+            if self.notes.len() > MAX_NOTES {
                 self.notes.pop_front();
             }
         }
@@ -388,23 +403,23 @@ impl Session {
     }
 
     fn timed_out(&self, command: &Command, limit: Duration) -> DeviceError {
-        let what = super::known(&command.name);
-        DeviceError::TimedOut { machine: Arc::clone(&self.machine), what, limit }
+        let what = super::static_command_name(&command.name);
+        DeviceError::TimedOut { machine: Arc::clone(&self.machine), operation: what, limit }
     }
 
     fn disconnected(&self, what: &'static str) -> DeviceError {
-        DeviceError::Disconnected { machine: Arc::clone(&self.machine), what }
+        DeviceError::Disconnected { machine: Arc::clone(&self.machine), operation: what }
     }
 
     fn unreadable(&self, line: String, why: &'static str) -> DeviceError {
         let line = line.chars().take(120).collect();
-        DeviceError::Unreadable { machine: Arc::clone(&self.machine), line, why }
+        DeviceError::Unreadable { machine: Arc::clone(&self.machine), line, reason: why }
     }
 }
 
 /// Returns true if an error stops nothing. Servers may change the severity of an error, so errors that stop a machine
 /// are recognised by their numbers.
-fn is_passing(error: &ServerError) -> bool {
+fn is_harmless(error: &ServerError) -> bool {
     error.is_warning() && !matches!(error.number, 6 | 500 | 503 | 1000..=1009 | 1500..=1503 | 2500..=2506)
 }
 
@@ -422,7 +437,7 @@ async fn read_line(stream: &mut Box<dyn Stream>, unread: &mut Vec<u8>) -> std::i
             }
             return Ok(text);
         }
-        if unread.len() > LONGEST_LINE {
+        if unread.len() > MAX_LINE_LENGTH {
             return Err(std::io::ErrorKind::InvalidData.into());
         }
         if stream.read_buf(unread).await? == 0 {

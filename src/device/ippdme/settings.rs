@@ -10,8 +10,8 @@ use serde::Deserialize;
 use super::IppdmeCmm;
 use super::session::Limits;
 use crate::no_machine::NoMachine;
-use crate::place::Place;
-use crate::wiring::{Making, MakingError, Wired};
+use crate::place::MachineTable;
+use crate::wiring::{DriverContext, DriverError, DriverFactory};
 use regrind_document::Document;
 
 /// I++ DME over TCP, for a measuring machine.
@@ -44,7 +44,7 @@ pub struct IppdmeWire {
     pub part_frame: Option<[f64; 6]>,
     /// How often a target is tried again that was missed.
     #[schemars(range(min = 0, max = 10))]
-    pub tries_again: u8,
+    pub retries: u8,
     /// For the connection, and for the acknowledgement of a command.
     #[schemars(range(min = 10, max = 600000))]
     pub answer_timeout_ms: u32,
@@ -73,7 +73,7 @@ impl Default for IppdmeWire {
             scan_speed_mm_s: None,
             scan_step_mm: 5.0,
             part_frame: None,
-            tries_again: 1,
+            retries: 1,
             answer_timeout_ms: 5000,
             completion_timeout_ms: 10_000,
             abort_timeout_ms: 5000,
@@ -130,12 +130,12 @@ impl IppdmeSettings {
     }
 }
 
-impl Wired for IppdmeWire {
+impl DriverFactory for IppdmeWire {
     type Cmm = IppdmeCmm;
     type Grinder = NoMachine;
-    const TELLS_TEMPERATURE: bool = false;
+    const REPORTS_TEMPERATURE: bool = false;
 
-    fn check(&self, place: &Place<'_>, document: &mut Document) {
+    fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         if place.table == "grinder" {
             let allowed = "I++ DME is for measuring machines";
             return document.report("grinder.wire.kind", "is \"ippdme\"", allowed, "name another wire");
@@ -143,7 +143,7 @@ impl Wired for IppdmeWire {
         self.check_address(place, document);
         if !document.is_there("cmm.travel") {
             let allowed = "every position is held against the machine's volume before it moves";
-            document.report("cmm.wire.kind", "is \"ippdme\" without [cmm.travel]", allowed, "add least_mm and most_mm");
+            document.report("cmm.wire.kind", "is \"ippdme\" without [cmm.travel]", allowed, "add min_mm and max_mm");
         }
         if self.tool.contains(['"', '\r', '\n']) || !self.tool.is_ascii() {
             let allowed = "names of tools are plain ASCII without quotes";
@@ -157,9 +157,9 @@ impl Wired for IppdmeWire {
         }
     }
 
-    fn cmm(&self, making: &Making<'_>) -> Result<IppdmeCmm, MakingError> {
+    fn create_cmm(&self, making: &DriverContext<'_>) -> Result<IppdmeCmm, DriverError> {
         let machine = format!("cmm at {}:{}", self.host, self.port);
-        let volume_mm = making.volume_mm.ok_or(MakingError::NoVolume { machine })?;
+        let volume_mm = making.volume_mm.ok_or(DriverError::NoVolume { machine })?;
         let ms = |ms: u32| Duration::from_millis(ms.into());
         Ok(IppdmeCmm::new(IppdmeSettings {
             host: self.host.clone(),
@@ -169,7 +169,7 @@ impl Wired for IppdmeWire {
             travel_speed_mm_s: self.travel_speed_mm_s,
             scan: self.scan_speed_mm_s.map(|speed_mm_s| Scanning { speed_mm_s, step_mm: self.scan_step_mm }),
             part_frame: self.part_frame,
-            retries: self.tries_again,
+            retries: self.retries,
             volume_mm,
             limits: Limits {
                 answer: ms(self.answer_timeout_ms),
@@ -184,17 +184,17 @@ impl Wired for IppdmeWire {
         }))
     }
 
-    fn grinder(&self, _: &Making<'_>) -> Result<NoMachine, MakingError> {
-        Err(MakingError::NoDriver { table: "grinder", kind: "ippdme" })
+    fn create_grinder(&self, _: &DriverContext<'_>) -> Result<NoMachine, DriverError> {
+        Err(DriverError::NoDriver { table: "grinder", kind: "ippdme" })
     }
 
-    fn dme(&self) -> Option<(String, u16)> {
+    fn ippdme_address(&self) -> Option<(String, u16)> {
         Some((self.host.clone(), self.port))
     }
 }
 
 impl IppdmeWire {
-    fn check_address(&self, place: &Place<'_>, document: &mut Document) {
+    fn check_address(&self, place: &MachineTable<'_>, document: &mut Document) {
         let host = &self.host;
         let is_here = host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
         if host.is_empty() {

@@ -3,9 +3,9 @@
 use std::fmt::{self, Write as _};
 
 /// Maximum number of digits of a number.
-const MOST_DIGITS: usize = 16;
+const MAX_DIGITS: usize = 16;
 /// Maximum depth of nested parentheses; the standard uses two.
-const DEEPEST: u32 = 8;
+const MAX_DEPTH: u32 = 8;
 
 /// Tag that links an answer to its command.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -18,7 +18,7 @@ pub enum Tag {
 
 impl Tag {
     /// Tag of messages that the server sends unasked.
-    pub const UNASKED: Self = Self::Event(0);
+    pub const UNSOLICITED: Self = Self::Event(0);
 
     /// Parses the five characters of a tag; `None` if they are not a tag.
     pub fn read(text: &str) -> Option<Self> {
@@ -42,21 +42,21 @@ impl fmt::Display for Tag {
 
 /// Reason why a line is refused: the error number of the standard that a server answers, and a text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Flaw {
+pub struct SyntaxError {
     /// Error number of the standard.
     pub number: u16,
     /// Explanation in words.
-    pub why: &'static str,
+    pub reason: &'static str,
 }
 
 /// Returns the error "incorrect arguments" (502).
-pub(super) const fn arguments(why: &'static str) -> Flaw {
-    Flaw { number: 502, why }
+pub(super) const fn arguments(why: &'static str) -> SyntaxError {
+    SyntaxError { number: 502, reason: why }
 }
 
 /// Returns the error "bad argument" (509).
-pub(super) const fn bad(why: &'static str) -> Flaw {
-    Flaw { number: 509, why }
+pub(super) const fn bad(why: &'static str) -> SyntaxError {
+    SyntaxError { number: 509, reason: why }
 }
 
 /// Argument or data item, between two commas.
@@ -78,12 +78,12 @@ pub enum Item {
 
 impl Item {
     /// Creates a property with one number, for example `X(1.5)`.
-    pub fn with(name: &str, value: f64) -> Self {
+    pub fn property(name: &str, value: f64) -> Self {
         Self::Call(name.to_owned(), vec![Self::Number(value)])
     }
 
     /// Creates a request for a property, for example `X()`.
-    pub fn asked(name: &str) -> Self {
+    pub fn property_query(name: &str) -> Self {
         Self::Call(name.to_owned(), Vec::new())
     }
 
@@ -122,10 +122,10 @@ pub fn number(value: f64) -> String {
     let digits = |text: &str| text.bytes().filter(u8::is_ascii_digit).count();
     let short = format!("{value:e}");
     let mantissa = |text: &str| digits(text.split('e').next().unwrap_or(text));
-    let short = if mantissa(&short) > MOST_DIGITS { format!("{value:.15e}") } else { short };
+    let short = if mantissa(&short) > MAX_DIGITS { format!("{value:.15e}") } else { short };
     // The plain form is written from the value rounded to 16 digits.
     let plain = short.parse::<f64>().map_or(String::new(), |rounded| rounded.to_string());
-    let is_plain = !plain.is_empty() && digits(&plain) <= MOST_DIGITS;
+    let is_plain = !plain.is_empty() && digits(&plain) <= MAX_DIGITS;
     if is_plain { plain } else { short.replace('e', "E") }
 }
 
@@ -171,7 +171,7 @@ impl<'a> Reader<'a> {
     }
 
     /// Parses the items in parentheses and the closing parenthesis; the opening one is already consumed.
-    pub(super) fn in_parentheses(&mut self) -> Result<Vec<Item>, Flaw> {
+    pub(super) fn in_parentheses(&mut self) -> Result<Vec<Item>, SyntaxError> {
         if self.eat(')') {
             return Ok(Vec::new());
         }
@@ -180,7 +180,7 @@ impl<'a> Reader<'a> {
     }
 
     /// Parses items separated by commas.
-    pub(super) fn items(&mut self) -> Result<Vec<Item>, Flaw> {
+    pub(super) fn items(&mut self) -> Result<Vec<Item>, SyntaxError> {
         let mut items = vec![self.item()?];
         while self.eat(',') {
             items.push(self.item()?);
@@ -188,7 +188,7 @@ impl<'a> Reader<'a> {
         Ok(items)
     }
 
-    fn item(&mut self) -> Result<Item, Flaw> {
+    fn item(&mut self) -> Result<Item, SyntaxError> {
         self.skip_blanks();
         match self.rest.chars().next() {
             None | Some(',' | ')') => Ok(Item::Nothing),
@@ -199,7 +199,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn text(&mut self) -> Result<Item, Flaw> {
+    fn text(&mut self) -> Result<Item, SyntaxError> {
         let body = &self.rest[1..];
         let end = body.find('"').ok_or(bad("a string that does not end"))?;
         if end == 0 && self.strictness == Strictness::Strict {
@@ -209,19 +209,19 @@ impl<'a> Reader<'a> {
         Ok(Item::Text(body[..end].to_owned()))
     }
 
-    fn take(&mut self, of: impl Fn(u8) -> bool) -> &'a str {
+    fn take_while(&mut self, of: impl Fn(u8) -> bool) -> &'a str {
         let end = self.rest.bytes().position(|b| !of(b)).unwrap_or(self.rest.len());
         let (taken, rest) = self.rest.split_at(end);
         self.rest = rest;
         taken
     }
 
-    fn number(&mut self) -> Result<f64, Flaw> {
+    fn number(&mut self) -> Result<f64, SyntaxError> {
         let all = self.rest;
         if self.rest.starts_with(['+', '-']) {
             self.rest = &self.rest[1..];
         }
-        let mantissa = self.take(|b| b.is_ascii_digit() || b == b'.');
+        let mantissa = self.take_while(|b| b.is_ascii_digit() || b == b'.');
         let digits = mantissa.bytes().filter(u8::is_ascii_digit).count();
         if mantissa.len() - digits > 1 {
             return Err(bad("a number with two decimal points"));
@@ -229,7 +229,7 @@ impl<'a> Reader<'a> {
         if digits == 0 {
             return Err(bad("a number without a digit"));
         }
-        if digits > MOST_DIGITS && self.strictness == Strictness::Strict {
+        if digits > MAX_DIGITS && self.strictness == Strictness::Strict {
             return Err(bad("a number with more than 16 digits"));
         }
         if self.rest.starts_with(['E', 'e']) {
@@ -237,7 +237,7 @@ impl<'a> Reader<'a> {
             if self.rest.starts_with(['+', '-']) {
                 self.rest = &self.rest[1..];
             }
-            if !(1..=3).contains(&self.take(|b| b.is_ascii_digit()).len()) {
+            if !(1..=3).contains(&self.take_while(|b| b.is_ascii_digit()).len()) {
                 return Err(bad("an exponent that has not one, two or three digits"));
             }
         }
@@ -245,8 +245,8 @@ impl<'a> Reader<'a> {
         value.ok_or(bad("a number that is too large"))
     }
 
-    fn named(&mut self) -> Result<Item, Flaw> {
-        let name = self.take(|b| b.is_ascii_alphanumeric() || b == b'.' || b == b'_');
+    fn named(&mut self) -> Result<Item, SyntaxError> {
+        let name = self.take_while(|b| b.is_ascii_alphanumeric() || b == b'.' || b == b'_');
         if name.ends_with('.') || name.contains("..") {
             return Err(arguments("a dot without a name"));
         }
@@ -257,7 +257,7 @@ impl<'a> Reader<'a> {
             return Ok(Item::Name(name.to_owned()));
         }
         self.depth += 1;
-        if self.depth > DEEPEST {
+        if self.depth > MAX_DEPTH {
             return Err(arguments("parentheses within too many others"));
         }
         let items = self.in_parentheses()?;
@@ -313,7 +313,7 @@ mod tests {
     #[test]
     fn tags_have_five_characters() {
         assert_eq!(Tag::read("00007"), Some(Tag::Command(7)));
-        assert_eq!(Tag::read("E0000"), Some(Tag::UNASKED));
+        assert_eq!(Tag::read("E0000"), Some(Tag::UNSOLICITED));
         assert_eq!(Tag::Event(12).to_string(), "E0012");
         for none in ["0007", "000007", "E00", "A2345", "+1234", "E+123"] {
             assert_eq!(Tag::read(none), None, "{none}");

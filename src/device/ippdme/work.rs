@@ -8,8 +8,8 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, sleep};
 
 use super::response::{ServerError, values};
-use super::route::{Leg, Route, along, approach};
-use super::session::{Answer, Failure, Session};
+use super::route::{Leg, Route, approach, point_on_normal};
+use super::session::{CommandReply, Failure, Session};
 use super::settings::IppdmeSettings;
 use super::text::Item;
 use crate::error::DeviceError;
@@ -18,80 +18,80 @@ use crate::words::{Fault, Job, Outcome, State};
 
 /// Server errors of a touch that do not end the job: the next touch can succeed. Unexpected contact, illegal touch, no
 /// surface found.
-pub(super) const MISSES: [u16; 3] = [1001, 1003, 1006];
+pub(super) const MISS_ERRORS: [u16; 3] = [1001, 1003, 1006];
 /// Number of targets not reached at which the job fails: the part lies elsewhere.
-const UNREACHED_MOST: u32 = 3;
+const MAX_UNREACHED: u32 = 3;
 /// Error numbers of a server that lacks a method or a property.
-const LACKING: [u16; 6] = [501, 502, 505, 506, 509, 510];
+const UNSUPPORTED_ERRORS: [u16; 6] = [501, 502, 505, 506, 509, 510];
 /// Time limits of a tool change and of homing, for their motion.
-const CHANGE: Duration = Duration::from_secs(180);
-const HOMING: Duration = Duration::from_secs(300);
+const TOOL_CHANGE_TIMEOUT: Duration = Duration::from_secs(180);
+const HOMING_TIMEOUT: Duration = Duration::from_secs(300);
 
 /// Plan of a job and its route.
 #[derive(Debug)]
-pub(super) struct Work {
+pub(super) struct RoutedPlan {
     pub(super) plan: Plan,
     pub(super) route: Route,
 }
 
 /// Request to the task, which it obeys at the next safe place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Wish {
-    GoOn,
+pub(super) enum JobRequest {
+    Continue,
     Hold,
     Stop,
 }
 
 /// Order to the task that owns the session.
 #[derive(Debug)]
-pub(super) enum Order {
-    Run(Arc<Work>),
+pub(super) enum WorkerOrder {
+    Run(Arc<RoutedPlan>),
     Clear(oneshot::Sender<Result<(), DeviceError>>),
-    Look(oneshot::Sender<()>),
+    CheckAlive(oneshot::Sender<()>),
 }
 
 /// State that the task and the machine's driver share.
 #[derive(Debug)]
-pub(super) struct Shared {
+pub(super) struct SharedState {
     pub(super) state: State,
     pub(super) job: Option<(Job, u32)>,
     pub(super) outcome: Outcome,
     pub(super) fault: Fault,
-    pub(super) clear: Option<bool>,
+    pub(super) clear_of_part: Option<bool>,
     /// Points measured so far, in the order of the plan; `None` for a target not measured yet.
     pub(super) points: Vec<Option<MeasuredPoint>>,
     pub(super) radius_mm: Option<f64>,
-    pub(super) worked: Duration,
+    pub(super) measuring_time: Duration,
     /// Time of the last status request.
-    pub(super) looked_at: Instant,
+    pub(super) last_status_request: Instant,
     /// Reason why the session is over.
-    pub(super) lost: Option<DeviceError>,
+    pub(super) session_error: Option<DeviceError>,
     /// Reason why the machine is stopped, and the messages of the server.
-    pub(super) why: Option<String>,
+    pub(super) stop_reason: Option<String>,
     pub(super) notes: Vec<String>,
 }
 
-impl Shared {
+impl SharedState {
     pub(super) fn new() -> Self {
         Self {
             state: State::Idle,
             job: None,
             outcome: Outcome::None,
             fault: Fault::None,
-            clear: None,
+            clear_of_part: None,
             points: Vec::new(),
             radius_mm: None,
-            worked: Duration::ZERO,
-            looked_at: Instant::now(),
-            lost: None,
-            why: None,
+            measuring_time: Duration::ZERO,
+            last_status_request: Instant::now(),
+            session_error: None,
+            stop_reason: None,
             notes: Vec::new(),
         }
     }
 
     /// Changes to the resting state that follows the current one: the server has finished its command, so nothing
     /// moves.
-    pub(super) fn stands(&mut self) {
+    pub(super) fn come_to_rest(&mut self) {
         (self.state, self.outcome) = match self.state {
             State::Aborting => (State::Aborted, Outcome::Aborted),
             State::Stopping => (State::Complete, Outcome::Stopped),
@@ -102,26 +102,26 @@ impl Shared {
 }
 
 /// Locks the shared state. A panic in another thread does not make it invalid, so a poisoned lock is ignored.
-pub(super) fn locked(shared: &Mutex<Shared>) -> MutexGuard<'_, Shared> {
+pub(super) fn locked(shared: &Mutex<SharedState>) -> MutexGuard<'_, SharedState> {
     shared.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Task that owns a session.
 pub(super) struct Worker {
     pub(super) session: Session,
-    pub(super) shared: Arc<Mutex<Shared>>,
-    pub(super) orders: mpsc::Receiver<Order>,
-    pub(super) wish: watch::Receiver<Wish>,
+    pub(super) shared: Arc<Mutex<SharedState>>,
+    pub(super) orders: mpsc::Receiver<WorkerOrder>,
+    pub(super) job_request: watch::Receiver<JobRequest>,
     pub(super) settings: Arc<IppdmeSettings>,
     /// Position of the probe's centre, if it is known.
-    pub(super) at_mm: Option<[f64; 3]>,
+    pub(super) position_mm: Option<[f64; 3]>,
     /// Speeds in force, in mm/s: travel, touching, scanning; 0 if not set yet.
     pub(super) speeds_mm_s: [f64; 3],
 }
 
 impl Worker {
     /// Serves the session until it is lost or until no sender of orders is left; then ends the session.
-    pub(super) async fn attend(mut self) {
+    pub(super) async fn serve_session(mut self) {
         loop {
             let done = tokio::select! {
                 biased;
@@ -142,27 +142,27 @@ impl Worker {
         let _ = self.session.ask("EndSession", Vec::new()).await;
     }
 
-    async fn carry_out(&mut self, order: Order) -> Result<(), Failure> {
+    async fn carry_out(&mut self, order: WorkerOrder) -> Result<(), Failure> {
         match order {
             // An abort came first, so the job does not begin.
-            Order::Run(_) if !locked(&self.shared).state.moves() || self.session.is_abort_ordered() => Ok(()),
-            Order::Run(work) => {
+            WorkerOrder::Run(_) if !locked(&self.shared).state.is_moving() || self.session.is_abort_ordered() => Ok(()),
+            WorkerOrder::Run(work) => {
                 let began = Instant::now();
                 let ran = self.run(&work).await;
-                locked(&self.shared).worked += began.elapsed();
+                locked(&self.shared).measuring_time += began.elapsed();
                 ran
             }
-            Order::Clear(answer) => {
+            WorkerOrder::Clear(answer) => {
                 let cleared = self.session.clear_errors(1).await;
                 let told = match &cleared {
                     Ok(()) => Ok(()),
-                    Err(failure) => Err(self.in_words(failure)),
+                    Err(failure) => Err(self.device_error(failure)),
                 };
                 // The requester may have dropped its receiver.
                 let _ = answer.send(told);
                 cleared
             }
-            Order::Look(answer) => {
+            WorkerOrder::CheckAlive(answer) => {
                 let looked = self.session.ask("GetErrStatusE", Vec::new()).await;
                 let _ = answer.send(());
                 looked.map(drop)
@@ -172,48 +172,48 @@ impl Worker {
 
     /// Records a failure in the shared state. Returns true if the session is lost.
     fn failed(&mut self, failure: Failure) -> bool {
-        let why = self.in_words(&failure);
-        self.at_mm = None;
+        let why = self.device_error(&failure);
+        self.position_mm = None;
         let mut shared = locked(&self.shared);
-        shared.clear = None;
+        shared.clear_of_part = None;
         match failure {
             Failure::Aborted => {
                 (shared.state, shared.outcome) = (State::Aborted, Outcome::Aborted);
                 return false;
             }
             Failure::Link(_) => {
-                shared.lost = Some(why);
+                shared.session_error = Some(why);
                 return true;
             }
-            Failure::No(error) => shared.fault = fault(error.number),
-            Failure::Wrong(_) => shared.fault = Fault::Tool,
+            Failure::Refused(error) => shared.fault = fault(error.number),
+            Failure::Implausible(_) => shared.fault = Fault::Tool,
         }
-        let of_job = shared.state.moves() || shared.state == State::Held;
+        let of_job = shared.state.is_moving() || shared.state == State::Held;
         shared.outcome = if of_job { Outcome::Failed } else { shared.outcome };
-        (shared.state, shared.why) = (State::Faulted, Some(why.to_string()));
+        (shared.state, shared.stop_reason) = (State::Faulted, Some(why.to_string()));
         false
     }
 
-    fn in_words(&self, failure: &Failure) -> DeviceError {
+    fn device_error(&self, failure: &Failure) -> DeviceError {
         let machine = Arc::clone(&self.session.machine);
         match failure {
-            Failure::Link(error) | Failure::Wrong(error) => error.clone(),
-            Failure::No(error) => DeviceError::MethodRefused { machine, method: "the job", error: error.clone() },
-            Failure::Aborted => DeviceError::Disconnected { machine, what: "aborted" },
+            Failure::Link(error) | Failure::Implausible(error) => error.clone(),
+            Failure::Refused(error) => DeviceError::MethodRefused { machine, method: "the job", error: error.clone() },
+            Failure::Aborted => DeviceError::Disconnected { machine, operation: "aborted" },
         }
     }
 
     // ---- a job ------------------------------------------------------------------------------------------------------------------------
 
     /// Measures the targets of the plan that have no point yet.
-    async fn run(&mut self, work: &Work) -> Result<(), Failure> {
+    async fn run(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         self.set_up(work).await?;
         let mut unreached = 0;
         'job: for leg in &work.route.legs {
             if let Leg::Scan(row) = leg
                 && locked(&self.shared).points[row.clone()].iter().any(Option::is_none)
             {
-                if self.wished() != Wish::GoOn {
+                if self.current_request() != JobRequest::Continue {
                     break;
                 }
                 if self.scan(work, row.clone()).await? {
@@ -221,69 +221,69 @@ impl Worker {
                 }
             }
             for k in leg.targets() {
-                if self.wished() != Wish::GoOn {
+                if self.current_request() != JobRequest::Continue {
                     break 'job;
                 }
                 if locked(&self.shared).points[k].is_some() {
                     continue;
                 }
-                self.keep_speeds(work, k).await?;
+                self.set_speeds(work, k).await?;
                 let point = self.touch(work, &work.plan.targets[k]).await?;
                 locked(&self.shared).points[k] = Some(point);
                 unreached += u32::from(point.status == PointStatus::NotReached);
-                if unreached >= UNREACHED_MOST {
-                    return self.lies_elsewhere(work, unreached).await;
+                if unreached >= MAX_UNREACHED {
+                    return self.fail_unreachable(work, unreached).await;
                 }
             }
         }
         self.rise(work).await?;
-        let wish = *self.wish.borrow();
+        let wish = *self.job_request.borrow();
         let mut shared = locked(&self.shared);
         if shared.state == State::Aborting {
             return Ok(()); // The abort is next.
         }
-        shared.clear = Some(true);
+        shared.clear_of_part = Some(true);
         (shared.state, shared.outcome) = match wish {
             _ if shared.points.iter().all(Option::is_some) => (State::Complete, Outcome::Complete),
-            Wish::Stop => (State::Complete, Outcome::Stopped),
+            JobRequest::Stop => (State::Complete, Outcome::Stopped),
             // Held, or resumed at the last moment.
-            Wish::Hold | Wish::GoOn => (State::Held, Outcome::None),
+            JobRequest::Hold | JobRequest::Continue => (State::Held, Outcome::None),
         };
         Ok(())
     }
 
     /// Rises to the clearance height and fails the job: too many targets could not be reached.
-    async fn lies_elsewhere(&mut self, work: &Work, unreached: u32) -> Result<(), Failure> {
+    async fn fail_unreachable(&mut self, work: &RoutedPlan, unreached: u32) -> Result<(), Failure> {
         self.rise(work).await?;
         let text = format!("{unreached} targets could not be reached: see how the part lies");
-        Err(Failure::No(ServerError { severity: 3, number: 2504, cause: String::new(), text }))
+        Err(Failure::Refused(ServerError { severity: 3, number: 2504, cause: String::new(), text }))
     }
 
     /// Returns the request in force. If no status request came within `silence_limit`, the job holds by itself, as a
     /// machine does that loses its client.
-    fn wished(&self) -> Wish {
+    fn current_request(&self) -> JobRequest {
         let mut shared = locked(&self.shared);
-        if shared.state == State::Execute && shared.looked_at.elapsed() > self.settings.silence_limit {
+        if shared.state == State::Execute && shared.last_status_request.elapsed() > self.settings.silence_limit {
             shared.state = State::Holding;
-            shared.why = Some("nobody looked at it for too long, and it held by itself".to_owned());
-            return Wish::Hold;
+            shared.stop_reason = Some("nobody looked at it for too long, and it held by itself".to_owned());
+            return JobRequest::Hold;
         }
-        *self.wish.borrow()
+        *self.job_request.borrow()
     }
 
     /// Puts the machine into the state that the plan needs, independent of what other clients did before.
-    async fn set_up(&mut self, work: &Work) -> Result<(), Failure> {
+    async fn set_up(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         let homed = self.session.ask("IsHomed", Vec::new()).await?;
         if homed.value("IsHomed") != Some(1.0) {
-            self.session.move_by("Home", Vec::new(), HOMING).await?;
+            self.session.request_motion("Home", Vec::new(), HOMING_TIMEOUT).await?;
         }
         self.set_frame().await?;
-        self.find_place().await?;
+        self.read_position().await?;
         self.rise(work).await?;
         let tool = vec![Item::Text(self.settings.tool.clone())];
-        self.session.move_by("ChangeTool", tool, CHANGE).await?;
-        self.find_place().await?;
-        self.check_radius(work).await?;
+        self.session.request_motion("ChangeTool", tool, TOOL_CHANGE_TIMEOUT).await?;
+        self.read_position().await?;
+        self.check_tool_radius(work).await?;
         self.speeds_mm_s = [0.0; 3];
         let Plan { approach_mm, search_mm, .. } = work.plan;
         self.set(&[
@@ -295,14 +295,14 @@ impl Worker {
         if work.route.legs.iter().any(|leg| matches!(leg, Leg::Scan(_))) {
             self.set_up_scans(work).await?;
         }
-        let report = |names: &[&str]| names.iter().map(|name| Item::asked(name)).collect::<Vec<_>>();
+        let report = |names: &[&str]| names.iter().map(|name| Item::property_query(name)).collect::<Vec<_>>();
         // Not every version of the standard has a quality and the radius of a touch.
         for names in [&["X", "Y", "Z", "IJK", "ER", "Q"][..], &["X", "Y", "Z", "IJK", "ER"], &["X", "Y", "Z"]] {
-            if self.ask_if_there("OnPtMeasReport", report(names)).await?.is_some() {
+            if self.request_if_supported("OnPtMeasReport", report(names)).await?.is_some() {
                 return Ok(());
             }
         }
-        Err(Failure::Wrong(self.untold("OnPtMeasReport", "the coordinates of a touch")))
+        Err(Failure::Implausible(self.missing_value("OnPtMeasReport", "the coordinates of a touch")))
     }
 
     async fn set_frame(&mut self) -> Result<(), Failure> {
@@ -320,52 +320,59 @@ impl Worker {
         let told = told.line().and_then(|data| values(data, "CoordSystem"));
         match told.as_deref() {
             Some([Item::Name(name) | Item::Text(name)]) if name == frame => Ok(()),
-            _ => Err(Failure::Wrong(self.untold("GetCoordSystem", "the frame that was set"))),
+            _ => Err(Failure::Implausible(self.missing_value("GetCoordSystem", "the frame that was set"))),
         }
     }
 
     /// Compares the radius of the tool with the radius of the plan.
-    async fn check_radius(&mut self, work: &Work) -> Result<(), Failure> {
-        let told = self.ask_if_there("GetProp", vec![Item::asked("Tool.AvrRadius")]).await?;
+    async fn check_tool_radius(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
+        let told = self.request_if_supported("GetProp", vec![Item::property_query("Tool.AvrRadius")]).await?;
         let Some(told) = told else {
             self.session.note("it does not tell the radius of its tool; that of each touch is looked at".to_owned());
             return Ok(());
         };
-        let missing = || self.untold("GetProp", "Tool.AvrRadius");
-        let told_mm = told.value("Tool.AvrRadius").ok_or_else(|| Failure::Wrong(missing()))?;
-        self.hold_radius(told_mm, work)?;
+        let missing = || self.missing_value("GetProp", "Tool.AvrRadius");
+        let told_mm = told.value("Tool.AvrRadius").ok_or_else(|| Failure::Implausible(missing()))?;
+        self.compare_radius(told_mm, work)?;
         locked(&self.shared).radius_mm = Some(told_mm);
         Ok(())
     }
 
-    pub(super) fn hold_radius(&self, told_mm: f64, work: &Work) -> Result<(), Failure> {
+    pub(super) fn compare_radius(&self, told_mm: f64, work: &RoutedPlan) -> Result<(), Failure> {
         let (plan_mm, limit_mm) = (work.plan.probe_radius_mm, self.settings.probe_tolerance_mm);
         if (told_mm - plan_mm).abs() <= limit_mm {
             return Ok(());
         }
         let (machine, tool) = (Arc::clone(&self.session.machine), self.settings.tool.clone());
-        Err(Failure::Wrong(DeviceError::ProbeRadius { machine, tool, told_mm, plan_mm, limit_mm }))
+        Err(Failure::Implausible(DeviceError::ProbeRadius { machine, tool, reported_mm: told_mm, plan_mm, limit_mm }))
     }
 
     /// Sets parameters of the tool and returns the values in force, in the same order. The machine may limit a value: a
     /// lower speed is accepted and noted, any other difference is an error.
     pub(super) async fn set(&mut self, parameters: &[(&str, f64)]) -> Result<Vec<f64>, Failure> {
         let named = |name: &str| format!("Tool.{name}");
-        let wanted = parameters.iter().map(|(name, value)| Item::with(&named(name), *value)).collect();
+        let wanted = parameters.iter().map(|(name, value)| Item::property(&named(name), *value)).collect();
         self.session.ask("SetProp", wanted).await?;
-        let asked = parameters.iter().map(|(name, _)| Item::asked(&named(name))).collect();
+        let asked = parameters.iter().map(|(name, _)| Item::property_query(&named(name))).collect();
         let told = self.session.ask("GetProp", asked).await?;
         let mut in_force = Vec::new();
         for (name, wanted) in parameters {
             let property = named(name);
-            let value = told.value(&property).ok_or_else(|| Failure::Wrong(self.untold("GetProp", "what was set")))?;
+            let value = told
+                .value(&property)
+                .ok_or_else(|| Failure::Implausible(self.missing_value("GetProp", "what was set")))?;
             // A lower speed only costs time. Any other difference changes the measurement.
             let slower = name.ends_with("Speed") && value > 0.0 && value < *wanted;
             if slower {
                 self.session.note(format!("{property} is {value}, and not {wanted} as was asked"));
             } else if (value - wanted).abs() > 1e-4 * wanted.abs() + 1e-6 {
                 let machine = Arc::clone(&self.session.machine);
-                return Err(Failure::Wrong(DeviceError::NotSet { machine, property, wanted: *wanted, told: value }));
+                return Err(Failure::Implausible(DeviceError::NotSet {
+                    machine,
+                    property,
+                    requested: *wanted,
+                    in_force: value,
+                }));
             }
             in_force.push(value);
         }
@@ -373,8 +380,8 @@ impl Worker {
     }
 
     /// Sets the travel and touch speeds for target `k` if they change: the first targets of a careful plan are slow.
-    pub(super) async fn keep_speeds(&mut self, work: &Work, k: usize) -> Result<(), Failure> {
-        let careful = work.plan.careful.filter(|careful| k < careful.targets as usize);
+    pub(super) async fn set_speeds(&mut self, work: &RoutedPlan, k: usize) -> Result<(), Failure> {
+        let careful = work.plan.careful_start.filter(|careful| k < careful.target_count as usize);
         let touching = careful.map_or(work.plan.speed_mm_s, |careful| careful.speed_mm_s);
         let travel = careful.map_or(self.settings.travel_speed_mm_s, |careful| careful.speed_mm_s);
         if self.speeds_mm_s[..2] == [travel, touching] {
@@ -388,65 +395,70 @@ impl Worker {
     // ---- motion -----------------------------------------------------------------------------------------------------------------------
 
     /// Touches one target, with up to `retries` retries after a miss.
-    async fn touch(&mut self, work: &Work, target: &Target) -> Result<MeasuredPoint, Failure> {
+    async fn touch(&mut self, work: &RoutedPlan, target: &Target) -> Result<MeasuredPoint, Failure> {
         let mut missed = PointStatus::NotFound;
         for _ in 0..=self.settings.retries {
-            self.go_over(work, target).await?;
+            self.move_above(work, target).await?;
             let [x, y, z] = target.point_mm;
             let [i, j, k] = target.normal.map(Item::Number);
             let normal = Item::Call("IJK".to_owned(), vec![i, j, k]);
-            let arguments = vec![Item::with("X", x), Item::with("Y", y), Item::with("Z", z), normal];
+            let arguments = vec![Item::property("X", x), Item::property("Y", y), Item::property("Z", z), normal];
             let depth_mm = 2.0 * (work.plan.approach_mm + work.plan.search_mm);
-            let motion = self.lasts(depth_mm, 1);
-            match self.session.move_by("PtMeas", arguments, motion).await {
+            let motion = self.motion_time(depth_mm, 1);
+            match self.session.request_motion("PtMeas", arguments, motion).await {
                 Ok(answer) => match missed_by(&answer) {
                     None => return self.point(work, target, &answer),
                     Some(number) => missed = status_of(number),
                 },
-                Err(Failure::No(error)) if MISSES.contains(&error.number) && error.severity <= 2 => {
+                Err(Failure::Refused(error)) if MISS_ERRORS.contains(&error.number) && error.severity <= 2 => {
                     missed = status_of(error.number);
                     self.session.note(format!("target {}: {error}", target.index));
                     self.session.clear_errors(1).await?;
                 }
                 Err(other) => return Err(other),
             }
-            self.find_place().await?;
+            self.read_position().await?;
             self.rise(work).await?;
         }
-        Ok(MeasuredPoint { index: target.index, status: missed, quality: 100, at_mm: [0.0; 3] })
+        Ok(MeasuredPoint { index: target.index, status: missed, quality: 100, position_mm: [0.0; 3] })
     }
 
     /// Returns the measured point in the answer to a touch, if it is plausible for this target.
-    fn point(&mut self, work: &Work, target: &Target, answer: &Answer) -> Result<MeasuredPoint, Failure> {
-        let missing = || Failure::Wrong(self.untold("PtMeas", "X, Y and Z, each once"));
+    fn point(&mut self, work: &RoutedPlan, target: &Target, answer: &CommandReply) -> Result<MeasuredPoint, Failure> {
+        let missing = || Failure::Implausible(self.missing_value("PtMeas", "X, Y and Z, each once"));
         let mut at_mm = [0.0; 3];
         for (at, name) in at_mm.iter_mut().zip(["X", "Y", "Z"]) {
             *at = answer.value(name).ok_or_else(missing)?;
         }
         if let Some(radius_mm) = answer.value("ER") {
-            self.hold_radius(radius_mm, work)?;
+            self.compare_radius(radius_mm, work)?;
         }
-        self.hold_place(work, target, at_mm)?;
+        self.check_touch_position(work, target, at_mm)?;
         let quality = answer.value("Q").map_or(0, |quality| quality.clamp(0.0, 100.0) as u16);
-        self.at_mm = Some(approach(target, &work.plan));
-        Ok(MeasuredPoint { index: target.index, status: PointStatus::Touched, quality, at_mm })
+        self.position_mm = Some(approach(target, &work.plan));
+        Ok(MeasuredPoint { index: target.index, status: PointStatus::Touched, quality, position_mm: at_mm })
     }
 
     /// Checks that a point lies within approach + search + probe tolerance of the position to which the probe was sent.
-    pub(super) fn hold_place(&self, work: &Work, target: &Target, at_mm: [f64; 3]) -> Result<(), Failure> {
+    pub(super) fn check_touch_position(
+        &self,
+        work: &RoutedPlan,
+        target: &Target,
+        at_mm: [f64; 3],
+    ) -> Result<(), Failure> {
         let plan = &work.plan;
-        let off_mm = distance(along(target, plan.probe_radius_mm), at_mm);
+        let off_mm = distance(point_on_normal(target, plan.probe_radius_mm), at_mm);
         let most = plan.approach_mm + plan.search_mm + self.settings.probe_tolerance_mm;
         if off_mm <= most {
             return Ok(());
         }
         let field = format!("the distance of the touch of target {} from where it was sent", target.index);
         let (machine, unit) = (Arc::clone(&self.session.machine), "mm".to_owned());
-        Err(Failure::Wrong(DeviceError::OutOfRange { machine, field, value: off_mm, least: 0.0, most, unit }))
+        Err(Failure::Implausible(DeviceError::OutOfRange { machine, field, value: off_mm, min: 0.0, max: most, unit }))
     }
 
     /// Travels at the clearance height to above a target, then down to the point where the probe turns into the normal.
-    pub(super) async fn go_over(&mut self, work: &Work, target: &Target) -> Result<(), Failure> {
+    pub(super) async fn move_above(&mut self, work: &RoutedPlan, target: &Target) -> Result<(), Failure> {
         self.rise(work).await?;
         let [x, y, z] = approach(target, &work.plan);
         self.go_to([x, y, work.route.clearance_mm]).await?;
@@ -454,64 +466,68 @@ impl Worker {
     }
 
     /// Moves straight up to the clearance height if the probe is below it.
-    pub(super) async fn rise(&mut self, work: &Work) -> Result<(), Failure> {
-        let Some([x, y, z]) = self.at_mm else { return Ok(()) };
+    pub(super) async fn rise(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
+        let Some([x, y, z]) = self.position_mm else { return Ok(()) };
         let clearance_mm = work.route.clearance_mm;
         if z >= clearance_mm {
             return Ok(());
         }
-        locked(&self.shared).clear = Some(false);
+        locked(&self.shared).clear_of_part = Some(false);
         self.go_to([x, y, clearance_mm]).await
     }
 
     async fn go_to(&mut self, to_mm: [f64; 3]) -> Result<(), Failure> {
-        let way_mm = self.at_mm.map_or(self.settings.diagonal_mm(), |at| distance(at, to_mm));
-        let arguments = ["X", "Y", "Z"].iter().zip(to_mm).map(|(axis, mm)| Item::with(axis, mm)).collect();
-        let motion = self.lasts(way_mm, 0);
-        self.session.move_by("GoTo", arguments, motion).await?;
-        self.at_mm = Some(to_mm);
+        let way_mm = self.position_mm.map_or(self.settings.diagonal_mm(), |at| distance(at, to_mm));
+        let arguments = ["X", "Y", "Z"].iter().zip(to_mm).map(|(axis, mm)| Item::property(axis, mm)).collect();
+        let motion = self.motion_time(way_mm, 0);
+        self.session.request_motion("GoTo", arguments, motion).await?;
+        self.position_mm = Some(to_mm);
         Ok(())
     }
 
     /// Returns the maximum duration of a way, from the speed in force with index `speed`. A speed not set yet is the
     /// machine's own, which may be slow: 1 mm/s is assumed.
-    pub(super) fn lasts(&self, way_mm: f64, speed: usize) -> Duration {
-        const SLOWEST_MM_S: f64 = 1.0;
+    pub(super) fn motion_time(&self, way_mm: f64, speed: usize) -> Duration {
+        const MIN_SPEED_MM_S: f64 = 1.0;
         let speed = self.speeds_mm_s[speed];
-        let speed = if speed > 0.0 { speed } else { SLOWEST_MM_S };
+        let speed = if speed > 0.0 { speed } else { MIN_SPEED_MM_S };
         // Factor 2: half of the time may go into acceleration and deceleration.
         Duration::try_from_secs_f64(2.0 * way_mm / speed).unwrap_or(Duration::from_secs(3600))
     }
 
-    pub(super) async fn find_place(&mut self) -> Result<(), Failure> {
-        let told = self.session.ask("Get", ["X", "Y", "Z"].map(Item::asked).to_vec()).await?;
+    pub(super) async fn read_position(&mut self) -> Result<(), Failure> {
+        let told = self.session.ask("Get", ["X", "Y", "Z"].map(Item::property_query).to_vec()).await?;
         let at = ["X", "Y", "Z"].map(|axis| told.value(axis));
         let [Some(x), Some(y), Some(z)] = at else {
-            return Err(Failure::Wrong(self.untold("Get", "where the probe is")));
+            return Err(Failure::Implausible(self.missing_value("Get", "where the probe is")));
         };
-        self.at_mm = Some([x, y, z]);
+        self.position_mm = Some([x, y, z]);
         Ok(())
     }
 
     /// Sends a request that not every server supports. Returns `None` if this server lacks it.
-    pub(super) async fn ask_if_there(&mut self, name: &str, arguments: Vec<Item>) -> Result<Option<Answer>, Failure> {
-        ask_if_there(&mut self.session, name, arguments).await
+    pub(super) async fn request_if_supported(
+        &mut self,
+        name: &str,
+        arguments: Vec<Item>,
+    ) -> Result<Option<CommandReply>, Failure> {
+        request_if_supported(&mut self.session, name, arguments).await
     }
 
-    pub(super) fn untold(&self, method: &'static str, missing: &'static str) -> DeviceError {
-        DeviceError::Untold { machine: Arc::clone(&self.session.machine), method, missing }
+    pub(super) fn missing_value(&self, method: &'static str, missing: &'static str) -> DeviceError {
+        DeviceError::ValueMissing { machine: Arc::clone(&self.session.machine), method, missing }
     }
 }
 
 /// Sends a request that not every server supports. Returns `None` if this server lacks it.
-pub(super) async fn ask_if_there(
+pub(super) async fn request_if_supported(
     session: &mut Session,
     name: &str,
     arguments: Vec<Item>,
-) -> Result<Option<Answer>, Failure> {
+) -> Result<Option<CommandReply>, Failure> {
     match session.ask(name, arguments).await {
         Ok(answer) => Ok(Some(answer)),
-        Err(Failure::No(error)) if LACKING.contains(&error.number) => {
+        Err(Failure::Refused(error)) if UNSUPPORTED_ERRORS.contains(&error.number) => {
             session.note(format!("it has no {name} as it was asked: {error}"));
             session.clear_errors(1).await?;
             Ok(None)
@@ -521,9 +537,9 @@ pub(super) async fn ask_if_there(
 }
 
 /// Returns the error number of a miss that the server reported only as a warning, without data.
-fn missed_by(answer: &Answer) -> Option<u16> {
+fn missed_by(answer: &CommandReply) -> Option<u16> {
     let numbers = answer.warnings.iter().map(|warning| warning.number);
-    numbers.into_iter().find(|number| MISSES.contains(number)).filter(|_| answer.data.is_empty())
+    numbers.into_iter().find(|number| MISS_ERRORS.contains(number)).filter(|_| answer.data.is_empty())
 }
 
 fn status_of(number: u16) -> PointStatus {

@@ -8,14 +8,14 @@ use tokio::time::{Instant, sleep};
 use super::link::{Link, LinkFault};
 use super::protocol::{Get, Mode, Reply, Request, Set};
 use super::settings::LinuxcncSettings;
-use crate::error::{Answered, DeviceError};
+use crate::error::{DeviceError, DeviceResult};
 use crate::words::{Answer, Command, State};
-use crate::{Dial, Line};
+use crate::{Connector, LineAddress};
 
 /// Interval between two queries while waiting for something.
-const ASKED_EVERY: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Maximum number of errors read at once.
-const MOST_ERRORS: usize = 32;
+const MAX_ERRORS: usize = 32;
 
 /// State of the interpreter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,13 +27,13 @@ pub(super) enum Interpreter {
 
 /// State of a controller, read in one exchange.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Seen {
+pub(super) struct ControllerState {
     /// True if this client has control.
-    pub(super) ours: bool,
+    pub(super) has_control: bool,
     /// True if the stop circuit is open.
-    pub(super) stopped: bool,
+    pub(super) stop_circuit_open: bool,
     /// True if the drives are on.
-    pub(super) on: bool,
+    pub(super) drives_on: bool,
     pub(super) mode: Mode,
     pub(super) homed: bool,
     pub(super) interpreter: Interpreter,
@@ -41,7 +41,7 @@ pub(super) struct Seen {
     pub(super) program: Option<String>,
     pub(super) line: u32,
     /// Position, as the controller reports it.
-    pub(super) at: String,
+    pub(super) position: String,
     /// Errors that it reports, each once.
     pub(super) errors: Vec<String>,
 }
@@ -51,52 +51,54 @@ pub(super) struct Seen {
 pub(super) struct Controller {
     pub(super) name: Arc<str>,
     settings: LinuxcncSettings,
-    dial: Box<dyn Dial>,
+    connector: Box<dyn Connector>,
     link: Option<Link>,
     /// Reason why the connection was lost. A later request returns this error, and not "never connected".
-    lost: Option<DeviceError>,
+    link_error: Option<DeviceError>,
     /// True if this client has taken control on this connection.
-    pub(super) owned: bool,
+    pub(super) has_control: bool,
     /// Machine configuration, which serves as its name.
     configuration: Option<String>,
 }
 
 impl Controller {
-    pub(super) fn new(settings: LinuxcncSettings, dial: Box<dyn Dial>) -> Self {
+    pub(super) fn new(settings: LinuxcncSettings, dial: Box<dyn Connector>) -> Self {
         let name = format!("grinder at {}:{} (LinuxCNC)", settings.host, settings.port).into();
-        Self { name, settings, dial, link: None, lost: None, owned: false, configuration: None }
+        Self { name, settings, connector: dial, link: None, link_error: None, has_control: false, configuration: None }
     }
 
     /// Reconnects and checks the identity; changes only settings of this connection. Returns the name of the machine.
-    pub(super) async fn meet(&mut self) -> Answered<String> {
-        (self.link, self.owned) = (None, false);
-        let LinuxcncSettings { host, port, answer_within, connect_password, .. } = &self.settings;
-        let line = Line::Tcp { host: host.clone(), port: *port };
-        let link = Link::open(&line, self.dial.as_mut(), *answer_within).await;
+    pub(super) async fn connect(&mut self) -> DeviceResult<String> {
+        (self.link, self.has_control) = (None, false);
+        let LinuxcncSettings { host, port, answer_timeout, connect_password, .. } = &self.settings;
+        let line = LineAddress::Tcp { host: host.clone(), port: *port };
+        let link = Link::open(&line, self.connector.as_mut(), *answer_timeout).await;
         let link = link.map_err(|fault| self.fault(fault, "a connection"))?;
         let hello = Request::Hello { password: connect_password.clone() };
-        let server = match link.ask(hello, *answer_within).answer().await {
+        let server = match link.ask(hello, *answer_timeout).answer().await {
             Ok(Reply::Value(server)) => server,
             Ok(_) => return Err(DeviceError::Password { machine: self.machine(), key: "connect_password" }),
-            Err(LinkFault::Nonsense | LinkFault::TimedOut) => return Err(self.foreign("hello", "nothing that fits")),
+            Err(LinkFault::NotProtocol | LinkFault::TimedOut) => {
+                return Err(self.not_linuxcnc("hello", "nothing that fits"));
+            }
             Err(fault) => return Err(self.fault(fault, "hello")),
         };
-        link.say(Request::EchoOff);
-        let verbose = link.ask(Request::Set(Set::Verbose), *answer_within).answer().await;
+        link.send_unanswered(Request::EchoOff);
+        let verbose = link.ask(Request::Set(Set::Verbose), *answer_timeout).answer().await;
         match verbose.map_err(|fault| self.fault(fault, "set verbose"))? {
             Reply::Acknowledged => {}
-            other => return Err(self.foreign("set verbose", &format!("{other:?}"))),
+            other => return Err(self.not_linuxcnc("set verbose", &format!("{other:?}"))),
         }
-        (self.link, self.lost) = (Some(link), None);
+        (self.link, self.link_error) = (Some(link), None);
         let configuration = self.get(Get::Inifile).await?;
         self.check_name(&server, &configuration)?;
-        self.look(false).await?;
+        self.read_state(false).await?;
         let name = format!("{server}, {configuration}");
         self.configuration = Some(configuration);
         Ok(name)
     }
 
-    fn check_name(&mut self, server: &str, configuration: &str) -> Answered<()> {
+    fn check_name(&mut self, server: &str, configuration: &str) -> DeviceResult<()> {
         let changed = self.configuration.as_ref().filter(|known| *known != configuration).cloned();
         let expected = changed.or_else(|| self.settings.expected_name.clone());
         let known = [configuration, server, server.split(' ').next().unwrap_or_default()];
@@ -111,7 +113,7 @@ impl Controller {
 
     /// Reads the complete state. Errors are read only if `errors` is true, because the controller reports each error to
     /// one reader only.
-    pub(super) async fn look(&mut self, errors: bool) -> Answered<Seen> {
+    pub(super) async fn read_state(&mut self, errors: bool) -> DeviceResult<ControllerState> {
         const WHAT: [Get; 9] = [
             Get::Enable,
             Get::Estop,
@@ -124,50 +126,50 @@ impl Controller {
             Get::AbsActPos,
         ];
         let link = self.link("its status")?;
-        let asked = WHAT.map(|what| (what, link.ask(Request::Get(what), self.settings.answer_within)));
+        let asked = WHAT.map(|what| (what, link.ask(Request::Get(what), self.settings.answer_timeout)));
         let mut told = Vec::with_capacity(WHAT.len());
         for (what, asked) in asked {
             let answer = asked.answer().await;
             told.push(self.value(what, answer)?);
         }
         let errors = if errors { self.errors().await? } else { Vec::new() };
-        self.understand(&told, errors)
+        self.decode_state(&told, errors)
     }
 
-    fn understand(&self, told: &[String], errors: Vec<String>) -> Answered<Seen> {
+    fn decode_state(&self, told: &[String], errors: Vec<String>) -> DeviceResult<ControllerState> {
         let [enable, estop, machine, mode, homed, program, interpreter, line, at] = told else {
-            return Err(self.foreign("its status", "less than was asked"));
+            return Err(self.not_linuxcnc("its status", "less than was asked"));
         };
         let switch = |what: &'static str, told: &str| match told {
             "ON" => Ok(true),
             "OFF" => Ok(false),
-            other => Err(self.foreign(what, other)),
+            other => Err(self.not_linuxcnc(what, other)),
         };
         let interpreter = match interpreter.as_str() {
             "IDLE" => Interpreter::Idle,
             "RUNNING" => Interpreter::Running,
             "PAUSED" => Interpreter::Paused,
-            other => return Err(self.foreign("get program_status", other)),
+            other => return Err(self.not_linuxcnc("get program_status", other)),
         };
         let homed: Vec<&str> = homed.split_whitespace().take(self.settings.joints).collect();
-        Ok(Seen {
-            ours: switch("get enable", enable)?,
-            stopped: switch("get estop", estop)?,
-            on: switch("get machine", machine)?,
-            mode: Mode::of(mode).ok_or_else(|| self.foreign("get mode", mode))?,
+        Ok(ControllerState {
+            has_control: switch("get enable", enable)?,
+            stop_circuit_open: switch("get estop", estop)?,
+            drives_on: switch("get machine", machine)?,
+            mode: Mode::from_name(mode).ok_or_else(|| self.not_linuxcnc("get mode", mode))?,
             homed: homed.len() == self.settings.joints && homed.iter().all(|joint| *joint == "YES"),
             interpreter,
             program: Some(program.clone()).filter(|program| program != "NONE"),
-            line: line.parse().map_err(|_| self.foreign("get program_line", line))?,
-            at: at.clone(),
+            line: line.parse().map_err(|_| self.not_linuxcnc("get program_line", line))?,
+            position: at.clone(),
             errors,
         })
     }
 
     /// Reads the errors since the last call.
-    pub(super) async fn errors(&mut self) -> Answered<Vec<String>> {
+    pub(super) async fn errors(&mut self) -> DeviceResult<Vec<String>> {
         let mut errors = Vec::new();
-        while errors.len() < MOST_ERRORS {
+        while errors.len() < MAX_ERRORS {
             match self.get(Get::Error).await? {
                 none if none == "OK" => break,
                 error => errors.push(error),
@@ -176,29 +178,29 @@ impl Controller {
         Ok(errors)
     }
 
-    pub(super) async fn get(&mut self, what: Get) -> Answered<String> {
-        let asked = self.link("a question")?.ask(Request::Get(what), self.settings.answer_within);
+    pub(super) async fn get(&mut self, what: Get) -> DeviceResult<String> {
+        let asked = self.link("a question")?.ask(Request::Get(what), self.settings.answer_timeout);
         let answer = asked.answer().await;
         self.value(what, answer)
     }
 
-    fn value(&mut self, what: Get, answer: Result<Reply, LinkFault>) -> Answered<String> {
+    fn value(&mut self, what: Get, answer: Result<Reply, LinkFault>) -> DeviceResult<String> {
         match answer {
             Ok(Reply::Value(value)) => Ok(value),
-            Ok(other) => Err(self.foreign("a question", &format!("{other:?} to {what:?}"))),
+            Ok(other) => Err(self.not_linuxcnc("a question", &format!("{other:?} to {what:?}"))),
             Err(fault) => Err(self.broken(fault, "its status")),
         }
     }
 
     /// Sends an order after the pending requests. An acknowledgement means that the order was received, not that it
     /// succeeded.
-    pub(super) async fn order(&mut self, set: Set, command: Command) -> Answered<()> {
-        let asked = self.link("an order")?.ask(Request::Set(set), self.settings.answer_within);
+    pub(super) async fn order(&mut self, set: Set, command: Command) -> DeviceResult<()> {
+        let asked = self.link("an order")?.ask(Request::Set(set), self.settings.answer_timeout);
         let answer = asked.answer().await;
-        self.heard(answer, command).await
+        self.check_acknowledged(answer, command).await
     }
 
-    async fn heard(&mut self, answer: Result<Reply, LinkFault>, command: Command) -> Answered<()> {
+    async fn check_acknowledged(&mut self, answer: Result<Reply, LinkFault>, command: Command) -> DeviceResult<()> {
         match answer {
             Ok(Reply::Acknowledged) => Ok(()),
             Ok(_) => Err(self.denied(command).await?),
@@ -207,20 +209,20 @@ impl Controller {
     }
 
     /// Returns the reason why an order was refused; without control every order is refused.
-    async fn denied(&mut self, command: Command) -> Answered<DeviceError> {
+    async fn denied(&mut self, command: Command) -> DeviceResult<DeviceError> {
         if self.get(Get::Enable).await? != "ON" {
-            return Ok(self.taken());
+            return Ok(self.control_taken());
         }
         let machine = self.machine();
         Ok(DeviceError::Refused { machine, command, answer: Answer::WrongState, state: State::Idle })
     }
 
     /// Takes control of the controller.
-    pub(super) async fn take(&mut self) -> Answered<()> {
+    pub(super) async fn take_control(&mut self) -> DeviceResult<()> {
         let enable = Set::Enable { password: self.settings.control_password.clone() };
-        let asked = self.link("control")?.ask(Request::Set(enable), self.settings.answer_within);
+        let asked = self.link("control")?.ask(Request::Set(enable), self.settings.answer_timeout);
         match asked.answer().await {
-            Ok(Reply::Acknowledged) => self.owned = true,
+            Ok(Reply::Acknowledged) => self.has_control = true,
             Ok(_) => return Err(DeviceError::Password { machine: self.machine(), key: "control_password" }),
             Err(fault) => return Err(self.broken(fault, "control")),
         }
@@ -228,31 +230,32 @@ impl Controller {
     }
 
     /// Aborts at once, whichever client has control: the two lines go out together without waiting.
-    pub(super) async fn abort(&mut self) -> Answered<()> {
+    pub(super) async fn abort(&mut self) -> DeviceResult<()> {
         let enable = Set::Enable { password: self.settings.control_password.clone() };
-        let within = self.settings.answer_within;
+        let within = self.settings.answer_timeout;
         let link = self.link("an abort")?;
         let (taken, aborted) = (link.ask(Request::Set(enable), within), link.ask(Request::Set(Set::Abort), within));
         if let Ok(Reply::Refused) = taken.answer().await {
             return Err(DeviceError::Password { machine: self.machine(), key: "control_password" });
         }
-        self.owned = true;
+        self.has_control = true;
         let answer = aborted.answer().await;
-        self.heard(answer, Command::Abort).await
+        self.check_acknowledged(answer, Command::Abort).await
     }
 
     /// Switches to a mode and waits until the controller reports that mode and an idle interpreter.
-    pub(super) async fn enter(&mut self, mode: Mode, command: Command) -> Answered<()> {
+    pub(super) async fn enter(&mut self, mode: Mode, command: Command) -> DeviceResult<()> {
         self.order(Set::Mode(mode), command).await?;
-        self.until("the mode", |seen| seen.mode == mode && seen.interpreter == Interpreter::Idle).await.map(drop)
+        self.wait_until("the mode", |seen| seen.mode == mode && seen.interpreter == Interpreter::Idle).await.map(drop)
     }
 
     /// Opens a program and checks that it is then the open one. A failed open is acknowledged too, and leaves the
     /// previous program open.
-    pub(super) async fn open(&mut self, path: &str, command: Command) -> Answered<()> {
+    pub(super) async fn open(&mut self, path: &str, command: Command) -> DeviceResult<()> {
         self.errors().await?;
         self.order(Set::Open(path.to_owned()), command).await?;
-        let opened = self.until("the program", |seen| seen.program.as_deref() == Some(path) && seen.line == 0).await;
+        let opened =
+            self.wait_until("the program", |seen| seen.program.as_deref() == Some(path) && seen.line == 0).await;
         if !self.is_connected() {
             return opened.map(drop);
         }
@@ -260,42 +263,46 @@ impl Controller {
         match opened {
             Ok(_) if errors.is_empty() => Ok(()),
             Err(error) if errors.is_empty() => Err(error),
-            _ => Err(DeviceError::Reports {
+            _ => Err(DeviceError::ControllerErrors {
                 machine: self.machine(),
-                what: "the program was opened",
+                occasion: "the program was opened",
                 errors: errors.join("; "),
             }),
         }
     }
 
     /// Reads the state until a condition holds.
-    pub(super) async fn until(&mut self, what: &'static str, holds: impl Fn(&Seen) -> bool) -> Answered<Seen> {
+    pub(super) async fn wait_until(
+        &mut self,
+        what: &'static str,
+        holds: impl Fn(&ControllerState) -> bool,
+    ) -> DeviceResult<ControllerState> {
         let began = Instant::now();
         loop {
-            let seen = self.look(false).await?;
-            if self.owned && !seen.ours {
-                return Err(self.taken());
+            let seen = self.read_state(false).await?;
+            if self.has_control && !seen.has_control {
+                return Err(self.control_taken());
             }
             if holds(&seen) {
                 return Ok(seen);
             }
-            if began.elapsed() > self.settings.settle_within {
+            if began.elapsed() > self.settings.settle_timeout {
                 return Err(DeviceError::TimedOut {
                     machine: self.machine(),
-                    what,
-                    limit: self.settings.settle_within,
+                    operation: what,
+                    limit: self.settings.settle_timeout,
                 });
             }
-            sleep(ASKED_EVERY).await;
+            sleep(POLL_INTERVAL).await;
         }
     }
 
     /// Releases control and closes the connection.
-    pub(super) async fn leave(&mut self) {
-        if self.owned && self.link.is_some() {
+    pub(super) async fn disconnect(&mut self) {
+        if self.has_control && self.link.is_some() {
             let _ = self.order(Set::Disable, Command::Release).await;
         }
-        (self.link, self.owned) = (None, false);
+        (self.link, self.has_control) = (None, false);
     }
 
     pub(super) fn is_connected(&self) -> bool {
@@ -306,36 +313,38 @@ impl Controller {
         Arc::clone(&self.name)
     }
 
-    pub(super) fn taken(&self) -> DeviceError {
+    pub(super) fn control_taken(&self) -> DeviceError {
         DeviceError::ControlTaken { machine: self.machine() }
     }
 
-    fn link(&self, what: &'static str) -> Answered<&Link> {
-        let never = || DeviceError::NotConnected { machine: self.machine(), what };
-        self.link.as_ref().ok_or_else(|| self.lost.clone().unwrap_or_else(never))
+    fn link(&self, what: &'static str) -> DeviceResult<&Link> {
+        let never = || DeviceError::NotConnected { machine: self.machine(), operation: what };
+        self.link.as_ref().ok_or_else(|| self.link_error.clone().unwrap_or_else(never))
     }
 
-    fn foreign(&self, asked: &'static str, told: &str) -> DeviceError {
-        DeviceError::NotLinuxcnc { machine: self.machine(), asked, told: told.chars().take(80).collect() }
+    fn not_linuxcnc(&self, asked: &'static str, told: &str) -> DeviceError {
+        DeviceError::NotLinuxcnc { machine: self.machine(), request: asked, reply: told.chars().take(80).collect() }
     }
 
     /// Returns the error of an unanswered request, and closes a connection that cannot be used any more.
     fn broken(&mut self, fault: LinkFault, what: &'static str) -> DeviceError {
         let error = self.fault(fault, what);
         if fault != LinkFault::Unsendable {
-            (self.link, self.owned, self.lost) = (None, false, Some(error.clone()));
+            (self.link, self.has_control, self.link_error) = (None, false, Some(error.clone()));
         }
         error
     }
 
     fn fault(&self, fault: LinkFault, what: &'static str) -> DeviceError {
-        let (machine, limit) = (self.machine(), self.settings.answer_within);
+        let (machine, limit) = (self.machine(), self.settings.answer_timeout);
         match fault {
-            LinkFault::Unreachable(why) => DeviceError::Unreachable { machine, why, limit },
-            LinkFault::TimedOut => DeviceError::TimedOut { machine, what, limit },
-            LinkFault::Disconnected => DeviceError::Disconnected { machine, what },
-            LinkFault::Nonsense => DeviceError::NotLinuxcnc { machine, asked: what, told: "lines without end".into() },
-            LinkFault::Unsendable => DeviceError::Unsendable { machine, what },
+            LinkFault::Unreachable(why) => DeviceError::Unreachable { machine, kind: why, limit },
+            LinkFault::TimedOut => DeviceError::TimedOut { machine, operation: what, limit },
+            LinkFault::Disconnected => DeviceError::Disconnected { machine, operation: what },
+            LinkFault::NotProtocol => {
+                DeviceError::NotLinuxcnc { machine, request: what, reply: "lines without end".into() }
+            }
+            LinkFault::Unsendable => DeviceError::Unsendable { machine, operation: what },
         }
     }
 }

@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 use regrind_formats::result::read_bytes;
 use regrind_formats::write_atomic;
 
-use super::program::{Order, PROGRAM, Program, RECORD, Record, name_begins};
+use super::program::{PROGRAM, Program, ProgramInputs, ProgramRecord, RECORD, name_begins};
 
 /// File name of the program that a run writes with every correction.
-const OF_THE_PASS: &str = "toolpath.ngc";
+const PASS_PROGRAM_FILE: &str = "toolpath.ngc";
 /// Maximum size of a record in bytes; a longer file is not a record.
-const LONGEST_RECORD: u64 = 1 << 16;
+const MAX_RECORD_BYTES: u64 = 1 << 16;
 
 /// Source and destination folders of programs.
 #[derive(Clone, Debug)]
@@ -20,11 +20,11 @@ pub(super) struct Folders {
     /// Folder of the run.
     pub(super) run: PathBuf,
     /// Folder of programs, as this computer sees it.
-    pub(super) here: PathBuf,
+    pub(super) local: PathBuf,
     /// Folder of programs, as the controller sees it.
-    pub(super) there: String,
+    pub(super) remote: String,
     /// True if work in the folders runs in turn with everything else, not on a thread of its own.
-    pub(super) in_turn: bool,
+    pub(super) single_threaded: bool,
 }
 
 impl Folders {
@@ -33,11 +33,12 @@ impl Folders {
     /// # Errors
     /// Returns a text if there is no program, or if the newest is not of this map or must not be run.
     pub(super) fn newest(&self, map: &[u8; 32], rounds: u32) -> Result<Program, String> {
-        let cycles = std::fs::read_dir(&self.run).map_err(|error| at(&self.run, &error))?;
-        let cycles = cycles.flatten().filter_map(|entry| Some((cycle(&entry.path())?, entry.path().join(OF_THE_PASS))));
+        let cycles = std::fs::read_dir(&self.run).map_err(|error| path_error(&self.run, &error))?;
+        let cycles =
+            cycles.flatten().filter_map(|entry| Some((cycle(&entry.path())?, entry.path().join(PASS_PROGRAM_FILE))));
         let newest = cycles.filter(|(_, file)| file.is_file()).max_by_key(|(cycle, _)| *cycle);
         let (cycle, file) = newest.ok_or_else(|| {
-            format!("{} holds no {OF_THE_PASS}: the journal says why none was written", self.run.display())
+            format!("{} holds no {PASS_PROGRAM_FILE}: the journal says why none was written", self.run.display())
         })?;
         self.framed(cycle, &file, map, rounds)
     }
@@ -45,13 +46,13 @@ impl Folders {
     fn framed(&self, cycle: u32, file: &Path, map: &[u8; 32], rounds: u32) -> Result<Program, String> {
         let pass = read_bytes(file).map_err(|error| error.to_string())?;
         let run = self.run.file_name().unwrap_or_default().to_string_lossy();
-        let order = Order { run: &run, cycle, pass: &pass, map, rounds, folder: &self.there };
+        let order = ProgramInputs { run: &run, cycle, pass: &pass, map, rounds, folder: &self.remote };
         Program::frame(order).map_err(|why| format!("{}: {why}", file.display()))
     }
 
     /// Writes a program into the folder that the controller sees, and reads it back.
     pub(super) fn put(&self, program: &Program) -> Result<(), String> {
-        let file = self.here.join(&program.name).with_extension(PROGRAM);
+        let file = self.local.join(&program.name).with_extension(PROGRAM);
         let lies_there = |file: &Path| std::fs::read(file).is_ok_and(|text| text == program.text);
         if lies_there(&file) {
             return Ok(());
@@ -64,16 +65,16 @@ impl Folders {
     }
 
     /// Returns the record that a program wrote; `None` if there is no such file.
-    pub(super) fn record(&self, name: &str) -> Result<Option<Record>, String> {
-        let file = self.here.join(name).with_extension(RECORD);
-        let read = std::fs::metadata(&file).and_then(|about| match about.len() <= LONGEST_RECORD {
+    pub(super) fn record(&self, name: &str) -> Result<Option<ProgramRecord>, String> {
+        let file = self.local.join(name).with_extension(RECORD);
+        let read = std::fs::metadata(&file).and_then(|about| match about.len() <= MAX_RECORD_BYTES {
             true => std::fs::read(&file),
             false => Err(io::ErrorKind::FileTooLarge.into()),
         });
         match read {
-            Ok(bytes) => Ok(Some(Record::read(&String::from_utf8_lossy(&bytes)))),
-            Err(error) if error.kind() == io::ErrorKind::NotFound && self.here.is_dir() => Ok(None),
-            Err(error) => Err(at(&file, &error)),
+            Ok(bytes) => Ok(Some(ProgramRecord::read(&String::from_utf8_lossy(&bytes)))),
+            Err(error) if error.kind() == io::ErrorKind::NotFound && self.local.is_dir() => Ok(None),
+            Err(error) => Err(path_error(&file, &error)),
         }
     }
 
@@ -81,13 +82,13 @@ impl Folders {
     pub(super) fn prepared(&self, cycle: u32, token: u32) -> Result<Option<Program>, String> {
         let run = self.run.file_name().unwrap_or_default().to_string_lossy();
         let begins = name_begins(&run, cycle);
-        for entry in std::fs::read_dir(&self.here).map_err(|error| at(&self.here, &error))?.flatten() {
+        for entry in std::fs::read_dir(&self.local).map_err(|error| path_error(&self.local, &error))?.flatten() {
             let file = entry.path();
             let name = file.file_stem().and_then(|name| name.to_str()).filter(|name| name.starts_with(&begins));
             let Some(name) = name.filter(|_| file.extension().is_some_and(|e| e == RECORD)) else { continue };
-            if self.record(name)?.is_some_and(|record| record.prepared == Some(token)) {
+            if self.record(name)?.is_some_and(|record| record.token == Some(token)) {
                 let file = file.with_extension(PROGRAM);
-                let text = std::fs::read(&file).map_err(|error| at(&file, &error))?;
+                let text = std::fs::read(&file).map_err(|error| path_error(&file, &error))?;
                 return Ok(Program::read(name, cycle, text));
             }
         }
@@ -100,6 +101,6 @@ fn cycle(folder: &Path) -> Option<u32> {
     folder.file_name()?.to_str()?.strip_prefix("cycle-")?.parse().ok()
 }
 
-fn at(path: &Path, error: &io::Error) -> String {
+fn path_error(path: &Path, error: &io::Error) -> String {
     format!("{}: {error}", path.display())
 }

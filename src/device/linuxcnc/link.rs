@@ -8,8 +8,8 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, sleep_until, timeout};
 
-use super::protocol::{Lines, Place, Reply, Request, Waiting};
-use crate::{Dial, Line, LineStream};
+use super::protocol::{LineMatch, LineSplitter, PendingRequests, Reply, Request};
+use crate::{Connector, LineAddress, LineStream};
 
 /// Reason why there is no answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -21,7 +21,7 @@ pub(super) enum LinkFault {
     /// The other end closed the connection, or it broke.
     Disconnected,
     /// The data received are not this protocol.
-    Nonsense,
+    NotProtocol,
     /// The request is not one plain line, and was not sent.
     Unsendable,
 }
@@ -29,22 +29,22 @@ pub(super) enum LinkFault {
 /// Connection. Dropping it closes it and discards requests not sent yet.
 #[derive(Debug)]
 pub(super) struct Link {
-    questions: mpsc::UnboundedSender<Question>,
+    requests: mpsc::UnboundedSender<QueuedRequest>,
 }
 
 #[derive(Debug)]
-struct Question {
+struct QueuedRequest {
     request: Request,
     line: String,
-    within: Duration,
+    timeout: Duration,
     reply: oneshot::Sender<Result<Reply, LinkFault>>,
 }
 
 /// Pending answer.
 #[derive(Debug)]
-pub(super) struct Asked(Result<oneshot::Receiver<Result<Reply, LinkFault>>, LinkFault>);
+pub(super) struct PendingReply(Result<oneshot::Receiver<Result<Reply, LinkFault>>, LinkFault>);
 
-impl Asked {
+impl PendingReply {
     /// Waits for the answer.
     pub(super) async fn answer(self) -> Result<Reply, LinkFault> {
         // The sender was dropped: the task has ended.
@@ -54,29 +54,33 @@ impl Asked {
 
 impl Link {
     /// Connects; sends nothing yet.
-    pub(super) async fn open(line: &Line, dial: &mut dyn Dial, within: Duration) -> Result<Self, LinkFault> {
-        let stream = match timeout(within, dial.dial(line)).await {
+    pub(super) async fn open(
+        line: &LineAddress,
+        dial: &mut dyn Connector,
+        within: Duration,
+    ) -> Result<Self, LinkFault> {
+        let stream = match timeout(within, dial.connect(line)).await {
             Ok(Ok(stream)) => stream,
             Ok(Err(error)) => return Err(LinkFault::Unreachable(error.kind())),
             Err(_) => return Err(LinkFault::Unreachable(io::ErrorKind::TimedOut)),
         };
         let (questions, asked) = mpsc::unbounded_channel();
-        tokio::spawn(Conversation::new(stream).run(asked));
-        Ok(Self { questions })
+        tokio::spawn(ConnectionTask::new(stream).run(asked));
+        Ok(Self { requests: questions })
     }
 
     /// Sends a request after the earlier ones, answered or not.
-    pub(super) fn ask(&self, request: Request, within: Duration) -> Asked {
-        let Some(line) = request.line() else { return Asked(Err(LinkFault::Unsendable)) };
+    pub(super) fn ask(&self, request: Request, within: Duration) -> PendingReply {
+        let Some(line) = request.line() else { return PendingReply(Err(LinkFault::Unsendable)) };
         let (reply, answer) = oneshot::channel();
-        match self.questions.send(Question { request, line, within, reply }) {
-            Ok(()) => Asked(Ok(answer)),
-            Err(_) => Asked(Err(LinkFault::Disconnected)),
+        match self.requests.send(QueuedRequest { request, line, timeout: within, reply }) {
+            Ok(()) => PendingReply(Ok(answer)),
+            Err(_) => PendingReply(Err(LinkFault::Disconnected)),
         }
     }
 
     /// Sends a request that has no answer.
-    pub(super) fn say(&self, request: Request) {
+    pub(super) fn send_unanswered(&self, request: Request) {
         drop(self.ask(request, Duration::ZERO));
     }
 }
@@ -84,32 +88,32 @@ impl Link {
 /// Receiver of a pending answer, and its deadline.
 type Waiter = (oneshot::Sender<Result<Reply, LinkFault>>, Instant);
 
-struct Conversation {
+struct ConnectionTask {
     stream: Box<dyn LineStream>,
-    lines: Lines,
-    waiting: Waiting<Waiter>,
+    lines: LineSplitter,
+    pending: PendingRequests<Waiter>,
 }
 
-impl Conversation {
+impl ConnectionTask {
     fn new(stream: Box<dyn LineStream>) -> Self {
-        Self { stream, lines: Lines::default(), waiting: Waiting::default() }
+        Self { stream, lines: LineSplitter::default(), pending: PendingRequests::default() }
     }
 
     /// Serves the connection until no sender of requests is left or the connection fails. Then reports the fault to all
     /// pending requests.
-    async fn run(mut self, mut asked: mpsc::UnboundedReceiver<Question>) {
-        let fault = self.converse(&mut asked).await;
+    async fn run(mut self, mut asked: mpsc::UnboundedReceiver<QueuedRequest>) {
+        let fault = self.serve_until_fault(&mut asked).await;
         asked.close();
         let left = std::iter::from_fn(|| asked.try_recv().ok()).map(|question| question.reply);
-        for reply in self.waiting.drain().map(|(reply, _)| reply).chain(left) {
+        for reply in self.pending.drain().map(|(reply, _)| reply).chain(left) {
             let _ = reply.send(Err(fault));
         }
     }
 
-    async fn converse(&mut self, asked: &mut mpsc::UnboundedReceiver<Question>) -> LinkFault {
+    async fn serve_until_fault(&mut self, asked: &mut mpsc::UnboundedReceiver<QueuedRequest>) -> LinkFault {
         let mut bytes = [0; 4096];
         loop {
-            let due = self.waiting.first().map(|(_, due)| *due);
+            let due = self.pending.first().map(|(_, due)| *due);
             let result = tokio::select! {
                 biased;
                 question = asked.recv() => match question {
@@ -117,7 +121,7 @@ impl Conversation {
                     None => Err(LinkFault::Disconnected),
                 },
                 read = self.stream.read(&mut bytes) => match read {
-                    Ok(count) if count > 0 => self.take(&bytes[..count]),
+                    Ok(count) if count > 0 => self.process_bytes(&bytes[..count]),
                     _ => Err(LinkFault::Disconnected),
                 },
                 () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => Err(LinkFault::TimedOut),
@@ -128,8 +132,8 @@ impl Conversation {
         }
     }
 
-    async fn send(&mut self, question: Question) -> Result<(), LinkFault> {
-        let Question { request, line, within, reply } = question;
+    async fn send(&mut self, question: QueuedRequest) -> Result<(), LinkFault> {
+        let QueuedRequest { request, line, timeout: within, reply } = question;
         let echo = request == Request::EchoOff;
         if reply.is_closed() && !echo {
             return Ok(()); // whoever asked has gone; what was never sent need not be
@@ -139,17 +143,17 @@ impl Conversation {
         let limit = within.max(Duration::from_secs(1));
         let written = timeout(limit, written).await.unwrap_or(Err(io::ErrorKind::TimedOut.into()));
         if !echo {
-            self.waiting.push(request, (reply, due));
+            self.pending.push(request, (reply, due));
         }
         written.map_err(|_| LinkFault::Disconnected)
     }
 
-    fn take(&mut self, bytes: &[u8]) -> Result<(), LinkFault> {
-        for line in self.lines.take(bytes).ok_or(LinkFault::Nonsense)? {
-            match self.waiting.place(&line) {
-                Place::Answer((reply, _), said) => drop(reply.send(Ok(said))),
-                Place::Aside => {}
-                Place::Nonsense => return Err(LinkFault::Nonsense),
+    fn process_bytes(&mut self, bytes: &[u8]) -> Result<(), LinkFault> {
+        for line in self.lines.push(bytes).ok_or(LinkFault::NotProtocol)? {
+            match self.pending.match_line(&line) {
+                LineMatch::Answer((reply, _), said) => drop(reply.send(Ok(said))),
+                LineMatch::Unmatched => {}
+                LineMatch::NotProtocol => return Err(LinkFault::NotProtocol),
             }
         }
         Ok(())

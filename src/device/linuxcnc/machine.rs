@@ -23,28 +23,28 @@ use tokio::time::{Instant, timeout};
 
 use super::controller::{Controller, Interpreter};
 use super::folder::Folders;
-use super::program::{PROGRAM, Program, Record, path};
+use super::program::{PROGRAM, Program, ProgramRecord, path};
 use super::protocol::{Mode, Set};
 use super::settings::LinuxcncSettings;
-use super::work::{Stage, Work};
-use crate::Dial;
-use crate::error::{Answered, DeviceError};
+use super::work::{ActiveJob, Stage};
+use crate::Connector;
+use crate::error::{DeviceError, DeviceResult};
 use crate::machine::{Grinder, Interrupt, Machine};
-use crate::modbus::OfThisComputer;
+use crate::modbus::SystemConnector;
 use crate::payload::{CorrectionMap, Identified, Pass, PassRecord};
 use crate::words::{
-    Answer, Armed, Command, Fault, Identity, Job, MachineKind, Outcome, Reconciled, Started, State, Status, Word,
-    digest,
+    Answer, Armed, Command, Fault, Identity, Job, MachineKind, OperatorConfirmation, Outcome, Reconciled, Started,
+    State, Status, digest,
 };
 use looking::standing_fault;
 use reconciling::unknown;
 
 /// Interval between two status queries while waiting for a start or a record.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Minimum time over which a start must be seen not to have happened.
-const SEEN_TWICE_OVER: Duration = Duration::from_millis(1050);
+const NOT_STARTED_CONFIRMATION: Duration = Duration::from_millis(1050);
 /// Timeout of work in a folder, which can be on another computer.
-const FOLDER_WITHIN: Duration = Duration::from_secs(30);
+const FOLDER_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// Grinder controlled through linuxcncrsh.
 #[derive(Debug)]
@@ -53,10 +53,10 @@ pub struct LinuxcncGrinder {
     settings: LinuxcncSettings,
     folders: Folders,
     /// True if another client has taken control. Only an abort takes control back.
-    taken: bool,
+    control_lost: bool,
     /// Loaded program, and the digest of its payload.
     loaded: Option<(Arc<Program>, u32)>,
-    work: Option<Work>,
+    job: Option<ActiveJob>,
     /// True if aborted when no job had begun: CLEAR is needed all the same.
     aborted: bool,
     /// Time since which the controller has been seen idle.
@@ -67,50 +67,50 @@ pub struct LinuxcncGrinder {
     /// Position, clear of the part, at which a finished program left the machine.
     clear_at: Option<String>,
     /// Line and position seen last, and since when.
-    moved: Option<(u32, String, Instant)>,
+    last_motion: Option<(u32, String, Instant)>,
     /// State at the last status query.
-    last: Option<State>,
+    last_state: Option<State>,
     notes: Vec<String>,
     /// Random generator of the preparation tokens.
-    chance: StdRng,
+    rng: StdRng,
 }
 
 impl LinuxcncGrinder {
     /// Creates a grinder; sends nothing to it yet.
     pub fn new(settings: LinuxcncSettings) -> Self {
-        Self::by(settings, Box::new(OfThisComputer), (false, random()))
+        Self::build(settings, Box::new(SystemConnector), (false, random()))
     }
 
     /// Creates a grinder that opens its connections with `dial`, uses no other thread, and draws its random numbers
     /// from `seed`: for controllers in the same process, and for simulated time.
-    pub fn over(settings: LinuxcncSettings, dial: Box<dyn Dial>, seed: u64) -> Self {
-        Self::by(settings, dial, (true, seed))
+    pub fn with_connector(settings: LinuxcncSettings, dial: Box<dyn Connector>, seed: u64) -> Self {
+        Self::build(settings, dial, (true, seed))
     }
 
-    fn by(settings: LinuxcncSettings, dial: Box<dyn Dial>, (in_turn, seed): (bool, u64)) -> Self {
+    fn build(settings: LinuxcncSettings, dial: Box<dyn Connector>, (in_turn, seed): (bool, u64)) -> Self {
         let folders = Folders {
             run: settings.run_folder.clone(),
-            here: settings.programs.clone(),
-            there: settings.programs_at_controller.clone(),
-            in_turn,
+            local: settings.programs.clone(),
+            remote: settings.programs_at_controller.clone(),
+            single_threaded: in_turn,
         };
         Self {
             controller: Controller::new(settings.clone(), dial),
             settings,
             folders,
-            taken: false,
+            control_lost: false,
             loaded: None,
-            work: None,
+            job: None,
             aborted: false,
             idle_since: None,
             began: None,
             duration_s: None,
             fault: Fault::None,
             clear_at: None,
-            moved: None,
-            last: None,
+            last_motion: None,
+            last_state: None,
             notes: Vec::new(),
-            chance: StdRng::seed_from_u64(seed),
+            rng: StdRng::seed_from_u64(seed),
         }
     }
 }
@@ -124,202 +124,216 @@ impl Machine for LinuxcncGrinder {
         self.notes.clone()
     }
 
-    async fn connect(&mut self) -> Answered<Identity> {
-        let name = self.controller.meet().await?;
-        self.find_what_was_restored().await;
+    async fn connect(&mut self) -> DeviceResult<Identity> {
+        let name = self.controller.connect().await?;
+        self.find_restored_program().await;
         // The controller has no boot number, and does not know if a real machine is connected.
         let simulation = self.settings.simulated;
         Ok(Identity { kind: MachineKind::Grinder, name, boot_id: 0, simulation, silence_limit_s: None })
     }
 
-    async fn status(&mut self) -> Answered<Status> {
-        Ok(self.look().await?.1)
+    async fn status(&mut self) -> DeviceResult<Status> {
+        Ok(self.read_status().await?.1)
     }
 
     fn restore(&mut self, intended: &Armed) {
         let Armed { job, start_sequence, token, .. } = *intended;
-        let (program, path, stage, wanted) = (None, String::new(), Stage::Begun, None);
+        let (program, path, stage, requested_outcome) = (None, String::new(), Stage::Begun, None);
         let (errors, round) = (Vec::new(), (0, 0));
-        self.work = Some(Work { job, sequence: start_sequence, token, program, path, stage, wanted, errors, round });
+        self.job = Some(ActiveJob {
+            job,
+            sequence: start_sequence,
+            token,
+            program,
+            path,
+            stage,
+            requested_outcome,
+            errors,
+            round,
+        });
     }
 
-    async fn claim(&mut self) -> Answered<Status> {
-        self.claim_again().await?;
+    async fn claim(&mut self) -> DeviceResult<Status> {
+        self.take_control().await?;
         self.status().await
     }
 
-    async fn prepare(&mut self, job: Job) -> Answered<Armed> {
+    async fn prepare(&mut self, job: Job) -> DeviceResult<Armed> {
         let Some((program, loaded)) = self.loaded.clone() else {
             return Err(self.refused(Command::Prepare, Answer::PayloadMissing));
         };
-        if loaded != job.digest || program.cycle + 1 != job.number().cycle {
+        if loaded != job.digest || program.cycle + 1 != job.batch_id().cycle {
             return Err(self.refused(Command::Prepare, Answer::OtherJob));
         }
         if self.aborted || !matches!(self.stage(), None | Some(Stage::Prepared)) {
             return Err(self.refused(Command::Prepare, Answer::WrongState));
         }
-        self.work = None;
-        self.prepared(job, program).await
+        self.job = None;
+        self.prepare_program(job, program).await
     }
 
-    async fn start(&mut self, armed: Armed) -> Answered<Started> {
-        let (seen, status) = self.look().await?;
-        let is_prepared = self.work_of(&armed).is_some_and(|work| work.stage == Stage::Prepared);
+    async fn start(&mut self, armed: Armed) -> DeviceResult<Started> {
+        let (seen, status) = self.read_status().await?;
+        let is_prepared = self.job_for(&armed).is_some_and(|work| work.stage == Stage::Prepared);
         if !is_prepared || status.state != State::Prepared || seen.mode != Mode::Auto {
             return Err(self.refused(Command::Start, Answer::DeadToken));
         }
         let Armed { job, start_sequence, .. } = armed;
         // From here on the job may have begun, even if this call fails.
-        if let Some(work) = self.work_of(&armed) {
+        if let Some(work) = self.job_for(&armed) {
             work.stage = Stage::Begun;
         }
         (self.began, self.idle_since) = (Some(Instant::now()), None);
-        match self.run().await {
+        match self.send_start().await {
             Ok(status) => Ok(Started { job, start_sequence, status }),
             Err(refused @ DeviceError::Refused { .. }) => {
-                self.work = None;
+                self.job = None;
                 Err(refused)
             }
             Err(why) => {
                 let (machine, why) = (self.machine(), Box::new(why));
-                Err(DeviceError::StartUnknown { machine, job, sequence: start_sequence, why })
+                Err(DeviceError::StartUnknown { machine, job, sequence: start_sequence, cause: why })
             }
         }
     }
 
-    async fn hold(&mut self) -> Answered<Status> {
+    async fn hold(&mut self) -> DeviceResult<Status> {
         // An idle controller would be paused without a program. If the program was seen running, the order is sent at
         // once.
-        if self.last != Some(State::Execute) {
-            self.look().await?;
+        if self.last_state != Some(State::Execute) {
+            self.read_status().await?;
         }
-        if self.last != Some(State::Execute) || self.stage() != Some(Stage::Begun) {
+        if self.last_state != Some(State::Execute) || self.stage() != Some(Stage::Begun) {
             return Err(self.refused(Command::Hold, Answer::WrongState));
         }
         let status = self.order(Set::Pause, Command::Hold).await?;
-        self.free_if_over(status).await
+        self.abort_if_ended(status).await
     }
 
-    async fn resume(&mut self) -> Answered<Status> {
-        self.look().await?;
-        if self.last != Some(State::Held) || self.stage() != Some(Stage::Begun) {
+    async fn resume(&mut self) -> DeviceResult<Status> {
+        self.read_status().await?;
+        if self.last_state != Some(State::Held) || self.stage() != Some(Stage::Begun) {
             return Err(self.refused(Command::Resume, Answer::WrongState));
         }
         self.order(Set::Resume, Command::Resume).await
     }
 
-    async fn stop(&mut self) -> Answered<Status> {
+    async fn stop(&mut self) -> DeviceResult<Status> {
         match self.stage() {
             Some(Stage::Prepared) => {
-                self.work = None;
+                self.job = None;
                 self.status().await
             }
             Some(Stage::Begun) => {
-                self.want(Outcome::Stopped);
+                self.set_requested_outcome(Outcome::Stopped);
                 self.order(Set::Abort, Command::Stop).await
             }
             _ => {
-                self.look().await?;
+                self.read_status().await?;
                 Err(self.refused(Command::Stop, Answer::WrongState))
             }
         }
     }
 
-    async fn abort(&mut self) -> Answered<Status> {
-        self.want(Outcome::Aborted);
+    async fn abort(&mut self) -> DeviceResult<Status> {
+        self.set_requested_outcome(Outcome::Aborted);
         if !self.controller.is_connected() {
-            self.controller.meet().await?;
+            self.controller.connect().await?;
         }
         let aborted = match self.controller.abort().await {
             // The connection was lost without notice.
             Err(DeviceError::Disconnected { .. }) => {
-                self.controller.meet().await?;
+                self.controller.connect().await?;
                 self.controller.abort().await
             }
             answer => answer,
         };
         match aborted {
             // A machine that is switched off accepts no order. If nothing runs, there is nothing to abort.
-            Err(refused @ DeviceError::Refused { .. }) => match self.controller.look(false).await?.interpreter {
+            Err(refused @ DeviceError::Refused { .. }) => match self.controller.read_state(false).await?.interpreter {
                 Interpreter::Idle => {}
                 _ => return Err(refused),
             },
             answer => answer?,
         }
-        self.taken = false;
-        match self.work.as_mut().map(|work| &mut work.stage) {
+        self.control_lost = false;
+        match self.job.as_mut().map(|work| &mut work.stage) {
             Some(Stage::Begun) => {}
             Some(Stage::Ended(state, _)) => *state = State::Aborted,
-            Some(Stage::Prepared) | None => (self.work, self.aborted) = (None, true),
+            Some(Stage::Prepared) | None => (self.job, self.aborted) = (None, true),
         }
         self.status().await
     }
 
-    async fn clear(&mut self) -> Answered<Status> {
-        let (seen, status) = self.look().await?;
+    async fn clear(&mut self) -> DeviceResult<Status> {
+        let (seen, status) = self.read_status().await?;
         if !matches!(status.state, State::Aborted | State::Faulted) {
             return Err(self.refused(Command::Clear, Answer::WrongState));
         }
         if let Some(fault) = standing_fault(&seen) {
             return Err(DeviceError::Faulted { machine: self.machine(), state: status.state, fault });
         }
-        (self.work, self.aborted, self.fault) = (None, false, Fault::None);
+        (self.job, self.aborted, self.fault) = (None, false, Fault::None);
         self.notes.clear();
         self.status().await
     }
 
-    async fn acknowledge(&mut self, done: u32) -> Answered<Status> {
-        match &self.work {
-            Some(Work { stage: Stage::Ended(State::Complete, _), sequence, .. }) if *sequence == done => {}
-            Some(Work { stage: Stage::Ended(State::Complete, _), .. }) => {
+    async fn acknowledge(&mut self, done: u32) -> DeviceResult<Status> {
+        match &self.job {
+            Some(ActiveJob { stage: Stage::Ended(State::Complete, _), sequence, .. }) if *sequence == done => {}
+            Some(ActiveJob { stage: Stage::Ended(State::Complete, _), .. }) => {
                 return Err(self.refused(Command::Acknowledge, Answer::OtherResult));
             }
             _ => return Err(self.refused(Command::Acknowledge, Answer::WrongState)),
         }
-        self.work = None;
+        self.job = None;
         self.status().await
     }
 
-    async fn release(&mut self) -> Answered<Status> {
+    async fn release(&mut self) -> DeviceResult<Status> {
         let status = self.status().await?;
-        self.controller.leave().await;
+        self.controller.disconnect().await;
         Ok(status)
     }
 
-    async fn reconcile(&mut self, intended: &Armed) -> Answered<Reconciled> {
-        match self.work_of(intended) {
-            Some(work) if work.program.is_none() => self.find_again(intended).await?,
+    async fn reconcile(&mut self, intended: &Armed) -> DeviceResult<Reconciled> {
+        match self.job_for(intended) {
+            Some(work) if work.program.is_none() => self.find_prepared_program(intended).await?,
             Some(work) => work.stage = if work.stage == Stage::Prepared { Stage::Begun } else { work.stage },
             None => {
                 self.restore(intended);
-                self.find_again(intended).await?;
+                self.find_prepared_program(intended).await?;
             }
         }
-        if self.work.as_ref().is_none_or(|work| work.program.is_none()) {
+        if self.job.as_ref().is_none_or(|work| work.program.is_none()) {
             return Ok(unknown("the record of its preparation is not in the folder of programs"));
         }
-        match self.what_became().await? {
+        match self.start_outcome().await? {
             Some(verdict) => Ok(verdict),
-            None => self.was_not_begun().await,
+            None => self.confirm_not_started().await,
         }
     }
 
-    async fn confirm(&mut self, word: Word) -> Answered<Vec<String>> {
-        if !self.is_untold().await? {
-            return Err(DeviceError::TellsItself { machine: self.machine() });
+    async fn confirm(&mut self, word: OperatorConfirmation) -> DeviceResult<Vec<String>> {
+        if !self.is_unresolved().await? {
+            return Err(DeviceError::ConfirmationNotNeeded { machine: self.machine() });
         }
-        let not_taken = |why: &str| DeviceError::NotTaken { machine: self.machine(), why: why.to_owned() };
-        let program = self.work.as_ref().and_then(|work| work.program.clone());
+        let not_taken = |why: &str| DeviceError::NotAccepted { machine: self.machine(), reason: why.to_owned() };
+        let program = self.job.as_ref().and_then(|work| work.program.clone());
         let ended = match word {
-            Word::Started { .. } => return Err(not_taken("it stands; confirm done, or still")),
-            Word::Done { file: Some(_), .. } => return Err(not_taken("a pass leaves no file: leave --file out")),
-            Word::Done { map_identity: Some(map), .. } if program.is_none_or(|program| program.map != map) => {
+            OperatorConfirmation::Started { .. } => return Err(not_taken("it stands; confirm done, or still")),
+            OperatorConfirmation::Done { file: Some(_), .. } => {
+                return Err(not_taken("a pass leaves no file: leave --file out"));
+            }
+            OperatorConfirmation::Done { map_identity: Some(map), .. }
+                if program.is_none_or(|program| program.map != map) =>
+            {
                 return Err(not_taken("that is another map than the one of its program"));
             }
-            Word::Done { .. } => Stage::Ended(State::Complete, Outcome::Complete),
-            Word::Still => Stage::Ended(State::Complete, Outcome::Stopped),
+            OperatorConfirmation::Done { .. } => Stage::Ended(State::Complete, Outcome::Complete),
+            OperatorConfirmation::Still => Stage::Ended(State::Complete, Outcome::Stopped),
         };
-        if let Some(work) = &mut self.work {
+        if let Some(work) = &mut self.job {
             work.stage = ended;
         }
         Ok(Vec::new())
@@ -327,19 +341,19 @@ impl Machine for LinuxcncGrinder {
 }
 
 impl Grinder for LinuxcncGrinder {
-    async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, interrupt: &Interrupt) -> Answered<()> {
+    async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, interrupt: &Interrupt) -> DeviceResult<()> {
         self.loaded = None;
         let (identity, rounds) = (map.identity(), u32::from(pass.spark_out_passes) + 1);
         let program = self.in_folders(move |folders| folders.newest(&identity, rounds)).await?;
         let break_off = |done| match interrupt.is_raised() {
-            true => Err(DeviceError::Interrupted { machine: self.machine(), what: "program", done, of: 2 }),
+            true => Err(DeviceError::Interrupted { machine: self.machine(), payload: "program", done, total: 2 }),
             false => Ok(()),
         };
         break_off(0)?;
         let put = program.clone();
         self.in_folders(move |folders| folders.put(&put)).await?;
         break_off(1)?;
-        let (seen, _) = self.look().await?;
+        let (seen, _) = self.read_status().await?;
         self.check_ready(&seen)?;
         let path = self.path(&program);
         self.controller.open(&path, Command::Prepare).await?;
@@ -347,9 +361,10 @@ impl Grinder for LinuxcncGrinder {
         Ok(())
     }
 
-    async fn collect(&mut self, job: Job, _: &Interrupt) -> Answered<PassRecord> {
-        let no_result = DeviceError::NoResult { machine: self.machine(), job, state: self.last.unwrap_or(State::Idle) };
-        let work = self.work.as_ref().filter(|work| work.job == job).ok_or_else(|| no_result.clone())?;
+    async fn collect(&mut self, job: Job, _: &Interrupt) -> DeviceResult<PassRecord> {
+        let no_result =
+            DeviceError::NoResult { machine: self.machine(), job, state: self.last_state.unwrap_or(State::Idle) };
+        let work = self.job.as_ref().filter(|work| work.job == job).ok_or_else(|| no_result.clone())?;
         let (Stage::Ended(_, outcome), Some(program)) = (work.stage, &work.program) else { return Err(no_result) };
         Ok(PassRecord {
             duration_s: self.duration_s,
@@ -364,51 +379,51 @@ impl LinuxcncGrinder {
     }
 
     fn refused(&self, command: Command, answer: Answer) -> DeviceError {
-        let state = self.last.unwrap_or(State::Idle);
+        let state = self.last_state.unwrap_or(State::Idle);
         DeviceError::Refused { machine: self.machine(), command, answer, state }
     }
 
     fn stage(&self) -> Option<Stage> {
-        self.work.as_ref().map(|work| work.stage)
+        self.job.as_ref().map(|work| work.stage)
     }
 
-    fn work_of(&mut self, armed: &Armed) -> Option<&mut Work> {
-        self.work.as_mut().filter(|work| (work.job, work.token) == (armed.job, armed.token))
+    fn job_for(&mut self, armed: &Armed) -> Option<&mut ActiveJob> {
+        self.job.as_mut().filter(|work| (work.job, work.token) == (armed.job, armed.token))
     }
 
     /// Stores the requested outcome of the job, if one was begun.
-    fn want(&mut self, outcome: Outcome) {
-        if let Some(work) = self.work.as_mut().filter(|work| work.stage == Stage::Begun) {
-            work.wanted = Some(outcome);
+    fn set_requested_outcome(&mut self, outcome: Outcome) {
+        if let Some(work) = self.job.as_mut().filter(|work| work.stage == Stage::Begun) {
+            work.requested_outcome = Some(outcome);
         }
     }
 
-    async fn claim_again(&mut self) -> Answered<()> {
-        if self.taken {
-            return Err(self.controller.taken());
+    async fn take_control(&mut self) -> DeviceResult<()> {
+        if self.control_lost {
+            return Err(self.controller.control_taken());
         }
-        self.controller.take().await
+        self.controller.take_control().await
     }
 
     /// Sends an order to a running or held job.
-    async fn order(&mut self, set: Set, command: Command) -> Answered<Status> {
+    async fn order(&mut self, set: Set, command: Command) -> DeviceResult<Status> {
         match self.controller.order(set, command).await {
             Ok(()) => {}
             Err(DeviceError::Refused { answer, .. }) => {
-                let _ = self.look().await?;
+                let _ = self.read_status().await?;
                 return Err(self.refused(command, answer));
             }
             Err(error) => {
-                self.taken |= matches!(error, DeviceError::ControlTaken { .. });
+                self.control_lost |= matches!(error, DeviceError::ControlTaken { .. });
                 return Err(error);
             }
         }
-        Ok(self.look().await?.1)
+        Ok(self.read_status().await?.1)
     }
 
     /// Ends a pause that came just after the end of the program, so that the controller is free.
-    async fn free_if_over(&mut self, status: Status) -> Answered<Status> {
-        if !matches!(self.work.as_ref().map(|work| work.stage), Some(Stage::Ended(..))) {
+    async fn abort_if_ended(&mut self, status: Status) -> DeviceResult<Status> {
+        if !matches!(self.job.as_ref().map(|work| work.stage), Some(Stage::Ended(..))) {
             return Ok(status);
         }
         self.order(Set::Abort, Command::Hold).await
@@ -418,26 +433,26 @@ impl LinuxcncGrinder {
     async fn in_folders<T: Send + 'static>(
         &self,
         work: impl FnOnce(&Folders) -> Result<T, String> + Send + 'static,
-    ) -> Answered<T> {
+    ) -> DeviceResult<T> {
         let folders = self.folders.clone();
-        let done = match self.folders.in_turn {
+        let done = match self.folders.single_threaded {
             true => Ok(Ok(work(&folders))),
-            false => timeout(FOLDER_WITHIN, tokio::task::spawn_blocking(move || work(&folders))).await,
+            false => timeout(FOLDER_TIMEOUT, tokio::task::spawn_blocking(move || work(&folders))).await,
         };
         let done = match done {
             Ok(done) => done.unwrap_or_else(|error| Err(error.to_string())),
-            Err(_) => Err(format!("{} did not answer within 30 s", self.folders.here.display())),
+            Err(_) => Err(format!("{} did not answer within 30 s", self.folders.local.display())),
         };
-        done.map_err(|why| DeviceError::Folder { machine: self.machine(), why })
+        done.map_err(|why| DeviceError::Folder { machine: self.machine(), reason: why })
     }
 
     /// Returns the record that the program of a job wrote, if its token is that of this preparation.
-    async fn record(&self, work: &Work) -> Answered<Option<Record>> {
+    async fn record(&self, work: &ActiveJob) -> DeviceResult<Option<ProgramRecord>> {
         let Some(name) = work.program.as_ref().map(|program| program.name.clone()) else { return Ok(None) };
-        Ok(work.owns(self.in_folders(move |folders| folders.record(&name)).await?))
+        Ok(work.own_record(self.in_folders(move |folders| folders.record(&name)).await?))
     }
 
     fn path(&self, program: &Program) -> String {
-        path(&self.folders.there, &program.name, PROGRAM)
+        path(&self.folders.remote, &program.name, PROGRAM)
     }
 }

@@ -22,6 +22,6 @@ mod settings;
 mod work;
 
 pub use machine::LinuxcncGrinder;
-pub use program::{Order, Program, Record};
-pub use protocol::{Get, Lines, Mode, Place, Reply, Request, Set, Waiting};
+pub use program::{Program, ProgramInputs, ProgramRecord};
+pub use protocol::{Get, LineMatch, LineSplitter, Mode, PendingRequests, Reply, Request, Set};
 pub use settings::{LinuxcncSettings, LinuxcncWire};

@@ -11,9 +11,9 @@ use sha2::{Digest, Sha256};
 use crate::hex;
 
 /// Maximum length of a path; LinuxCNC reads lines of 255 characters.
-const LONGEST_PATH: usize = 220;
+const MAX_PATH_LENGTH: usize = 220;
 /// Maximum length of the run's part of a name.
-const LONGEST_RUN: usize = 60;
+const MAX_RUN_LENGTH: usize = 60;
 
 /// Program in its frame.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -34,7 +34,7 @@ pub struct Program {
 
 /// Inputs of a program.
 #[derive(Clone, Copy, Debug)]
-pub struct Order<'a> {
+pub struct ProgramInputs<'a> {
     /// Name of the run, as in file names.
     pub run: &'a str,
     /// Cycle whose correction it is.
@@ -54,15 +54,15 @@ impl Program {
     ///
     /// # Errors
     /// Returns the reason, as text, why the program must not be run.
-    pub fn frame(order: Order<'_>) -> Result<Self, String> {
+    pub fn frame(order: ProgramInputs<'_>) -> Result<Self, String> {
         let body = body(order.pass, order.map)?;
         let mut content = Sha256::new();
         content.update(order.pass);
         content.update(order.rounds.to_be_bytes());
         let name = name_begins(order.run, order.cycle) + &hex(&content.finalize()[..8]);
         let record = path(order.folder, &name, RECORD);
-        if record.len() > LONGEST_PATH {
-            return Err(format!("its path at the controller is longer than {LONGEST_PATH} characters: {record}"));
+        if record.len() > MAX_PATH_LENGTH {
+            return Err(format!("its path at the controller is longer than {MAX_PATH_LENGTH} characters: {record}"));
         }
         let says = |word: &str| format!("(LOGAPPEND,{record})\n(LOG,{word})\n(LOGCLOSE)\n");
         let (repeat, again) = match order.rounds {
@@ -83,7 +83,7 @@ impl Program {
     pub(super) fn read(name: &str, cycle: u32, text: Vec<u8>) -> Option<Self> {
         let whole = std::str::from_utf8(&text).ok()?;
         let repeat = whole.lines().nth(4).and_then(|line| line.strip_prefix(REPEAT)?.strip_suffix(']')?.parse().ok());
-        let map = whole.lines().find_map(|line| line.strip_prefix(OF_MAP)?.strip_suffix(')'))?;
+        let map = whole.lines().find_map(|line| line.strip_prefix(MAP_COMMENT)?.strip_suffix(')'))?;
         let digits = |k: usize| u8::from_str_radix(map.get(2 * k..2 * k + 2)?, 16).ok();
         let mut identity = [0; 32];
         for (k, byte) in identity.iter_mut().enumerate() {
@@ -106,7 +106,7 @@ impl Program {
 
 /// Returns the beginning of the name of every program of a cycle.
 pub(super) fn name_begins(run: &str, cycle: u32) -> String {
-    let run: String = run.chars().map(plain).take(LONGEST_RUN).collect();
+    let run: String = run.chars().map(plain).take(MAX_RUN_LENGTH).collect();
     format!("{run}-c{cycle}-")
 }
 
@@ -117,7 +117,7 @@ const PREPARED: &str = "prepared";
 const BEGIN: &str = "begin";
 const END: &str = "end";
 const REPEAT: &str = "o<regrind> repeat [";
-const OF_MAP: &str = "(map: sha256 ";
+const MAP_COMMENT: &str = "(map: sha256 ";
 
 /// Returns the path of a file in the folder at the controller, which is always a Unix system.
 pub(super) fn path(folder: &str, name: &str, extension: &str) -> String {
@@ -140,7 +140,7 @@ fn plain(c: char) -> char {
 /// word.
 fn body<'a>(pass: &'a [u8], map: &[u8; 32]) -> Result<&'a str, String> {
     let text = std::str::from_utf8(pass).ok().filter(|text| text.is_ascii()).ok_or("it is not plain text")?;
-    let of_map = format!("{OF_MAP}{})", hex(map));
+    let of_map = format!("{MAP_COMMENT}{})", hex(map));
     if !text.lines().any(|line| line.trim() == of_map) {
         return Err(format!("it is not the program of the map {}", hex(&map[..4])));
     }
@@ -187,23 +187,23 @@ fn check_mode(code: &[Vec<&str>]) -> Result<(), String> {
 
 /// Record that a program wrote.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Record {
+pub struct ProgramRecord {
     /// Token of the preparation that opened the record.
-    pub prepared: Option<u32>,
+    pub token: Option<u32>,
     /// Number of times that the program began.
     pub begun: u32,
     /// Number of times that its last motion ended.
     pub ended: u32,
 }
 
-impl Record {
+impl ProgramRecord {
     /// Parses a record; an incomplete last line is ignored.
     pub fn read(text: &str) -> Self {
         let mut record = Self::default();
         let whole = text.rfind('\n').map_or("", |end| &text[..end]);
         for line in whole.lines().map(str::trim) {
             match line.split_once(' ') {
-                Some((PREPARED, token)) => record.prepared = u32::from_str_radix(token, 16).ok(),
+                Some((PREPARED, token)) => record.token = u32::from_str_radix(token, 16).ok(),
                 None if line == BEGIN => record.begun += 1,
                 None if line == END => record.ended += 1,
                 _ => {}
@@ -224,7 +224,8 @@ mod tests {
     }
 
     fn frame(pass: &str, rounds: u32) -> Result<Program, String> {
-        let order = Order { run: "A part/1", cycle: 2, pass: pass.as_bytes(), map: &MAP, rounds, folder: "/srv/nc/" };
+        let order =
+            ProgramInputs { run: "A part/1", cycle: 2, pass: pass.as_bytes(), map: &MAP, rounds, folder: "/srv/nc/" };
         Program::frame(order)
     }
 
@@ -288,11 +289,11 @@ mod tests {
 
     #[test]
     fn what_is_not_whole_in_a_record_is_not_there() {
-        let read = Record::read;
-        assert_eq!(read(""), Record::default());
-        assert_eq!(read("prepared 0000002a\nbegin"), Record { prepared: Some(42), begun: 0, ended: 0 });
-        assert_eq!(read("prepared 0000002a\nbegin\nen"), Record { prepared: Some(42), begun: 1, ended: 0 });
-        assert_eq!(read("prepared 0000002a\r\nbegin\nend\n"), Record { prepared: Some(42), begun: 1, ended: 1 });
-        assert_eq!(read("prepared x\nbeginning\nthe end\n"), Record::default());
+        let read = ProgramRecord::read;
+        assert_eq!(read(""), ProgramRecord::default());
+        assert_eq!(read("prepared 0000002a\nbegin"), ProgramRecord { token: Some(42), begun: 0, ended: 0 });
+        assert_eq!(read("prepared 0000002a\nbegin\nen"), ProgramRecord { token: Some(42), begun: 1, ended: 0 });
+        assert_eq!(read("prepared 0000002a\r\nbegin\nend\n"), ProgramRecord { token: Some(42), begun: 1, ended: 1 });
+        assert_eq!(read("prepared x\nbeginning\nthe end\n"), ProgramRecord::default());
     }
 }

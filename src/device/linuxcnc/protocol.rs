@@ -8,9 +8,9 @@ use std::collections::VecDeque;
 use std::fmt;
 
 /// Maximum length of a line, in both directions.
-const LONGEST_LINE: usize = 4096;
+const MAX_LINE_LENGTH: usize = 4096;
 /// Maximum number of successive lines that answer nothing; more are not this protocol.
-const MOST_ASIDE: u32 = 100;
+const MAX_UNMATCHED: u32 = 100;
 
 /// Query that needs no control and changes nothing, except that each error is reported once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -66,7 +66,7 @@ impl Mode {
     }
 
     /// Returns the mode of this name, in upper or lower case.
-    pub fn of(word: &str) -> Option<Self> {
+    pub fn from_name(word: &str) -> Option<Self> {
         [Self::Manual, Self::Auto, Self::Mdi].into_iter().find(|mode| mode.word().eq_ignore_ascii_case(word))
     }
 }
@@ -151,7 +151,7 @@ impl Request {
             }
         };
         let plain = line.chars().all(|c| c == ' ' || c.is_ascii_graphic());
-        (plain && line.len() < LONGEST_LINE).then(|| line + "\r\n")
+        (plain && line.len() < MAX_LINE_LENGTH).then(|| line + "\r\n")
     }
 
     /// Returns the reply if a line answers this request.
@@ -202,17 +202,17 @@ fn refused(rest: &str, word: &str) -> Option<Reply> {
 /// Splitter of a byte stream into lines. An incomplete line waits for its rest. CR or LF ends a line; empty lines are
 /// ignored.
 #[derive(Debug, Default)]
-pub struct Lines {
+pub struct LineSplitter {
     bytes: Vec<u8>,
 }
 
-impl Lines {
+impl LineSplitter {
     /// Adds bytes and returns the lines completed by them; `None` if the data are not a line of this protocol.
-    pub fn take(&mut self, bytes: &[u8]) -> Option<Vec<String>> {
+    pub fn push(&mut self, bytes: &[u8]) -> Option<Vec<String>> {
         self.bytes.extend_from_slice(bytes);
         let mut lines = Vec::new();
         while let Some(end) = self.bytes.iter().position(|byte| matches!(byte, b'\r' | b'\n')) {
-            if end > LONGEST_LINE {
+            if end > MAX_LINE_LENGTH {
                 return None;
             }
             let line: Vec<u8> = self.bytes.drain(..=end).take(end).collect();
@@ -220,35 +220,35 @@ impl Lines {
             let line: String = line.into_iter().map(char::from).collect();
             lines.extend(Some(line.trim().to_owned()).filter(|line| !line.is_empty()));
         }
-        (self.bytes.len() <= LONGEST_LINE).then_some(lines)
+        (self.bytes.len() <= MAX_LINE_LENGTH).then_some(lines)
     }
 }
 
 /// Pending requests in order, each with an attached value.
 #[derive(Debug)]
-pub struct Waiting<T> {
+pub struct PendingRequests<T> {
     requests: VecDeque<(Request, T)>,
-    aside: u32,
+    unmatched: u32,
 }
 
 /// Meaning of a received line.
 #[derive(Debug, PartialEq)]
-pub enum Place<T> {
+pub enum LineMatch<T> {
     /// Answer to the oldest pending request.
     Answer(T, Reply),
     /// Line of no pending request.
-    Aside,
-    /// Line of no pending request, one of more than `MOST_ASIDE` in a row: this is not the protocol.
-    Nonsense,
+    Unmatched,
+    /// Line of no pending request, one of more than `MAX_UNMATCHED` in a row: this is not the protocol.
+    NotProtocol,
 }
 
-impl<T> Default for Waiting<T> {
+impl<T> Default for PendingRequests<T> {
     fn default() -> Self {
-        Self { requests: VecDeque::new(), aside: 0 }
+        Self { requests: VecDeque::new(), unmatched: 0 }
     }
 }
 
-impl<T> Waiting<T> {
+impl<T> PendingRequests<T> {
     /// Adds a request that was sent.
     pub fn push(&mut self, request: Request, kept: T) {
         self.requests.push_back((request, kept));
@@ -265,18 +265,18 @@ impl<T> Waiting<T> {
     }
 
     /// Assigns a line to the oldest pending request, if it answers it.
-    pub fn place(&mut self, line: &str) -> Place<T> {
+    pub fn match_line(&mut self, line: &str) -> LineMatch<T> {
         match self.requests.front().and_then(|(request, _)| request.answer(line)) {
             Some(reply) => {
-                self.aside = 0;
+                self.unmatched = 0;
                 match self.requests.pop_front() {
-                    Some((_, kept)) => Place::Answer(kept, reply),
-                    None => Place::Aside,
+                    Some((_, kept)) => LineMatch::Answer(kept, reply),
+                    None => LineMatch::Unmatched,
                 }
             }
             None => {
-                self.aside += 1;
-                if self.aside > MOST_ASIDE { Place::Nonsense } else { Place::Aside }
+                self.unmatched += 1;
+                if self.unmatched > MAX_UNMATCHED { LineMatch::NotProtocol } else { LineMatch::Unmatched }
             }
         }
     }
@@ -331,7 +331,7 @@ mod tests {
         ]
     }
 
-    fn told() -> Vec<Reply> {
+    fn replies() -> Vec<Reply> {
         let value = |text: &str| Reply::Value(text.to_owned());
         vec![
             value("EMCNETSVR 1.1"),
@@ -363,20 +363,20 @@ mod tests {
     fn answers_are_the_same_in_halves_merged_and_byte_by_byte() {
         let all: String = SESSION.map(|(_, answer)| answer).concat();
         for size in [1, 2, 3, 7, 16, 1000] {
-            let (mut lines, mut waiting, mut found) = (Lines::default(), Waiting::default(), Vec::new());
+            let (mut lines, mut waiting, mut found) = (LineSplitter::default(), PendingRequests::default(), Vec::new());
             for request in requests().into_iter().filter(|request| *request != Request::EchoOff) {
                 waiting.push(request, ());
             }
             for bytes in all.as_bytes().chunks(size) {
-                for line in lines.take(bytes).unwrap() {
-                    match waiting.place(&line) {
-                        Place::Answer((), reply) => found.push(reply),
-                        Place::Aside => assert_eq!(line, "set echo off"),
-                        Place::Nonsense => panic!("{line}"),
+                for line in lines.push(bytes).unwrap() {
+                    match waiting.match_line(&line) {
+                        LineMatch::Answer((), reply) => found.push(reply),
+                        LineMatch::Unmatched => assert_eq!(line, "set echo off"),
+                        LineMatch::NotProtocol => panic!("{line}"),
                     }
                 }
             }
-            assert_eq!(found, told(), "in pieces of {size}");
+            assert_eq!(found, replies(), "in pieces of {size}");
             assert!(waiting.first().is_none());
         }
     }
@@ -410,11 +410,11 @@ mod tests {
 
     #[test]
     fn a_flood_of_lines_is_no_conversation() {
-        let mut waiting = Waiting::default();
+        let mut waiting = PendingRequests::default();
         waiting.push(Request::Get(Get::Mode), ());
-        let told: Vec<_> = (0..102).map(|_| waiting.place("ERROR what")).collect();
-        assert_eq!((&told[0], &told[101]), (&Place::Aside, &Place::Nonsense));
-        assert!(Lines::default().take(&[b'x'; 5000]).is_none());
-        assert!(Lines::default().take(&[0xff, b'\n']).is_some());
+        let told: Vec<_> = (0..102).map(|_| waiting.match_line("ERROR what")).collect();
+        assert_eq!((&told[0], &told[101]), (&LineMatch::Unmatched, &LineMatch::NotProtocol));
+        assert!(LineSplitter::default().push(&[b'x'; 5000]).is_none());
+        assert!(LineSplitter::default().push(&[0xff, b'\n']).is_some());
     }
 }

@@ -11,8 +11,8 @@ use serde::Deserialize;
 use super::LinuxcncGrinder;
 use crate::MachineKind;
 use crate::no_machine::NoMachine;
-use crate::place::Place;
-use crate::wiring::{Making, MakingError, Wired};
+use crate::place::MachineTable;
+use crate::wiring::{DriverContext, DriverError, DriverFactory};
 use regrind_document::Document;
 
 /// LinuxCNC by linuxcncrsh over TCP, for a grinder.
@@ -95,21 +95,21 @@ pub struct LinuxcncSettings {
     /// Joints that must be homed.
     pub joints: usize,
     /// Timeout of an answer.
-    pub answer_within: Duration,
+    pub answer_timeout: Duration,
     /// Timeout of the effect of an order.
-    pub settle_within: Duration,
+    pub settle_timeout: Duration,
     /// Timeout until a record is visible after its program has stopped running.
-    pub record_within: Duration,
+    pub record_timeout: Duration,
     /// Expected name of the machine: its ini file, or the name of its server.
     pub expected_name: Option<String>,
 }
 
-impl Wired for LinuxcncWire {
+impl DriverFactory for LinuxcncWire {
     type Cmm = NoMachine;
     type Grinder = LinuxcncGrinder;
-    const WORKS_FROM_RUN: bool = true;
+    const READS_RUN_FOLDER: bool = true;
 
-    fn check(&self, place: &Place<'_>, document: &mut Document) {
+    fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         if place.table == "cmm" {
             let allowed = "LinuxCNC is for grinders";
             return document.report("cmm.wire.kind", "is \"linuxcnc\"", allowed, "name another wire");
@@ -140,16 +140,16 @@ impl Wired for LinuxcncWire {
         (known && !here).then(|| note.to_owned()).into_iter().collect()
     }
 
-    fn cmm(&self, _: &Making<'_>) -> Result<NoMachine, MakingError> {
-        Err(MakingError::NoDriver { table: "cmm", kind: "linuxcnc" })
+    fn create_cmm(&self, _: &DriverContext<'_>) -> Result<NoMachine, DriverError> {
+        Err(DriverError::NoDriver { table: "cmm", kind: "linuxcnc" })
     }
 
-    fn grinder(&self, making: &Making<'_>) -> Result<LinuxcncGrinder, MakingError> {
+    fn create_grinder(&self, making: &DriverContext<'_>) -> Result<LinuxcncGrinder, DriverError> {
         let programs = making.cell_folder.join(&self.programs);
         let programs = std::path::absolute(&programs).unwrap_or(programs);
         if !programs.is_dir() {
             let (key, machine) = ("grinder.wire.programs".to_owned(), MachineKind::Grinder);
-            return Err(MakingError::Folder { key, path: programs, machine });
+            return Err(DriverError::Folder { key, path: programs, machine });
         }
         let ms = |ms: u32| Duration::from_millis(ms.into());
         let at_controller = self.programs_at_controller.clone();
@@ -163,14 +163,14 @@ impl Wired for LinuxcncWire {
             programs,
             simulated: making.simulated,
             joints: self.joints.into(),
-            answer_within: ms(self.answer_timeout_ms),
-            settle_within: ms(self.settle_timeout_ms),
-            record_within: ms(self.record_timeout_ms),
+            answer_timeout: ms(self.answer_timeout_ms),
+            settle_timeout: ms(self.settle_timeout_ms),
+            record_timeout: ms(self.record_timeout_ms),
             expected_name: making.expected_name.map(str::to_owned),
         }))
     }
 
-    fn rsh(&self) -> Option<(String, u16)> {
+    fn linuxcncrsh_address(&self) -> Option<(String, u16)> {
         Some((self.host.clone(), self.port))
     }
 }
@@ -190,7 +190,7 @@ impl LinuxcncWire {
 
     /// Checks `executed_path`: a simulated cell has a real controller but no real machine, so it needs the executed
     /// path.
-    fn check_path(&self, place: &Place<'_>, document: &mut Document) {
+    fn check_path(&self, place: &MachineTable<'_>, document: &mut Document) {
         let key = place.key("wire.executed_path");
         match (place.simulated, &self.executed_path) {
             (Some(true), None) => {
@@ -210,7 +210,7 @@ impl LinuxcncWire {
     }
 
     /// Checks the folder at the controller: its path becomes part of a protocol line and of a comment in the program.
-    fn check_folder(&self, place: &Place<'_>, document: &mut Document) {
+    fn check_folder(&self, place: &MachineTable<'_>, document: &mut Document) {
         let (key, folder) = match &self.programs_at_controller {
             Some(folder) => ("wire.programs_at_controller", folder),
             None => ("wire.programs", &self.programs),

@@ -6,13 +6,13 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::controller::{Interpreter, Seen};
-use super::program::{Program, Record};
+use super::controller::{ControllerState, Interpreter};
+use super::program::{Program, ProgramRecord};
 use crate::words::{Fault, Job, Outcome, State};
 
 /// Prepared job and everything known about it.
 #[derive(Clone, Debug)]
-pub(super) struct Work {
+pub(super) struct ActiveJob {
     pub(super) job: Job,
     /// Start sequence number.
     pub(super) sequence: u32,
@@ -24,7 +24,7 @@ pub(super) struct Work {
     pub(super) path: String,
     pub(super) stage: Stage,
     /// Outcome that a person requested.
-    pub(super) wanted: Option<Outcome>,
+    pub(super) requested_outcome: Option<Outcome>,
     /// Errors since it began, in the controller's words.
     pub(super) errors: Vec<String>,
     /// Number of completed rounds of the pass, and the line seen last.
@@ -46,46 +46,52 @@ pub(super) enum Stage {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Verdict {
     /// The job is in this state and can continue.
-    At(State),
+    InState(State),
     /// The job is over.
     Ended(State, Outcome, Fault),
     /// The controller runs a program that is not ours.
     Foreign(State),
     /// The controller is idle, and nothing shows how the job ended.
-    Untold,
+    Unresolved,
 }
 
-impl Work {
+impl ActiveJob {
     /// Returns the record if its token is that of this preparation.
-    pub(super) fn owns(&self, record: Option<Record>) -> Option<Record> {
-        record.filter(|record| record.prepared == Some(self.token))
+    pub(super) fn own_record(&self, record: Option<ProgramRecord>) -> Option<ProgramRecord> {
+        record.filter(|record| record.token == Some(self.token))
     }
 
     /// Returns the verdict on a job that was begun. `still` is how long the controller has been seen idle. `settles` is
     /// the maximum delay until a written record is visible.
-    pub(super) fn judge(&self, seen: &Seen, record: Option<Record>, still: Duration, settles: Duration) -> Verdict {
-        let record = self.owns(record).unwrap_or_default();
+    pub(super) fn judge(
+        &self,
+        seen: &ControllerState,
+        record: Option<ProgramRecord>,
+        still: Duration,
+        settles: Duration,
+    ) -> Verdict {
+        let record = self.own_record(record).unwrap_or_default();
         let is_ours = seen.program.as_deref() == Some(&self.path);
-        let aborts = self.wanted == Some(Outcome::Aborted);
+        let aborts = self.requested_outcome == Some(Outcome::Aborted);
         match seen.interpreter {
             // A pause after the end of the program holds nothing.
             Interpreter::Running | Interpreter::Paused if is_ours && record.ended == 0 => match seen.interpreter {
-                _ if aborts => Verdict::At(State::Aborting),
-                _ if self.wanted == Some(Outcome::Stopped) => Verdict::At(State::Stopping),
-                Interpreter::Paused => Verdict::At(State::Held),
-                _ => Verdict::At(State::Execute),
+                _ if aborts => Verdict::InState(State::Aborting),
+                _ if self.requested_outcome == Some(Outcome::Stopped) => Verdict::InState(State::Stopping),
+                Interpreter::Paused => Verdict::InState(State::Held),
+                _ => Verdict::InState(State::Execute),
             },
-            Interpreter::Running if is_ours => Verdict::At(State::Execute),
+            Interpreter::Running if is_ours => Verdict::InState(State::Execute),
             Interpreter::Running => Verdict::Foreign(State::Execute),
             Interpreter::Paused if !is_ours => Verdict::Foreign(State::Held),
             _ if record.ended > 0 && aborts => Verdict::Ended(State::Aborted, Outcome::Complete, Fault::None),
             _ if record.ended > 0 => Verdict::Ended(State::Complete, Outcome::Complete, Fault::None),
-            _ if still < settles && self.wanted.is_none() => Verdict::At(State::Execute),
+            _ if still < settles && self.requested_outcome.is_none() => Verdict::InState(State::Execute),
             _ if aborts => Verdict::Ended(State::Aborted, Outcome::Aborted, Fault::None),
-            _ if self.wanted.is_some() => Verdict::Ended(State::Complete, Outcome::Stopped, Fault::None),
-            _ if record.begun == 0 => Verdict::Untold,
-            _ if seen.stopped => Verdict::Ended(State::Faulted, Outcome::Failed, Fault::StopCircuit),
-            _ if !seen.on => Verdict::Ended(State::Faulted, Outcome::Failed, Fault::Supplies),
+            _ if self.requested_outcome.is_some() => Verdict::Ended(State::Complete, Outcome::Stopped, Fault::None),
+            _ if record.begun == 0 => Verdict::Unresolved,
+            _ if seen.stop_circuit_open => Verdict::Ended(State::Faulted, Outcome::Failed, Fault::StopCircuit),
+            _ if !seen.drives_on => Verdict::Ended(State::Faulted, Outcome::Failed, Fault::Supplies),
             _ if !self.errors.is_empty() => Verdict::Ended(State::Faulted, Outcome::Failed, self.fault()),
             // Somebody has aborted it at the machine.
             _ => Verdict::Ended(State::Aborted, Outcome::Aborted, Fault::None),
@@ -119,42 +125,42 @@ mod tests {
     use super::super::protocol::Mode;
     use super::*;
 
-    fn work() -> Work {
-        Work {
+    fn work() -> ActiveJob {
+        ActiveJob {
             job: Job { job: 7, cycle: 2, digest: 3 },
             sequence: 2,
             token: 42,
             program: None,
             path: "/nc/p.ngc".into(),
             stage: Stage::Begun,
-            wanted: None,
+            requested_outcome: None,
             errors: Vec::new(),
             round: (0, 0),
         }
     }
 
-    fn seen(interpreter: Interpreter, program: &str) -> Seen {
-        Seen {
-            ours: true,
-            stopped: false,
-            on: true,
+    fn seen(interpreter: Interpreter, program: &str) -> ControllerState {
+        ControllerState {
+            has_control: true,
+            stop_circuit_open: false,
+            drives_on: true,
             mode: Mode::Auto,
             homed: true,
             interpreter,
             program: Some(program.into()),
             line: 1,
-            at: String::new(),
+            position: String::new(),
             errors: Vec::new(),
         }
     }
 
-    fn record(begun: u32, ended: u32) -> Option<Record> {
-        Some(Record { prepared: Some(42), begun, ended })
+    fn record(begun: u32, ended: u32) -> Option<ProgramRecord> {
+        Some(ProgramRecord { token: Some(42), begun, ended })
     }
 
     const SETTLES: Duration = Duration::from_secs(2);
 
-    fn judged(work: &Work, seen: &Seen, record: Option<Record>) -> Verdict {
+    fn judged(work: &ActiveJob, seen: &ControllerState, record: Option<ProgramRecord>) -> Verdict {
         work.judge(seen, record, SETTLES, SETTLES)
     }
 
@@ -165,12 +171,15 @@ mod tests {
         let aborted = Verdict::Ended(State::Aborted, Outcome::Aborted, Fault::None);
         assert_eq!(judged(&work, &idle, record(1, 1)), complete);
         assert_eq!(judged(&work, &idle, record(1, 0)), aborted);
-        assert_eq!(judged(&work, &idle, record(0, 0)), Verdict::Untold);
-        assert_eq!(judged(&work, &idle, None), Verdict::Untold);
+        assert_eq!(judged(&work, &idle, record(0, 0)), Verdict::Unresolved);
+        assert_eq!(judged(&work, &idle, None), Verdict::Unresolved);
         // Record of another preparation.
-        assert_eq!(judged(&work, &idle, Some(Record { prepared: Some(41), begun: 1, ended: 1 })), Verdict::Untold);
+        assert_eq!(
+            judged(&work, &idle, Some(ProgramRecord { token: Some(41), begun: 1, ended: 1 })),
+            Verdict::Unresolved
+        );
         // The record may become visible late.
-        assert_eq!(work.judge(&idle, record(1, 0), SETTLES / 2, SETTLES), Verdict::At(State::Execute));
+        assert_eq!(work.judge(&idle, record(1, 0), SETTLES / 2, SETTLES), Verdict::InState(State::Execute));
     }
 
     #[test]
@@ -179,10 +188,13 @@ mod tests {
         let idle = seen(Interpreter::Idle, "/nc/p.ngc");
         let failed = |fault| Verdict::Ended(State::Faulted, Outcome::Failed, fault);
         assert_eq!(
-            judged(&work, &Seen { stopped: true, on: false, ..idle.clone() }, record(1, 0)),
+            judged(&work, &ControllerState { stop_circuit_open: true, drives_on: false, ..idle.clone() }, record(1, 0)),
             failed(Fault::StopCircuit)
         );
-        assert_eq!(judged(&work, &Seen { on: false, ..idle.clone() }, record(1, 0)), failed(Fault::Supplies));
+        assert_eq!(
+            judged(&work, &ControllerState { drives_on: false, ..idle.clone() }, record(1, 0)),
+            failed(Fault::Supplies)
+        );
         for (error, fault) in [
             ("Linear move on line 7 would exceed X's positive limit", Fault::TravelLimit),
             ("joint 0 following error", Fault::Drive),
@@ -199,8 +211,8 @@ mod tests {
         for (wanted, on_the_way, state) in
             [(Outcome::Aborted, State::Aborting, State::Aborted), (Outcome::Stopped, State::Stopping, State::Complete)]
         {
-            let work = Work { wanted: Some(wanted), ..work() };
-            assert_eq!(judged(&work, &running, record(1, 0)), Verdict::At(on_the_way));
+            let work = ActiveJob { requested_outcome: Some(wanted), ..work() };
+            assert_eq!(judged(&work, &running, record(1, 0)), Verdict::InState(on_the_way));
             assert_eq!(judged(&work, &idle, record(1, 0)), Verdict::Ended(state, wanted, Fault::None));
             // The program ended before the stop took effect.
             assert_eq!(judged(&work, &idle, record(1, 1)), Verdict::Ended(state, Outcome::Complete, Fault::None));
@@ -214,7 +226,7 @@ mod tests {
         assert_eq!(of(Interpreter::Running), Verdict::Foreign(State::Execute));
         assert_eq!(of(Interpreter::Paused), Verdict::Foreign(State::Held));
         let paused = seen(Interpreter::Paused, "/nc/p.ngc");
-        assert_eq!(judged(&work, &paused, record(1, 0)), Verdict::At(State::Held));
+        assert_eq!(judged(&work, &paused, record(1, 0)), Verdict::InState(State::Held));
     }
 
     #[test]

@@ -18,11 +18,13 @@ use std::sync::Arc;
 use sha2::{Digest, Sha256};
 use tokio::time::Instant;
 
-use super::exchange::{ExchangeError, Wanted, check_measurement, file_word, foreign, measurement, plan_csv};
+use super::exchange::{
+    ExchangeError, ResultRequirements, assemble_measurement, check_measurement, contradiction, file_word, plan_csv,
+};
 use super::{
-    Answer, Answered, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Identity, Interrupt, Job,
-    Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status, Word,
-    digest, hex,
+    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt,
+    Job, Machine, MachineKind, Measurement, OperatorConfirmation, Outcome, Pass, PassRecord, Plan, Reconciled, Started,
+    State, Status, digest, hex,
 };
 use regrind_formats::result::{Content, read_bytes};
 use regrind_formats::{FormatError, ResultFolder, write_atomic};
@@ -35,13 +37,13 @@ pub struct ManualSettings {
     /// Name of the part in prompts.
     pub part: String,
     /// Folder of the run.
-    pub folder: PathBuf,
+    pub run_folder: PathBuf,
     /// Known properties of the files of measurements.
     pub content: Content,
     /// Minimum number of points, if any points are accepted.
-    pub free_points: Option<usize>,
+    pub min_free_points: Option<usize>,
     /// Minimum share of the targets of which a measurement must have a point.
-    pub least_found: f64,
+    pub min_coverage: f64,
     /// True if the plan itself is accepted as the measurement.
     pub rehearsal: bool,
     /// Maximum difference between the probe radius in a file and the plan's, in mm.
@@ -50,7 +52,7 @@ pub struct ManualSettings {
 
 /// Work that the person is asked to do.
 #[derive(Clone, Debug)]
-enum Work {
+enum ManualTask {
     Measure(Arc<Plan>),
     Grind(Pass, [u8; 32]),
 }
@@ -64,22 +66,22 @@ pub struct ManualMachine {
     connected: bool,
     state: State,
     /// Loaded work and its digest.
-    work: Option<(Work, u32)>,
+    task: Option<(ManualTask, u32)>,
     /// Requested job, and its start sequence number.
     job: Option<(Job, u32)>,
     /// Unresolved job of an interrupted run: nobody has said what became of it.
-    untold: Option<(Job, u32)>,
+    unresolved: Option<(Job, u32)>,
     /// Jobs and cycles that were ever requested: none is requested twice.
-    asked: Vec<(u32, u16)>,
+    requested_jobs: Vec<(u32, u16)>,
     outcome: Outcome,
     /// Time at which the start was confirmed.
-    begun: Option<Instant>,
+    started_at: Option<Instant>,
     duration_s: Option<f64>,
     /// True if it is clear of the part, as a person confirmed; `None` if unknown.
-    clear: Option<bool>,
-    measured: Option<Measurement>,
+    clear_of_part: Option<bool>,
+    measurement: Option<Measurement>,
     /// SHA-256 of every accepted file: no two measurements have the same bytes.
-    taken: Vec<[u8; 32]>,
+    accepted_files: Vec<[u8; 32]>,
 }
 
 impl ManualMachine {
@@ -91,26 +93,26 @@ impl ManualMachine {
             settings,
             connected: false,
             state: State::Idle,
-            work: None,
+            task: None,
             job: None,
-            untold: None,
-            asked: Vec::new(),
+            unresolved: None,
+            requested_jobs: Vec::new(),
             outcome: Outcome::None,
-            begun: None,
+            started_at: None,
             duration_s: None,
-            clear: None,
-            measured: None,
-            taken: Vec::new(),
+            clear_of_part: None,
+            measurement: None,
+            accepted_files: Vec::new(),
         }
     }
 
-    fn told(&self) -> Status {
+    fn current_status(&self) -> Status {
         Status {
             job: self.job.map(|(job, _)| job),
             done: self.job.filter(|_| self.outcome != Outcome::None).map_or(0, |(_, sequence)| sequence),
             outcome: self.outcome,
-            clear_of_part: self.clear,
-            ..Status::of(self.state)
+            clear_of_part: self.clear_of_part,
+            ..Status::from_state(self.state)
         }
     }
 
@@ -118,20 +120,20 @@ impl ManualMachine {
         DeviceError::Refused { machine: Arc::clone(&self.name), command, answer, state: self.state }
     }
 
-    fn not_taken(&self, why: impl ToString) -> DeviceError {
-        DeviceError::NotTaken { machine: Arc::clone(&self.name), why: why.to_string() }
+    fn not_accepted(&self, why: impl ToString) -> DeviceError {
+        DeviceError::NotAccepted { machine: Arc::clone(&self.name), reason: why.to_string() }
     }
 
     /// Changes the state to `to` and returns the status.
     ///
     /// # Errors
     /// Refuses with [`Answer::WrongState`] if the current state is not in `from`.
-    fn go(&mut self, command: Command, from: &[State], to: State) -> Answered<Status> {
+    fn transition(&mut self, command: Command, from: &[State], to: State) -> DeviceResult<Status> {
         if !from.contains(&self.state) {
             return Err(self.refused(command, Answer::WrongState));
         }
         self.state = to;
-        Ok(self.told())
+        Ok(self.current_status())
     }
 
     fn finish(&mut self, outcome: Outcome) {
@@ -144,12 +146,12 @@ impl ManualMachine {
     fn prompt(&self) -> Vec<String> {
         let Some((job, _)) = self.job else { return Vec::new() };
         let name = self.kind.name();
-        let confirm = |what: &str| format!("then: regrind confirm {what}{}", self.run());
+        let confirm = |what: &str| format!("then: regrind confirm {what}{}", self.run_argument());
         let still =
             |what: &str| vec![format!("{what} it at its own panel"), confirm(&format!("still --machine {name}"))];
-        match (self.state, &self.work) {
-            (State::Execute, Some((Work::Measure(plan), _))) => self.prompt_to_measure(job, plan, &confirm),
-            (State::Execute, Some((Work::Grind(pass, map), _))) => self.prompt_to_grind(job, pass, map, &confirm),
+        match (self.state, &self.task) {
+            (State::Execute, Some((ManualTask::Measure(plan), _))) => self.prompt_to_measure(job, plan, &confirm),
+            (State::Execute, Some((ManualTask::Grind(pass, map), _))) => self.prompt_to_grind(job, pass, map, &confirm),
             (State::Holding, _) => still("HOLD"),
             (State::Stopping, _) => still("STOP"),
             (State::Aborting, _) => vec!["ABORT: stop it at its own panel NOW; nothing here can".to_owned()],
@@ -159,12 +161,12 @@ impl ManualMachine {
 
     fn prompt_to_measure(&self, job: Job, plan: &Plan, confirm: &dyn Fn(&str) -> String) -> Vec<String> {
         let (part, file) = (&self.settings.part, self.cycle_folder(job).join(plan_file(job)));
-        let points = match self.settings.free_points {
+        let points = match self.settings.min_free_points {
             Some(least) => format!("at least {least} points"),
             None => format!("{} points of {}", plan.targets.len(), file.display()),
         };
         vec![
-            format!("MEASURE {part}, cycle {}: {points}", job.number()),
+            format!("MEASURE {part}, cycle {}: {points}", job.batch_id()),
             format!("check: right part, clean, clamped; wheel clear of it; probe radius {} mm", plan.probe_radius_mm),
             "when it is measured and the probe is clear of the part,".to_owned(),
             confirm("done --file RESULT"),
@@ -172,12 +174,12 @@ impl ManualMachine {
     }
 
     fn prompt_to_grind(&self, job: Job, pass: &Pass, map: &[u8; 32], confirm: &dyn Fn(&str) -> String) -> Vec<String> {
-        if self.begun.is_some() {
+        if self.started_at.is_some() {
             let ended = "when the pass has ended and the wheel is clear of the part,".to_owned();
             return vec![ended, confirm("done")];
         }
         let folder = self.cycle_folder(Job { cycle: job.cycle.saturating_sub(1), ..job });
-        let there = program_in(&folder).or_else(|| Some(folder.join("correction.csv")).filter(|file| file.is_file()));
+        let there = find_program(&folder).or_else(|| Some(folder.join("correction.csv")).filter(|file| file.is_file()));
         let by = there.map_or("your own program".to_owned(), |file| file.display().to_string());
         let map = hex(&map[..4]);
         vec![
@@ -192,98 +194,105 @@ impl ManualMachine {
     }
 
     /// Returns the run argument of `regrind confirm`; empty if the command finds the newest run by itself.
-    fn run(&self) -> String {
-        let folder = &self.settings.folder;
+    fn run_argument(&self) -> String {
+        let folder = &self.settings.run_folder;
         if folder.parent() == Some(Path::new("runs")) { String::new() } else { format!(" {}", folder.display()) }
     }
 
     fn cycle_folder(&self, job: Job) -> PathBuf {
-        self.settings.folder.join(format!("cycle-{}", job.number().cycle))
+        self.settings.run_folder.join(format!("cycle-{}", job.batch_id().cycle))
     }
 
     // ---- what a person says -------------------------------------------------------------------------------------------------------
 
-    async fn take_word(&mut self, word: Word) -> Answered<Vec<String>> {
+    async fn accept_confirmation(&mut self, word: OperatorConfirmation) -> DeviceResult<Vec<String>> {
         let is_cmm = self.kind == MachineKind::Cmm;
         match word {
-            Word::Started { map_identity } | Word::Done { map_identity, .. } if self.is_other(map_identity) => {
-                Err(self.not_taken("that is another map than the one asked for: which program is in the grinder?"))
+            OperatorConfirmation::Started { map_identity } | OperatorConfirmation::Done { map_identity, .. }
+                if self.names_other_map(map_identity) =>
+            {
+                Err(self.not_accepted("that is another map than the one asked for: which program is in the grinder?"))
             }
-            Word::Started { .. } if is_cmm => Err(self.not_taken("nothing is started here; measure, and confirm done")),
-            Word::Started { .. } if self.state == State::Execute => {
-                self.begun.get_or_insert_with(Instant::now);
+            OperatorConfirmation::Started { .. } if is_cmm => {
+                Err(self.not_accepted("nothing is started here; measure, and confirm done"))
+            }
+            OperatorConfirmation::Started { .. } if self.state == State::Execute => {
+                self.started_at.get_or_insert_with(Instant::now);
                 Ok(Vec::new())
             }
-            Word::Done { file, .. } if matches!(self.state, State::Execute | State::Holding | State::Held) => {
+            OperatorConfirmation::Done { file, .. }
+                if matches!(self.state, State::Execute | State::Holding | State::Held) =>
+            {
                 let kept = match file {
-                    Some(file) if is_cmm => self.take_file(file).await?,
-                    None if is_cmm => return Err(self.not_taken("name the measurement: --file, and where it is")),
-                    Some(_) => return Err(self.not_taken("a pass leaves no file: leave --file out")),
-                    None if self.begun.is_none() => {
-                        return Err(self.not_taken("confirm first that it has begun: regrind confirm started"));
+                    Some(file) if is_cmm => self.accept_file(file).await?,
+                    None if is_cmm => return Err(self.not_accepted("name the measurement: --file, and where it is")),
+                    Some(_) => return Err(self.not_accepted("a pass leaves no file: leave --file out")),
+                    None if self.started_at.is_none() => {
+                        return Err(self.not_accepted("confirm first that it has begun: regrind confirm started"));
                     }
                     None => Vec::new(),
                 };
-                self.duration_s = self.begun.map(|begun| begun.elapsed().as_secs_f64());
-                self.clear = Some(true);
+                self.duration_s = self.started_at.map(|begun| begun.elapsed().as_secs_f64());
+                self.clear_of_part = Some(true);
                 self.finish(Outcome::Complete);
                 Ok(kept)
             }
-            Word::Still if self.state == State::Holding => {
+            OperatorConfirmation::Still if self.state == State::Holding => {
                 self.state = State::Held;
                 Ok(Vec::new())
             }
-            Word::Still if self.state == State::Stopping => {
+            OperatorConfirmation::Still if self.state == State::Stopping => {
                 self.finish(Outcome::Stopped);
                 Ok(Vec::new())
             }
-            _ => Err(self.not_taken(format!("it is {}, and nothing of that kind is asked", self.state))),
+            _ => Err(self.not_accepted(format!("it is {}, and nothing of that kind is asked", self.state))),
         }
     }
 
     /// Returns true if a confirmation names another map than the requested one.
-    fn is_other(&self, named: Option<[u8; 32]>) -> bool {
-        match &self.work {
-            Some((Work::Grind(_, map), _)) => named.is_some_and(|named| named != *map),
+    fn names_other_map(&self, named: Option<[u8; 32]>) -> bool {
+        match &self.task {
+            Some((ManualTask::Grind(_, map), _)) => named.is_some_and(|named| named != *map),
             _ => false,
         }
     }
 
     /// Accepts a file as the requested measurement, and stores its bytes in the folder of the run.
-    async fn take_file(&mut self, file: PathBuf) -> Answered<Vec<String>> {
-        let (Some((job, done)), Some((Work::Measure(plan), _))) = (self.job, &self.work) else {
-            return Err(self.not_taken("no measurement is asked for"));
+    async fn accept_file(&mut self, file: PathBuf) -> DeviceResult<Vec<String>> {
+        let (Some((job, done)), Some((ManualTask::Measure(plan), _))) = (self.job, &self.task) else {
+            return Err(self.not_accepted("no measurement is asked for"));
         };
-        let (settings, plan, taken) = (self.settings.clone(), Arc::clone(plan), self.taken.clone());
+        let (settings, plan, taken) = (self.settings.clone(), Arc::clone(plan), self.accepted_files.clone());
         let cycle_folder = self.cycle_folder(job);
         let read = tokio::task::spawn_blocking(move || {
             let bytes = read_bytes(&file)?;
             let sha256: [u8; 32] = Sha256::digest(&bytes).into();
-            if taken.contains(&sha256) || lies_there(&settings.folder, &sha256) {
-                return Err(ExchangeError::Offered { path: file });
+            if taken.contains(&sha256) || is_stored_result(&settings.run_folder, &sha256) {
+                return Err(ExchangeError::AlreadyMeasured { path: file });
             }
-            let measurement = measured(&settings, &plan, job, done, &file, &bytes)?;
+            let measurement = read_measurement(&settings, &plan, job, done, &file, &bytes)?;
             // The bytes are stored unchanged, under a name that no other file of the cycle has.
             let extension = file.extension().map_or("txt".to_owned(), |e| file_word(&e.to_string_lossy()));
-            let name = format!("result{}.{extension}", of_batch(job));
+            let name = format!("result{}.{extension}", batch_suffix(job));
             write_atomic(&cycle_folder.join(&name), &bytes)?;
             Ok((measurement, sha256, name))
         });
-        let (measurement, sha256, name) = read.await.map_err(|e| self.not_taken(e))?.map_err(|e| self.not_taken(e))?;
-        self.taken.push(sha256);
-        self.measured = Some(measurement);
-        let cycle = job.number().cycle;
+        let (measurement, sha256, name) =
+            read.await.map_err(|e| self.not_accepted(e))?.map_err(|e| self.not_accepted(e))?;
+        self.accepted_files.push(sha256);
+        self.measurement = Some(measurement);
+        let cycle = job.batch_id().cycle;
         Ok(vec![format!("cycle-{cycle}/{}", plan_file(job)), format!("cycle-{cycle}/{name}")])
     }
 }
 
 fn plan_file(job: Job) -> String {
-    format!("plan{}.csv", of_batch(job))
+    format!("plan{}.csv", batch_suffix(job))
 }
 
 /// Returns the suffix of the file names of a batch; empty for the first batch.
-fn of_batch(job: Job) -> String {
-    match job.number().batch {
+fn batch_suffix(job: Job) -> String {
+    match job.batch_id().batch {
         0 => String::new(),
         before => format!("-{}", before + 1),
     }
@@ -291,7 +300,7 @@ fn of_batch(job: Job) -> String {
 
 /// Returns true if a file was accepted before this process resumed the run: the folders of the cycles hold all accepted
 /// files.
-fn lies_there(run: &Path, sha256: &[u8; 32]) -> bool {
+fn is_stored_result(run: &Path, sha256: &[u8; 32]) -> bool {
     let within = |folder: &Path| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
     let stem = |path: &Path, wanted: &str| path.file_stem().is_some_and(|stem| stem == wanted);
     let cycles = within(run).filter(|path| path.is_dir());
@@ -300,7 +309,7 @@ fn lies_there(run: &Path, sha256: &[u8; 32]) -> bool {
 }
 
 /// Parses the bytes of a file and checks them against the plan. Returns the measurement.
-fn measured(
+fn read_measurement(
     settings: &ManualSettings,
     plan: &Plan,
     job: Job,
@@ -309,24 +318,24 @@ fn measured(
     bytes: &[u8],
 ) -> Result<Measurement, ExchangeError> {
     let targets: Vec<u32> = plan.targets.iter().map(|target| target.index).collect();
-    let wanted = Wanted {
-        targets: settings.free_points.is_none().then_some(&targets),
+    let wanted = ResultRequirements {
+        targets: settings.min_free_points.is_none().then_some(&targets),
         content: &settings.content,
         probe_radius_mm: plan.probe_radius_mm,
         probe_tolerance_mm: settings.probe_tolerance_mm,
     };
     let identity = plan.identity();
     let file = wanted.read(path, bytes)?;
-    if let Some(why) = foreign(&file.statements, &settings.part, job.cycle, &hex(&identity)) {
-        return Err(ExchangeError::Foreign { path: path.to_owned(), why });
+    if let Some(why) = contradiction(&file.statements, &settings.part, job.cycle, &hex(&identity)) {
+        return Err(ExchangeError::Foreign { path: path.to_owned(), reason: why });
     }
-    let points = wanted.matched(path, &file)?;
-    if let Some(expected) = settings.free_points.filter(|least| points.len() < *least) {
+    let points = wanted.assign_by_index(path, &file)?;
+    if let Some(expected) = settings.min_free_points.filter(|least| points.len() < *least) {
         return Err(ExchangeError::Count { path: path.to_owned(), found: points.len(), expected });
     }
-    let measurement = measurement(points, &[file], job, identity, done);
-    if settings.free_points.is_none() {
-        check_measurement(path, plan, &measurement, settings.least_found, settings.rehearsal)?;
+    let measurement = assemble_measurement(points, &[file], job, identity, done);
+    if settings.min_free_points.is_none() {
+        check_measurement(path, plan, &measurement, settings.min_coverage, settings.rehearsal)?;
     }
     Ok(measurement)
 }
@@ -335,7 +344,7 @@ fn measured(
 fn write_plan(settings: &ManualSettings, folder: &Path, plan: &Plan, job: Job) -> Result<(), FormatError> {
     ResultFolder::prepare(folder)?.keep();
     let text = plan_csv(&settings.part, job, &hex(&plan.identity()), plan);
-    write_atomic(&folder.join("plan.csv"), text.as_bytes())
+    write_atomic(&folder.join(plan_file(job)), text.as_bytes())
 }
 
 impl Machine for ManualMachine {
@@ -347,144 +356,144 @@ impl Machine for ManualMachine {
         self.prompt()
     }
 
-    async fn connect(&mut self) -> Answered<Identity> {
+    async fn connect(&mut self) -> DeviceResult<Identity> {
         self.connected = true;
-        Ok(Identity::by_person(self.kind, &self.name))
+        Ok(Identity::for_manual_machine(self.kind, &self.name))
     }
 
-    async fn status(&mut self) -> Answered<Status> {
+    async fn status(&mut self) -> DeviceResult<Status> {
         match self.connected {
-            true => Ok(self.told()),
-            false => Err(DeviceError::NotConnected { machine: Arc::clone(&self.name), what: "its status" }),
+            true => Ok(self.current_status()),
+            false => Err(DeviceError::NotConnected { machine: Arc::clone(&self.name), operation: "its status" }),
         }
     }
 
     fn restore(&mut self, intended: &Armed) {
-        self.untold = Some((intended.job, intended.start_sequence));
-        self.asked.push((intended.job.job, intended.job.cycle));
+        self.unresolved = Some((intended.job, intended.start_sequence));
+        self.requested_jobs.push((intended.job.job, intended.job.cycle));
     }
 
-    async fn claim(&mut self) -> Answered<Status> {
+    async fn claim(&mut self) -> DeviceResult<Status> {
         self.status().await
     }
 
-    async fn prepare(&mut self, job: Job) -> Answered<Armed> {
+    async fn prepare(&mut self, job: Job) -> DeviceResult<Armed> {
         // The cell continues only after a person has confirmed that the job is over.
-        self.untold = None;
-        let is_loaded = self.work.as_ref().is_some_and(|(_, digest)| *digest == job.digest);
+        self.unresolved = None;
+        let is_loaded = self.task.as_ref().is_some_and(|(_, digest)| *digest == job.digest);
         if self.state != State::Idle || !is_loaded {
             let answer = if is_loaded { Answer::WrongState } else { Answer::PayloadMissing };
             return Err(self.refused(Command::Prepare, answer));
         }
-        if self.asked.contains(&(job.job, job.cycle)) {
+        if self.requested_jobs.contains(&(job.job, job.cycle)) {
             return Err(self.refused(Command::Prepare, Answer::AlreadyBegun));
         }
-        if let Some((Work::Measure(plan), _)) = &self.work {
+        if let Some((ManualTask::Measure(plan), _)) = &self.task {
             let (settings, plan, folder) = (self.settings.clone(), Arc::clone(plan), self.cycle_folder(job));
             let written = tokio::task::spawn_blocking(move || write_plan(&settings, &folder, &plan, job));
-            written.await.map_err(|e| self.not_taken(e))?.map_err(|e| self.not_taken(e))?;
+            written.await.map_err(|e| self.not_accepted(e))?.map_err(|e| self.not_accepted(e))?;
         }
-        let start_sequence = self.asked.len() as u32 + 1;
+        let start_sequence = self.requested_jobs.len() as u32 + 1;
         (self.job, self.state, self.outcome) = (Some((job, start_sequence)), State::Prepared, Outcome::None);
-        (self.begun, self.duration_s, self.measured) = (None, None, None);
+        (self.started_at, self.duration_s, self.measurement) = (None, None, None);
         Ok(Armed { job, start_sequence, token: 0, boot_id: 0 })
     }
 
-    async fn start(&mut self, armed: Armed) -> Answered<Started> {
+    async fn start(&mut self, armed: Armed) -> DeviceResult<Started> {
         let Armed { job, start_sequence, .. } = armed;
         if self.state != State::Prepared || self.job != Some((job, start_sequence)) {
             return Err(self.refused(Command::Start, Answer::OtherJob));
         }
-        self.asked.push((job.job, job.cycle));
-        (self.state, self.clear) = (State::Execute, None);
-        Ok(Started { job, start_sequence, status: self.told() })
+        self.requested_jobs.push((job.job, job.cycle));
+        (self.state, self.clear_of_part) = (State::Execute, None);
+        Ok(Started { job, start_sequence, status: self.current_status() })
     }
 
-    async fn hold(&mut self) -> Answered<Status> {
-        self.go(Command::Hold, &[State::Execute], State::Holding)
+    async fn hold(&mut self) -> DeviceResult<Status> {
+        self.transition(Command::Hold, &[State::Execute], State::Holding)
     }
 
-    async fn resume(&mut self) -> Answered<Status> {
-        self.go(Command::Resume, &[State::Held], State::Execute)
+    async fn resume(&mut self) -> DeviceResult<Status> {
+        self.transition(Command::Resume, &[State::Held], State::Execute)
     }
 
-    async fn stop(&mut self) -> Answered<Status> {
-        if let Some(untold) = self.untold.take() {
+    async fn stop(&mut self) -> DeviceResult<Status> {
+        if let Some(untold) = self.unresolved.take() {
             (self.job, self.state) = (Some(untold), State::Stopping);
-            return Ok(self.told());
+            return Ok(self.current_status());
         }
         match self.state {
             State::Prepared => (self.state, self.job) = (State::Idle, None),
             // A person has confirmed that it does not move.
             State::Held => self.finish(Outcome::Stopped),
-            _ => return self.go(Command::Stop, &[State::Execute, State::Holding], State::Stopping),
+            _ => return self.transition(Command::Stop, &[State::Execute, State::Holding], State::Stopping),
         }
-        Ok(self.told())
+        Ok(self.current_status())
     }
 
-    async fn abort(&mut self) -> Answered<Status> {
-        let untold = self.untold.take();
-        let may_move = self.state.moves() || untold.is_some();
+    async fn abort(&mut self) -> DeviceResult<Status> {
+        let untold = self.unresolved.take();
+        let may_move = self.state.is_moving() || untold.is_some();
         self.job = self.job.or(untold);
         self.state = if may_move { State::Aborting } else { State::Aborted };
         self.outcome = Outcome::Aborted;
-        Ok(self.told())
+        Ok(self.current_status())
     }
 
-    async fn clear(&mut self) -> Answered<Status> {
+    async fn clear(&mut self) -> DeviceResult<Status> {
         (self.job, self.outcome) = (None, Outcome::None);
-        self.go(Command::Clear, &[State::Aborted], State::Idle)
+        self.transition(Command::Clear, &[State::Aborted], State::Idle)
     }
 
-    async fn acknowledge(&mut self, done: u32) -> Answered<Status> {
+    async fn acknowledge(&mut self, done: u32) -> DeviceResult<Status> {
         if self.job.is_none_or(|(_, sequence)| sequence != done) {
             return Err(self.refused(Command::Acknowledge, Answer::OtherResult));
         }
-        let status = self.go(Command::Acknowledge, &[State::Complete], State::Idle)?;
+        let status = self.transition(Command::Acknowledge, &[State::Complete], State::Idle)?;
         (self.job, self.outcome) = (None, Outcome::None);
         Ok(status)
     }
 
-    async fn release(&mut self) -> Answered<Status> {
-        Ok(self.told())
+    async fn release(&mut self) -> DeviceResult<Status> {
+        Ok(self.current_status())
     }
 
-    async fn reconcile(&mut self, intended: &Armed) -> Answered<Reconciled> {
+    async fn reconcile(&mut self, intended: &Armed) -> DeviceResult<Reconciled> {
         let ours = self.job == Some((intended.job, intended.start_sequence));
         Ok(match self.state {
-            State::Complete | State::Aborted if ours => Reconciled::Finished(self.told()),
-            state if ours && (state.moves() || state == State::Held) => Reconciled::Running(self.told()),
-            _ => Reconciled::Unknown { why: "only who was asked to do it can tell what became of it".to_owned() },
+            State::Complete | State::Aborted if ours => Reconciled::Finished(self.current_status()),
+            state if ours && (state.is_moving() || state == State::Held) => Reconciled::Running(self.current_status()),
+            _ => Reconciled::Unknown { reason: "only who was asked to do it can tell what became of it".to_owned() },
         })
     }
 
-    async fn confirm(&mut self, word: Word) -> Answered<Vec<String>> {
-        self.take_word(word).await
+    async fn confirm(&mut self, word: OperatorConfirmation) -> DeviceResult<Vec<String>> {
+        self.accept_confirmation(word).await
     }
 }
 
 impl Cmm for ManualMachine {
-    async fn load_plan(&mut self, plan: &Plan, _: &Interrupt) -> Answered<()> {
-        self.work = Some((Work::Measure(Arc::new(plan.clone())), digest(&[plan.identity()])));
+    async fn load_plan(&mut self, plan: &Plan, _: &Interrupt) -> DeviceResult<()> {
+        self.task = Some((ManualTask::Measure(Arc::new(plan.clone())), digest(&[plan.identity()])));
         Ok(())
     }
 
-    async fn collect(&mut self, job: Job, _: &Interrupt) -> Answered<Measurement> {
-        let measured = self.measured.clone().filter(|m| (m.job, m.cycle) == (job.job, job.cycle));
+    async fn collect(&mut self, job: Job, _: &Interrupt) -> DeviceResult<Measurement> {
+        let measured = self.measurement.clone().filter(|m| (m.job, m.cycle) == (job.job, job.cycle));
         measured.ok_or_else(|| DeviceError::NoResult { machine: Arc::clone(&self.name), job, state: self.state })
     }
 }
 
 impl Grinder for ManualMachine {
-    async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, _: &Interrupt) -> Answered<()> {
+    async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, _: &Interrupt) -> DeviceResult<()> {
         let map = map.identity();
-        self.work = Some((Work::Grind(*pass, map), digest(&[map, pass.identity()])));
+        self.task = Some((ManualTask::Grind(*pass, map), digest(&[map, pass.identity()])));
         Ok(())
     }
 
-    async fn collect(&mut self, job: Job, _: &Interrupt) -> Answered<PassRecord> {
-        match (self.job, &self.work) {
-            (Some((own, done)), Some((Work::Grind(_, map_identity), _))) if own == job => Ok(PassRecord {
+    async fn collect(&mut self, job: Job, _: &Interrupt) -> DeviceResult<PassRecord> {
+        match (self.job, &self.task) {
+            (Some((own, done)), Some((ManualTask::Grind(_, map_identity), _))) if own == job => Ok(PassRecord {
                 duration_s: self.duration_s,
                 ..PassRecord::unmeasured(self.outcome, *map_identity, job, done)
             }),
@@ -494,7 +503,7 @@ impl Grinder for ManualMachine {
 }
 
 /// Returns the path of the program of a pass in the folder of a cycle, in any dialect.
-fn program_in(folder: &Path) -> Option<PathBuf> {
+fn find_program(folder: &Path) -> Option<PathBuf> {
     let files = std::fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
     let mut programs: Vec<PathBuf> =
         files.filter(|file| file.is_file() && file.file_stem() == Some("toolpath".as_ref())).collect();
@@ -507,13 +516,13 @@ mod tests {
     use super::*;
 
     /// Machine of a resumed run that was interrupted during a pass.
-    fn taken_up() -> ManualMachine {
+    fn resumed_machine() -> ManualMachine {
         let settings = ManualSettings {
             part: "a part".into(),
-            folder: PathBuf::new(),
+            run_folder: PathBuf::new(),
             content: Content::default(),
-            free_points: None,
-            least_found: 0.0,
+            min_free_points: None,
+            min_coverage: 0.0,
             rehearsal: false,
             probe_tolerance_mm: 0.1,
         };
@@ -529,22 +538,22 @@ mod tests {
         std::fs::create_dir(run.path().join("cycle-1")).unwrap();
         std::fs::write(run.path().join("cycle-1/result.csv"), "1,2,3").unwrap();
         let sha256 = |text: &str| -> [u8; 32] { Sha256::digest(text).into() };
-        assert!(lies_there(run.path(), &sha256("1,2,3")));
-        assert!(!lies_there(run.path(), &sha256("1,2,4")));
+        assert!(is_stored_result(run.path(), &sha256("1,2,3")));
+        assert!(!is_stored_result(run.path(), &sha256("1,2,4")));
     }
 
     #[tokio::test]
     async fn what_became_of_the_pass_of_an_interrupted_run_is_nothing_that_this_program_knows() {
         let job = Job { job: 7, cycle: 2, digest: 3 };
         let armed = Armed { job, start_sequence: 1, token: 0, boot_id: 0 };
-        assert!(matches!(taken_up().reconcile(&armed).await, Ok(Reconciled::Unknown { .. })));
+        assert!(matches!(resumed_machine().reconcile(&armed).await, Ok(Reconciled::Unknown { .. })));
         // It may be moving: a person must confirm that it does not, and nobody has confirmed an abort.
-        let mut machine = taken_up();
+        let mut machine = resumed_machine();
         machine.connect().await.unwrap();
         assert_eq!(machine.stop().await.unwrap().state, State::Stopping);
-        machine.confirm(Word::Still).await.unwrap();
+        machine.confirm(OperatorConfirmation::Still).await.unwrap();
         let status = machine.status().await.unwrap();
         assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Stopped));
-        assert_eq!(taken_up().abort().await.unwrap().state, State::Aborting);
+        assert_eq!(resumed_machine().abort().await.unwrap().state, State::Aborting);
     }
 }

@@ -5,7 +5,7 @@ use serde::Deserialize;
 
 use super::{ManualMachine, ManualSettings};
 use crate::MachineKind;
-use crate::wiring::{Making, MakingError, Wired};
+use crate::wiring::{DriverContext, DriverError, DriverFactory};
 use regrind_formats::result::{Content, Coordinates, DecimalMark};
 use regrind_formats::{Columns, Unit};
 
@@ -14,7 +14,7 @@ use regrind_formats::{Columns, Unit};
 #[serde(default, deny_unknown_fields)]
 pub struct ManualWire {
     /// What the coordinates of measurements are, where the files do not say so themselves; said nowhere, they are refused.
-    pub what: Option<Coordinates>,
+    pub coordinates: Option<Coordinates>,
     /// Decimal mark of measurements.
     pub decimal: DecimalMark,
     /// Unit of length of measurements.
@@ -32,7 +32,7 @@ pub struct ManualWire {
 impl Default for ManualWire {
     fn default() -> Self {
         Self {
-            what: None,
+            coordinates: None,
             decimal: DecimalMark::Auto,
             unit: Unit::Millimetre,
             height_unit: None,
@@ -42,39 +42,39 @@ impl Default for ManualWire {
     }
 }
 
-impl Wired for ManualWire {
+impl DriverFactory for ManualWire {
     type Cmm = ManualMachine;
     type Grinder = ManualMachine;
     const BY_PERSON: bool = true;
-    const WORKS_FROM_RUN: bool = true;
+    const READS_RUN_FOLDER: bool = true;
 
     fn coordinates(&self) -> Option<Coordinates> {
-        self.what
+        self.coordinates
     }
 
-    fn cmm(&self, making: &Making<'_>) -> Result<ManualMachine, MakingError> {
+    fn create_cmm(&self, making: &DriverContext<'_>) -> Result<ManualMachine, DriverError> {
         Ok(ManualMachine::new(MachineKind::Cmm, self.settings(making)))
     }
 
-    fn grinder(&self, making: &Making<'_>) -> Result<ManualMachine, MakingError> {
+    fn create_grinder(&self, making: &DriverContext<'_>) -> Result<ManualMachine, DriverError> {
         Ok(ManualMachine::new(MachineKind::Grinder, self.settings(making)))
     }
 }
 
 impl ManualWire {
-    fn settings(&self, making: &Making<'_>) -> ManualSettings {
+    fn settings(&self, making: &DriverContext<'_>) -> ManualSettings {
         ManualSettings {
             part: making.part.to_owned(),
-            folder: making.run_folder.to_owned(),
+            run_folder: making.run_folder.to_owned(),
             content: Content {
-                coordinates: self.what,
+                coordinates: self.coordinates,
                 decimal: self.decimal,
                 unit: self.unit,
                 height_unit: self.height_unit,
                 columns: self.columns.clone(),
             },
-            free_points: making.free_points,
-            least_found: making.least_found,
+            min_free_points: making.min_free_points,
+            min_coverage: making.min_coverage,
             rehearsal: making.rehearsal,
             probe_tolerance_mm: self.probe_tolerance_mm,
         }

@@ -9,23 +9,23 @@
 use std::time::Duration;
 
 use super::codec::{self, Registers};
-use super::link::Ask;
-use super::{Block, Header, ModbusMachine, PAGE, RESULT_BYTES};
-use crate::{DeviceError, Interrupt, Job, MeasuredPoint, Preliminary, State, digest};
+use super::link::LinkRequest;
+use super::{Header, MAX_RESULT_BYTES, ModbusMachine, PAGE_REGISTERS, StatusBlock};
+use crate::{DeviceError, Interrupt, Job, MeasuredPoint, PreliminaryPoints, State, digest};
 
 /// Maximum transmission time of a page. An order waits for the request under way, so nothing is read ahead if a page
 /// takes longer.
-const LONGEST_REQUEST: Duration = Duration::from_millis(75);
+const MAX_PAGE_TIME: Duration = Duration::from_millis(75);
 /// Number of bytes of a page read on a serial line, with its answer.
 const PAGE_BYTES: u32 = 8 + 237;
 /// Number of reads after which a page that is not shown is selected again.
-const LOOKS: u32 = 10;
+const MAX_READS: u32 = 10;
 /// Number of failures after which the rest of a job is read at its end.
-const MISSES: u32 = 3;
+const MAX_FAILURES: u32 = 3;
 
 /// Pages that were read ahead, with the connection, boot and job to which they belong.
 #[derive(Debug)]
-pub(super) struct Ahead {
+pub(super) struct ReadAhead {
     generation: u64,
     boot_id: u32,
     start: u32,
@@ -34,100 +34,100 @@ pub(super) struct Ahead {
     /// Data registers of the pages, from the first page on.
     words: Vec<u16>,
     /// Number of reads of the next page since it was selected; `None` if it was not selected.
-    looks: Option<u32>,
+    reads_since_select: Option<u32>,
     /// Progress at which the next page was not full yet.
     not_full_at: Option<u32>,
 }
 
 /// Failures of the read-ahead in a job.
 #[derive(Debug, Default)]
-pub(super) struct Misses {
+pub(super) struct ReadAheadFailures {
     start: u32,
     count: u32,
 }
 
-impl Ahead {
+impl ReadAhead {
     /// Returns the number of complete points.
-    fn points(&self) -> usize {
+    fn point_count(&self) -> usize {
         self.words.len() / self.header.registers
     }
 
     fn next_page(&self) -> u32 {
-        (self.words.len() / PAGE) as u32
+        (self.words.len() / PAGE_REGISTERS) as u32
     }
 
     /// Returns true if the next page should be full according to the progress in the status.
     fn is_due(&self, progress: u32) -> bool {
         let registers = u64::from(progress) * self.header.registers as u64;
-        let end = self.words.len() + PAGE;
-        end as u64 <= registers && 2 * end <= RESULT_BYTES as usize && self.not_full_at != Some(progress)
+        let end = self.words.len() + PAGE_REGISTERS;
+        end as u64 <= registers && 2 * end <= MAX_RESULT_BYTES as usize && self.not_full_at != Some(progress)
     }
 }
 
 impl ModbusMachine {
     /// Takes at most one step of reading ahead after a read of the status. Returns the new points, if there are any.
-    pub(super) async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<Preliminary> {
-        let block = self.seen.take()?;
+    pub(super) async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<PreliminaryPoints> {
+        let block = self.last_block.take()?;
         let runs = matches!(block.state, State::Execute | State::Holding | State::Held | State::Stopping);
-        let mine = block.job == Some(job) && self.began == Some(block.begun_by) && block.begun_by != 0;
-        let room = self.unit.link.line().transmission(PAGE_BYTES) <= LONGEST_REQUEST;
-        if !(runs && mine && room && self.unit.gives_ahead()) || self.has_missed(block.begun_by) {
+        let mine = block.job == Some(job) && self.last_start == Some(block.begun_by) && block.begun_by != 0;
+        let room = self.unit.link.line().transmission(PAGE_BYTES) <= MAX_PAGE_TIME;
+        if !(runs && mine && room && self.unit.offers_read_ahead()) || self.has_failed_ahead(block.begun_by) {
             return None;
         }
         match self.step_ahead(job, &block, interrupt).await {
             Ok(told) => told,
             Err(error) => {
-                self.miss(block.begun_by, &error);
+                self.count_failure_ahead(block.begun_by, &error);
                 None
             }
         }
     }
 
-    fn has_missed(&self, start: u32) -> bool {
-        self.misses.start == start && self.misses.count >= MISSES
+    fn has_failed_ahead(&self, start: u32) -> bool {
+        self.read_ahead_failures.start == start && self.read_ahead_failures.count >= MAX_FAILURES
     }
 
     /// Counts a failure. A machine that refuses is not asked again in this job. A busy machine is no failure.
-    fn miss(&mut self, start: u32, error: &DeviceError) {
-        if self.misses.start != start {
-            self.misses = Misses { start, count: 0 };
+    fn count_failure_ahead(&mut self, start: u32, error: &DeviceError) {
+        if self.read_ahead_failures.start != start {
+            self.read_ahead_failures = ReadAheadFailures { start, count: 0 };
         }
         match error {
             DeviceError::Exception { .. } if error.is_link() => return,
-            error if error.is_link() => self.misses.count += 1,
-            _ => self.misses.count = MISSES,
+            error if error.is_link() => self.read_ahead_failures.count += 1,
+            _ => self.read_ahead_failures.count = MAX_FAILURES,
         }
-        self.ahead = None;
+        self.read_ahead = None;
     }
 
     async fn step_ahead(
         &mut self,
         job: Job,
-        block: &Block,
+        block: &StatusBlock,
         interrupt: &Interrupt,
-    ) -> Result<Option<Preliminary>, DeviceError> {
+    ) -> Result<Option<PreliminaryPoints>, DeviceError> {
         if interrupt.is_raised() {
             return Ok(None);
         }
-        let Some(ahead) = self.ahead.take().filter(|ahead| self.is_of(ahead, job, block.begun_by)) else {
+        let Some(ahead) = self.read_ahead.take().filter(|ahead| self.belongs_to(ahead, job, block.begun_by)) else {
             return self.begin_ahead(job, block).await.map(|()| None);
         };
-        let ahead = self.ahead.insert(ahead);
+        let ahead = self.read_ahead.insert(ahead);
         let page = ahead.next_page();
         if !ahead.is_due(block.progress.0) {
             return Ok(None);
         }
-        if ahead.looks.is_none_or(|looks| looks >= LOOKS) {
+        if ahead.reads_since_select.is_none_or(|reads_since_select| reads_since_select >= MAX_READS) {
             self.select_ahead(page).await?;
             if interrupt.is_raised() {
                 return Ok(None);
             }
         }
-        self.take_page(page, block.progress.0).await
+        self.read_page_ahead(page, block.progress.0).await
     }
 
     /// Returns true if pages belong to this job and came over this connection from this boot of the machine.
-    fn is_of(&self, ahead: &Ahead, job: Job, start: u32) -> bool {
+    fn belongs_to(&self, ahead: &ReadAhead, job: Job, start: u32) -> bool {
         let boot_id = self.unit.identity().map(|identity| identity.boot_id);
         self.unit.generation() == Some(ahead.generation)
             && boot_id == Some(ahead.boot_id)
@@ -135,9 +135,9 @@ impl ModbusMachine {
     }
 
     /// Reads the header of the result so far. It names the job and the plan, and its number of the finished job is 0.
-    async fn begin_ahead(&mut self, job: Job, block: &Block) -> Result<(), DeviceError> {
+    async fn begin_ahead(&mut self, job: Job, block: &StatusBlock) -> Result<(), DeviceError> {
         let address = self.unit.map.outbox_header;
-        let words = self.unit.once("outbox header", address, Ask::Read { address, count: 56 }).await?;
+        let words = self.unit.request_once("outbox header", address, LinkRequest::Read { address, count: 56 }).await?;
         if words[0] == 0 {
             return Ok(()); // There is nothing yet.
         }
@@ -146,9 +146,10 @@ impl ModbusMachine {
         self.compare([("the digest of the plan that is measured", job.digest.into(), measured.into())])?;
         self.coordinates(&header)?;
         let (Some(generation), start) = (self.unit.generation(), block.begun_by) else { return Ok(()) };
-        let (words, looks, not_full_at) = (Vec::new(), None, None);
+        let (words, reads_since_select, not_full_at) = (Vec::new(), None, None);
         let boot_id = block.boot_id;
-        self.ahead = Some(Ahead { generation, boot_id, start, job, header, words, looks, not_full_at });
+        self.read_ahead =
+            Some(ReadAhead { generation, boot_id, start, job, header, words, reads_since_select, not_full_at });
         Ok(())
     }
 
@@ -156,53 +157,63 @@ impl ModbusMachine {
         let address = self.unit.map.outbox_select;
         let mut select = self.unit.writer();
         select.u32(page);
-        let ask = Ask::Write { address, words: select.words().into() };
-        self.unit.once("outbox select", address, ask).await?;
-        if let Some(ahead) = &mut self.ahead {
-            ahead.looks = Some(0);
+        let ask = LinkRequest::Write { address, words: select.words().into() };
+        self.unit.request_once("outbox select", address, ask).await?;
+        if let Some(ahead) = &mut self.read_ahead {
+            ahead.reads_since_select = Some(0);
         }
         Ok(())
     }
 
     /// Reads the selected page and stores it, if it is shown and full. Returns the new points, if there are any.
-    async fn take_page(&mut self, page: u32, progress: u32) -> Result<Option<Preliminary>, DeviceError> {
+    async fn read_page_ahead(&mut self, page: u32, progress: u32) -> Result<Option<PreliminaryPoints>, DeviceError> {
         let address = self.unit.map.outbox_page;
-        let read = self.unit.once("outbox page", address, Ask::Read { address, count: 4 + PAGE as u16 }).await?;
+        let read = self
+            .unit
+            .request_once("outbox page", address, LinkRequest::Read { address, count: 4 + PAGE_REGISTERS as u16 })
+            .await?;
         let shown = self.unit.registers(&read).u32(0);
-        let Some(mut ahead) = self.ahead.take() else { return Ok(None) };
-        let before = ahead.points();
+        let Some(mut ahead) = self.read_ahead.take() else { return Ok(None) };
+        let before = ahead.point_count();
         match (shown == page, usize::from(read[2])) {
-            (true, PAGE) => {
+            (true, PAGE_REGISTERS) => {
                 ahead.words.extend_from_slice(&read[4..]);
-                (ahead.looks, ahead.not_full_at) = (None, None);
+                (ahead.reads_since_select, ahead.not_full_at) = (None, None);
             }
             (true, 0) => ahead.not_full_at = Some(progress),
             (true, other) => {
                 let (machine, what) = (self.machine(), "data registers of a page that is read while its job runs");
-                return Err(DeviceError::Count { machine, what, expected: PAGE as u64, found: other as u64 });
+                return Err(DeviceError::WrongCount {
+                    machine,
+                    elements: what,
+                    expected: PAGE_REGISTERS as u64,
+                    found: other as u64,
+                });
             }
-            (false, _) => ahead.looks = ahead.looks.map(|looks| looks + 1),
+            (false, _) => {
+                ahead.reads_since_select = ahead.reads_since_select.map(|reads_since_select| reads_since_select + 1)
+            }
         }
         let points = self.points_of(&ahead, before)?;
         let coordinates = self.coordinates(&ahead.header)?;
-        let told = Preliminary { job: ahead.job, from: before, points, coordinates };
-        self.ahead = Some(ahead);
+        let told = PreliminaryPoints { job: ahead.job, first_index: before, points, coordinates };
+        self.read_ahead = Some(ahead);
         Ok((!told.points.is_empty()).then_some(told))
     }
 
     /// Decodes the points from the first one that was not reported yet.
-    fn points_of(&self, ahead: &Ahead, told: usize) -> Result<Vec<MeasuredPoint>, DeviceError> {
+    fn points_of(&self, ahead: &ReadAhead, told: usize) -> Result<Vec<MeasuredPoint>, DeviceError> {
         let Header { format, registers, scale_mm, .. } = ahead.header;
-        let new = &ahead.words[told * registers..ahead.points() * registers];
-        let point = |record| codec::point(Registers::new(record, self.unit.map.word_order), format, scale_mm);
-        let points = new.chunks_exact(registers).map(|record| point(record).map_err(|flaw| self.flawed(flaw)));
+        let new = &ahead.words[told * registers..ahead.point_count() * registers];
+        let point = |record| codec::decode_point(Registers::new(record, self.unit.map.word_order), format, scale_mm);
+        let points = new.chunks_exact(registers).map(|record| point(record).map_err(|flaw| self.record_error(flaw)));
         points.collect()
     }
 
     /// Returns the registers that were read ahead of this result. Returns `None` if they belong to another job, line,
     /// boot, plan or format, or are more than the result has.
-    pub(super) fn kept(&self, job: Job, header: &Header, done: u32) -> Option<Vec<u16>> {
-        let ahead = self.ahead.as_ref().filter(|ahead| self.is_of(ahead, job, done))?;
+    pub(super) fn registers_read_ahead(&self, job: Job, header: &Header, done: u32) -> Option<Vec<u16>> {
+        let ahead = self.read_ahead.as_ref().filter(|ahead| self.belongs_to(ahead, job, done))?;
         let like = |of: &Header| {
             let reals = [of.probe_radius_mm, of.scale_mm].map(f64::to_bits);
             (of.format, of.coordinates, of.identity, reals)

@@ -3,13 +3,13 @@
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
-use super::codec::{Registers, outcome, pass_figures, point, point_registers};
-use super::{Line, Link, ModbusMachine, ModbusSettings, WordOrder};
+use super::codec::{Registers, decode_outcome, decode_pass_record, decode_point, point_registers};
+use super::{LineAddress, Link, ModbusMachine, ModbusSettings, WordOrder};
 use crate::{Job, MachineKind, Status};
 
 /// Returns a driver whose line leads nowhere and is never used.
 fn driver() -> ModbusMachine {
-    let settings = ModbusSettings::new(Line::Tcp { host: "nowhere.invalid".into(), port: 502 });
+    let settings = ModbusSettings::new(LineAddress::Tcp { host: "nowhere.invalid".into(), port: 502 });
     let link = Link::new(settings.line.clone(), settings.request_timeout, Duration::ZERO).expect("a thread");
     ModbusMachine::new(MachineKind::Cmm, link, settings)
 }
@@ -32,9 +32,9 @@ pub fn any_registers(bytes: &[u8]) {
         words
     };
     match which & 0x7f {
-        0 => drop(machine.unit.recognise(&sized(32))),
+        0 => drop(machine.unit.decode_identity(&sized(32))),
         1 => {
-            if let Ok(block) = machine.understand(&sized(48)) {
+            if let Ok(block) = machine.decode_status(&sized(48)) {
                 let Status { temperature_c, progress, .. } = Status::from(&block);
                 assert!(temperature_c.is_none_or(|told| (-40.0..=120.0).contains(&told)));
                 assert!(progress.is_none_or(|(done, total)| done <= total));
@@ -43,11 +43,11 @@ pub fn any_registers(bytes: &[u8]) {
         2 => assert_header(&machine, &sized(56)),
         3 => assert_points(&sized(16), order),
         4 => {
-            if let Ok((.., figures)) = pass_figures(Registers::new(&sized(32), order)) {
+            if let Ok((.., figures)) = decode_pass_record(Registers::new(&sized(32), order)) {
                 assert!(figures.into_iter().all(f64::is_finite));
             }
         }
-        _ => drop(outcome(sized(1)[0])),
+        _ => drop(decode_outcome(sized(1)[0])),
     }
 }
 
@@ -58,7 +58,7 @@ fn assert_header(machine: &ModbusMachine, words: &[u16]) {
         let Ok(header) = machine.header(words, job, kind, block.u32(46)) else { continue };
         let temperature_c = header.temperature_c.unwrap_or(0.0);
         let told = [header.probe_radius_mm, header.scale_mm, temperature_c, header.duration_s];
-        assert!(told.into_iter().all(f64::is_finite) && header.bytes <= super::RESULT_BYTES);
+        assert!(told.into_iter().all(f64::is_finite) && header.bytes <= super::MAX_RESULT_BYTES);
         assert_eq!(header.bytes as usize, 2 * header.registers * header.records as usize);
     }
 }
@@ -66,8 +66,8 @@ fn assert_header(machine: &ModbusMachine, words: &[u16]) {
 fn assert_points(words: &[u16], order: WordOrder) {
     for (format, scale_mm) in [(1, 1.0), (2, 1e-6), (2, f64::MAX)] {
         let size = point_registers(format).unwrap_or_default();
-        if let Ok(point) = point(Registers::new(&words[..size], order), format, scale_mm) {
-            assert!(point.at_mm.into_iter().all(f64::is_finite));
+        if let Ok(point) = decode_point(Registers::new(&words[..size], order), format, scale_mm) {
+            assert!(point.position_mm.into_iter().all(f64::is_finite));
         }
     }
 }

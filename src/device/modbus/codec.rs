@@ -6,7 +6,7 @@
 use sha2::{Digest, Sha256};
 
 use super::settings::WordOrder;
-use crate::{Careful, Command, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, PointStatus};
+use crate::{CarefulStart, Command, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, PointStatus};
 use regrind_core::geometry::Grid;
 
 impl WordOrder {
@@ -182,11 +182,11 @@ pub(super) trait Payload: Identified {
     /// Number of its kind.
     const KIND: u16;
     /// Name in messages.
-    const WHAT: &'static str;
+    const NAME: &'static str;
     /// Returns its registers.
     fn words(&self, order: WordOrder) -> Vec<u16>;
     /// Returns the first value that no machine could accept: the field, its value, and the allowed range.
-    fn flaw(&self) -> Option<(String, f64, &'static str)>;
+    fn invalid_field(&self) -> Option<(String, f64, &'static str)>;
 }
 
 fn sha256(words: &[u16]) -> [u8; 32] {
@@ -207,23 +207,23 @@ fn not_positive<'a>(fields: impl IntoIterator<Item = (&'a str, f64)>) -> Option<
 
 impl Payload for Plan {
     const KIND: u16 = 1;
-    const WHAT: &'static str = "plan";
+    const NAME: &'static str = "plan";
 
     fn words(&self, order: WordOrder) -> Vec<u16> {
         let mut plan = Writer::new(order);
         plan.u16(1).u16(0).u32(self.targets.len() as u32);
         plan.f64s(&[self.probe_radius_mm, self.approach_mm, self.search_mm, self.speed_mm_s, self.safe_height_mm]);
-        match self.careful {
-            Some(Careful { targets, speed_mm_s }) => plan.u32(targets).zeros(2).f64(speed_mm_s),
+        match self.careful_start {
+            Some(CarefulStart { target_count: targets, speed_mm_s }) => plan.u32(targets).zeros(2).f64(speed_mm_s),
             None => plan.zeros(8),
         };
         for target in &self.targets {
-            plan.u32(target.index).u16(target.what as u16).u16(0).f64s(&target.point_mm).f64s(&target.normal);
+            plan.u32(target.index).u16(target.kind as u16).u16(0).f64s(&target.point_mm).f64s(&target.normal);
         }
         plan.finish()
     }
 
-    fn flaw(&self) -> Option<(String, f64, &'static str)> {
+    fn invalid_field(&self) -> Option<(String, f64, &'static str)> {
         let count = self.targets.len();
         if count == 0 || count > 1_000_000 {
             return Some(("the number of targets".into(), count as f64, "1 to 1,000,000"));
@@ -234,7 +234,7 @@ impl Payload for Plan {
             ("search_mm", self.search_mm),
             ("speed_mm_s", self.speed_mm_s),
         ];
-        let careful = self.careful.and_then(|careful| careful.flaw(count, self.speed_mm_s));
+        let careful = self.careful_start.and_then(|careful| careful.invalid_field(count, self.speed_mm_s));
         not_positive(header).or(careful).or_else(|| not_finite([("safe_height_mm", self.safe_height_mm)])).or_else(
             || {
                 self.targets.iter().find_map(|target| {
@@ -257,10 +257,10 @@ impl Payload for Plan {
     }
 }
 
-impl Careful {
-    fn flaw(self, targets: usize, speed_mm_s: f64) -> Option<(String, f64, &'static str)> {
-        if self.targets == 0 || self.targets as usize > targets {
-            return Some(("the number of careful targets".into(), self.targets.into(), "1 to all of them"));
+impl CarefulStart {
+    fn invalid_field(self, targets: usize, speed_mm_s: f64) -> Option<(String, f64, &'static str)> {
+        if self.target_count == 0 || self.target_count as usize > targets {
+            return Some(("the number of careful targets".into(), self.target_count.into(), "1 to all of them"));
         }
         let slower = self.speed_mm_s > 0.0 && self.speed_mm_s <= speed_mm_s;
         (!slower).then(|| ("careful_speed_mm_s".into(), self.speed_mm_s, "above 0, and not above speed_mm_s"))
@@ -269,7 +269,7 @@ impl Careful {
 
 impl Payload for CorrectionMap {
     const KIND: u16 = 2;
-    const WHAT: &'static str = "correction map";
+    const NAME: &'static str = "correction map";
 
     fn words(&self, order: WordOrder) -> Vec<u16> {
         let largest_mm = self.values_mm.iter().fold(0.0, |most: f64, value| most.max(value.abs()));
@@ -281,7 +281,7 @@ impl Payload for CorrectionMap {
         map.finish()
     }
 
-    fn flaw(&self) -> Option<(String, f64, &'static str)> {
+    fn invalid_field(&self) -> Option<(String, f64, &'static str)> {
         let Grid { columns, rows, first_mm, spacing_mm } = self.grid;
         let nodes = columns.checked_mul(rows);
         if nodes != Some(self.values_mm.len()) {
@@ -298,7 +298,7 @@ impl Payload for CorrectionMap {
 
 impl Payload for Pass {
     const KIND: u16 = 3;
-    const WHAT: &'static str = "pass";
+    const NAME: &'static str = "pass";
 
     fn words(&self, order: WordOrder) -> Vec<u16> {
         let mut pass = Writer::new(order);
@@ -314,7 +314,7 @@ impl Payload for Pass {
         pass.finish()
     }
 
-    fn flaw(&self) -> Option<(String, f64, &'static str)> {
+    fn invalid_field(&self) -> Option<(String, f64, &'static str)> {
         let positive = [
             ("wheel_radius_mm", self.wheel_radius_mm),
             ("feed_mm_min", self.feed_mm_min),
@@ -352,7 +352,7 @@ impl Identified for Pass {
 
 /// Error in a record that a machine sent.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum RecordFlaw {
+pub(super) enum RecordError {
     /// A coordinate or another value is not a finite number.
     NotFinite { field: String, value: f64 },
     /// A code is not in the contract.
@@ -369,45 +369,45 @@ pub(super) fn point_registers(format: u16) -> Option<usize> {
 }
 
 /// Decodes one measured point from the registers of its record. `scale_mm` is the scale of counts in format 2.
-pub(super) fn point(record: Registers<'_>, format: u16, scale_mm: f64) -> Result<MeasuredPoint, RecordFlaw> {
+pub(super) fn decode_point(record: Registers<'_>, format: u16, scale_mm: f64) -> Result<MeasuredPoint, RecordError> {
     let index = record.u32(0);
     let status = match record.u16(2) {
         1 => PointStatus::Touched,
         2 => PointStatus::NotFound,
         3 => PointStatus::NotReached,
-        other => return Err(RecordFlaw::Unlisted { field: "the status of a point", found: u32::from(other) }),
+        other => return Err(RecordError::Unlisted { field: "the status of a point", found: u32::from(other) }),
     };
     let at_mm = match format {
         1 => [4, 8, 12].map(|at| record.f64(at)),
         _ => [4, 6, 8].map(|at| f64::from(record.i32(at)) * scale_mm),
     };
     if let Some(value) = at_mm.into_iter().find(|value| !value.is_finite()) {
-        return Err(RecordFlaw::NotFinite { field: format!("a coordinate of point {index}"), value });
+        return Err(RecordError::NotFinite { field: format!("a coordinate of point {index}"), value });
     }
-    Ok(MeasuredPoint { index, status, quality: record.u16(3), at_mm })
+    Ok(MeasuredPoint { index, status, quality: record.u16(3), position_mm: at_mm })
 }
 
 /// Decodes a pass record: job, cycle, outcome, and the six values in their order.
-pub(super) fn pass_figures(record: Registers<'_>) -> Result<(u32, u16, Outcome, [f64; 6]), RecordFlaw> {
+pub(super) fn decode_pass_record(record: Registers<'_>) -> Result<(u32, u16, Outcome, [f64; 6]), RecordError> {
     const FIELDS: [&str; 6] =
         ["path travelled", "volume removed", "largest depth", "idle share", "spindle load", "wheel radius"];
-    let outcome = outcome(record.u16(3))?;
+    let outcome = decode_outcome(record.u16(3))?;
     let figures = [4, 8, 12, 16, 20, 24].map(|at| record.f64(at));
     match FIELDS.iter().zip(figures).find(|(_, value)| !value.is_finite()) {
-        Some((field, value)) => Err(RecordFlaw::NotFinite { field: (*field).into(), value }),
+        Some((field, value)) => Err(RecordError::NotFinite { field: (*field).into(), value }),
         None => Ok((record.u32(0), record.u16(2), outcome, figures)),
     }
 }
 
 /// Decodes the outcome of a job.
-pub(super) fn outcome(number: u16) -> Result<Outcome, RecordFlaw> {
+pub(super) fn decode_outcome(number: u16) -> Result<Outcome, RecordError> {
     Ok(match number {
         0 => Outcome::None,
         1 => Outcome::Complete,
         2 => Outcome::Stopped,
         3 => Outcome::Aborted,
         4 => Outcome::Failed,
-        other => return Err(RecordFlaw::Unlisted { field: "the result", found: u32::from(other) }),
+        other => return Err(RecordError::Unlisted { field: "the result", found: u32::from(other) }),
     })
 }
 
@@ -466,7 +466,7 @@ mod tests {
 
     fn plan() -> Plan {
         let target =
-            Target { index: 9, what: TargetKind::ReferenceSphere, point_mm: [1.0, -2.0, 0.5], normal: [0.0, 0.0, 1.0] };
+            Target { index: 9, kind: TargetKind::ReferenceSphere, point_mm: [1.0, -2.0, 0.5], normal: [0.0, 0.0, 1.0] };
         Plan {
             targets: vec![target],
             probe_radius_mm: 2.0,
@@ -474,7 +474,7 @@ mod tests {
             search_mm: 0.5,
             speed_mm_s: 4.0,
             safe_height_mm: 8.0,
-            careful: None,
+            careful_start: None,
         }
     }
 
@@ -486,12 +486,12 @@ mod tests {
         assert_eq!(words[4..8], [0x4000, 0, 0, 0]); // 2.0 at byte 8
         assert_eq!(words[20..24], [0x4020, 0, 0, 0]); // 8.0 at byte 40
         assert_eq!(words[24..32], [0; 8]);
-        let careful = Plan { careful: Some(Careful { targets: 1, speed_mm_s: 2.0 }), ..plan() };
+        let careful = Plan { careful_start: Some(CarefulStart { target_count: 1, speed_mm_s: 2.0 }), ..plan() };
         assert_eq!(careful.words(WordOrder::Big)[24..32], [0, 1, 0, 0, 0x4000, 0, 0, 0]); // at byte 48 and 56
         assert_eq!(careful.words(WordOrder::Little)[24..32], [1, 0, 0, 0, 0, 0, 0, 0x4000]);
         for (targets, speed_mm_s) in [(0, 2.0), (2, 2.0), (1, 0.0), (1, 4.5), (1, f64::NAN)] {
-            let flawed = Plan { careful: Some(Careful { targets, speed_mm_s }), ..plan() };
-            assert!(flawed.flaw().is_some(), "{targets} {speed_mm_s}");
+            let flawed = Plan { careful_start: Some(CarefulStart { target_count: targets, speed_mm_s }), ..plan() };
+            assert!(flawed.invalid_field().is_some(), "{targets} {speed_mm_s}");
         }
         assert_eq!(words[32..36], [0, 9, 2, 0]); // the target at byte 64
         assert_eq!(words[40..44], [0xc000, 0, 0, 0]); // y = -2 at byte 64 + 16
@@ -527,7 +527,7 @@ mod tests {
         assert_eq!(words[..4], [1, 2, 0, 0]);
         assert_eq!(words[24..28], [0xbff0, 0, 0, 0]); // least x, -1, at byte 48
         assert_eq!(words[48..], [0xcdcd; 16]); // byte 96
-        assert_eq!((map.flaw(), pass.flaw(), plan().flaw()), (None, None, None));
+        assert_eq!((map.invalid_field(), pass.invalid_field(), plan().invalid_field()), (None, None, None));
     }
 
     #[test]
@@ -541,16 +541,16 @@ mod tests {
     fn what_no_machine_could_take_is_named() {
         let mut bad = plan();
         bad.targets[0].point_mm[2] = f64::NAN;
-        assert!(bad.flaw().is_some_and(|(field, ..)| field.contains("target 9")));
+        assert!(bad.invalid_field().is_some_and(|(field, ..)| field.contains("target 9")));
         bad = plan();
         bad.targets[0].normal = [0.0, 0.0, 2.0];
-        assert!(bad.flaw().is_some_and(|(_, length, _)| length == 2.0));
+        assert!(bad.invalid_field().is_some_and(|(_, length, _)| length == 2.0));
         bad = plan();
         bad.targets.clear();
-        assert!(bad.flaw().is_some());
+        assert!(bad.invalid_field().is_some());
         bad = plan();
         bad.probe_radius_mm = 0.0;
-        assert!(bad.flaw().is_some());
+        assert!(bad.invalid_field().is_some());
     }
 
     #[test]
@@ -558,14 +558,14 @@ mod tests {
         let mut writer = Writer::new(WordOrder::Little);
         writer.u32(70_000).u16(1).u16(5).f64s(&[1.5, -2.5, 3.5]);
         let words = writer.finish();
-        let read = point(Registers::new(&words, WordOrder::Little), 1, 1.0).unwrap();
+        let read = decode_point(Registers::new(&words, WordOrder::Little), 1, 1.0).unwrap();
         assert_eq!(read.index, 70_000);
-        assert_eq!((read.status, read.quality, read.at_mm), (PointStatus::Touched, 5, [1.5, -2.5, 3.5]));
+        assert_eq!((read.status, read.quality, read.position_mm), (PointStatus::Touched, 5, [1.5, -2.5, 3.5]));
         let mut writer = Writer::new(WordOrder::Big);
         writer.u32(1).u16(2).u16(100).u32(10).u32((-20_i32).cast_unsigned()).u32(0);
         let words = writer.finish();
-        let read = point(Registers::new(&words, WordOrder::Big), 2, 0.5).unwrap();
-        assert_eq!((read.status, read.at_mm), (PointStatus::NotFound, [5.0, -10.0, 0.0]));
+        let read = decode_point(Registers::new(&words, WordOrder::Big), 2, 0.5).unwrap();
+        assert_eq!((read.status, read.position_mm), (PointStatus::NotFound, [5.0, -10.0, 0.0]));
         assert_eq!((point_registers(1), point_registers(2), point_registers(3)), (Some(16), Some(10), None));
     }
 
@@ -575,8 +575,8 @@ mod tests {
             let mut writer = Writer::new(WordOrder::Big);
             writer.u32(3).u16(1).u16(0).f64s(&[0.0, value, 0.0]);
             let words = writer.finish();
-            let flaw = point(Registers::new(&words, WordOrder::Big), 1, 1.0);
-            assert!(matches!(flaw, Err(RecordFlaw::NotFinite { field, .. }) if field.contains("point 3")));
+            let flaw = decode_point(Registers::new(&words, WordOrder::Big), 1, 1.0);
+            assert!(matches!(flaw, Err(RecordError::NotFinite { field, .. }) if field.contains("point 3")));
         }
     }
 
@@ -585,8 +585,8 @@ mod tests {
         fn any_registers_read_as_something_and_never_panic(words in prop::collection::vec(any::<u16>(), 0..70), at in 0_usize..80) {
             let registers = Registers::new(&words, WordOrder::Little);
             let _ = (registers.u32(at), registers.f64(at), registers.text(at, 16), registers.identity(at));
-            let _ = point(registers, 1, 1.0);
-            let _ = pass_figures(registers);
+            let _ = decode_point(registers, 1, 1.0);
+            let _ = decode_pass_record(registers);
         }
 
         #[test]

@@ -34,18 +34,18 @@ use tokio_modbus::{ProtocolError, Request, Response};
 use tokio_serial::{SerialPort as _, SerialStream};
 
 use super::port;
-use super::settings::Line;
+use super::settings::LineAddress;
 
-/// First pause before a line is opened again; it doubles up to [`LONGEST_BACKOFF`].
-const FIRST_BACKOFF: Duration = Duration::from_millis(100);
+/// First pause before a line is opened again; it doubles up to [`MAX_BACKOFF`].
+const MIN_BACKOFF: Duration = Duration::from_millis(100);
 /// Longest pause before a line is opened again.
-const LONGEST_BACKOFF: Duration = Duration::from_secs(5);
+const MAX_BACKOFF: Duration = Duration::from_secs(5);
 /// Maximum time to wait for silence on a line.
-const LONGEST_DRAIN: Duration = Duration::from_secs(2);
+const MAX_DRAIN_TIME: Duration = Duration::from_secs(2);
 
 /// Statistics of a line since it was created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct LinkFigures {
+pub struct LinkStatistics {
     /// Number of requests sent.
     pub requests: u64,
     /// Number of valid answers.
@@ -67,15 +67,15 @@ pub struct LinkFigures {
     /// Sum of the times from request to answer, in ns.
     pub answer_ns: u64,
     /// Longest time from request to answer, in ns.
-    pub slowest_ns: u64,
+    pub max_answer_ns: u64,
 }
 
 /// Statistics of a line, which its thread writes and its handles read.
 #[derive(Debug, Clone, Default)]
-struct Counters(Arc<Mutex<LinkFigures>>);
+struct Counters(Arc<Mutex<LinkStatistics>>);
 
 impl Counters {
-    fn count(&self, change: impl FnOnce(&mut LinkFigures)) {
+    fn count(&self, change: impl FnOnce(&mut LinkStatistics)) {
         change(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner));
     }
 }
@@ -99,7 +99,7 @@ pub(super) enum LinkFault {
 
 /// Request to a line.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Ask {
+pub(super) enum LinkRequest {
     Read {
         address: u16,
         count: u16,
@@ -109,16 +109,16 @@ pub(super) enum Ask {
         words: Arc<[u16]>,
     },
     /// Drops the connection: a check that the line cannot make has found its data invalid.
-    Distrust,
+    DropConnection,
 }
 
-type Answer = Result<(u64, Vec<u16>), LinkFault>;
+type LinkResult = Result<(u64, Vec<u16>), LinkFault>;
 
-struct Question {
+struct QueuedRequest {
     unit: u8,
     generation: Option<u64>,
-    ask: Ask,
-    reply: oneshot::Sender<Answer>,
+    request: LinkRequest,
+    reply: oneshot::Sender<LinkResult>,
 }
 
 /// Stream between a line and its machines. It can report if bytes wait to be read.
@@ -127,75 +127,87 @@ pub trait LineStream: AsyncRead + AsyncWrite + Debug + Send + Unpin {
     ///
     /// # Errors
     /// The far side has closed the stream.
-    fn waiting(&mut self, cx: &mut Context<'_>) -> io::Result<usize>;
+    fn waiting_bytes(&mut self, cx: &mut Context<'_>) -> io::Result<usize>;
 }
 
 /// Method to open a line. An own implementation is for lines that use no socket and no port of this computer.
-pub trait Dial: Debug + Send + Sync {
+pub trait Connector: Debug + Send + Sync {
     /// Opens the line.
-    fn dial<'a>(&'a mut self, line: &'a Line) -> Dialled<'a>;
+    fn connect<'a>(&'a mut self, line: &'a LineAddress) -> ConnectFuture<'a>;
 }
 
 /// Future of a line that is being opened.
-pub type Dialled<'a> = Pin<Box<dyn Future<Output = io::Result<Box<dyn LineStream>>> + Send + 'a>>;
+pub type ConnectFuture<'a> = Pin<Box<dyn Future<Output = io::Result<Box<dyn LineStream>>> + Send + 'a>>;
 
 /// Handle to one line. Clones share it; the line ends with its last handle.
 #[derive(Debug, Clone)]
 pub struct Link {
-    line: Line,
+    line: LineAddress,
     request_timeout: Duration,
-    questions: mpsc::Sender<Question>,
+    requests: mpsc::Sender<QueuedRequest>,
     /// Ends a pause of the line early.
-    hurried: Arc<Notify>,
+    pause_skipped: Arc<Notify>,
     counters: Counters,
 }
 
 impl Link {
     /// Creates a line that is opened with its first request. `quarantine` is the worst-case answer time of a machine on
     /// it: after an error the line is not used for this time.
-    pub fn new(line: Line, request_timeout: Duration, quarantine: Duration) -> io::Result<Self> {
+    pub fn new(line: LineAddress, request_timeout: Duration, quarantine: Duration) -> io::Result<Self> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let name = format!("line {line}");
         let (link, connection, inbox) =
-            Self::ends(line, request_timeout, quarantine, Box::new(OfThisComputer), rand::random());
+            Self::build_parts(line, request_timeout, quarantine, Box::new(SystemConnector), rand::random());
         std::thread::Builder::new().name(name).spawn(move || runtime.block_on(connection.run(inbox)))?;
         Ok(link)
     }
 
     /// Creates a line that `dial` opens, as a task of the current runtime. Its random numbers come from `seed`. For
     /// machines in the same process, and for simulated time.
-    pub fn over(line: Line, request_timeout: Duration, quarantine: Duration, dial: Box<dyn Dial>, seed: u64) -> Self {
-        let (link, connection, inbox) = Self::ends(line, request_timeout, quarantine, dial, seed);
+    pub fn with_connector(
+        line: LineAddress,
+        request_timeout: Duration,
+        quarantine: Duration,
+        dial: Box<dyn Connector>,
+        seed: u64,
+    ) -> Self {
+        let (link, connection, inbox) = Self::build_parts(line, request_timeout, quarantine, dial, seed);
         tokio::spawn(connection.run(inbox));
         link
     }
 
-    fn ends(
-        line: Line,
+    fn build_parts(
+        line: LineAddress,
         request_timeout: Duration,
         quarantine: Duration,
-        dial: Box<dyn Dial>,
+        dial: Box<dyn Connector>,
         seed: u64,
-    ) -> (Self, Connection, mpsc::Receiver<Question>) {
+    ) -> (Self, Connection, mpsc::Receiver<QueuedRequest>) {
         let (questions, inbox) = mpsc::channel(16);
-        let link = Self { line, request_timeout, questions, hurried: Arc::default(), counters: Counters::default() };
+        let link = Self {
+            line,
+            request_timeout,
+            requests: questions,
+            pause_skipped: Arc::default(),
+            counters: Counters::default(),
+        };
         let connection = Connection::new(&link, quarantine, dial, StdRng::seed_from_u64(seed));
         (link, connection, inbox)
     }
 
     /// Returns the address of the line.
-    pub fn line(&self) -> &Line {
+    pub fn line(&self) -> &LineAddress {
         &self.line
     }
 
     /// Returns the statistics so far.
-    pub fn figures(&self) -> LinkFigures {
+    pub fn statistics(&self) -> LinkStatistics {
         *self.counters.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Lets the next request open the line at once, without the pause after an error.
-    pub(super) fn hurry(&self) {
-        self.hurried.notify_one();
+    pub(super) fn skip_pause(&self) {
+        self.pause_skipped.notify_one();
     }
 
     pub(super) fn request_timeout(&self) -> Duration {
@@ -208,13 +220,13 @@ impl Link {
 
     /// Sends one request to one unit and returns the generation on which the answer came, with the registers. With a
     /// generation, the request is sent only on that connection; without one, the line is opened if necessary.
-    pub(super) async fn ask(&self, unit: u8, generation: Option<u64>, ask: Ask) -> Answer {
+    pub(super) async fn request(&self, unit: u8, generation: Option<u64>, ask: LinkRequest) -> LinkResult {
         let (reply, answer) = oneshot::channel();
-        let question = Question { unit, generation, ask, reply };
+        let question = QueuedRequest { unit, generation, request: ask, reply };
         // The line has its own timeouts; this one is for a port that blocks inside the operating system.
-        let limit = self.request_timeout * 4 + LONGEST_BACKOFF * 2 + LONGEST_DRAIN;
+        let limit = self.request_timeout * 4 + MAX_BACKOFF * 2 + MAX_DRAIN_TIME;
         let both = async {
-            self.questions.send(question).await.map_err(|_| LinkFault::Disconnected)?;
+            self.requests.send(question).await.map_err(|_| LinkFault::Disconnected)?;
             answer.await.unwrap_or(Err(LinkFault::Disconnected))
         };
         timeout(limit, both).await.unwrap_or(Err(LinkFault::TimedOut))
@@ -223,12 +235,12 @@ impl Link {
 
 /// Receiving side of the channel: the connection and its history.
 struct Connection {
-    line: Line,
+    line: LineAddress,
     request_timeout: Duration,
     quarantine: Duration,
-    dial: Box<dyn Dial>,
-    chance: StdRng,
-    hurried: Arc<Notify>,
+    connector: Box<dyn Connector>,
+    rng: StdRng,
+    pause_skipped: Arc<Notify>,
     counters: Counters,
     connection: Option<tokio_modbus::client::Context>,
     generation: u64,
@@ -238,15 +250,15 @@ struct Connection {
 }
 
 impl Connection {
-    fn new(link: &Link, quarantine: Duration, dial: Box<dyn Dial>, chance: StdRng) -> Self {
+    fn new(link: &Link, quarantine: Duration, dial: Box<dyn Connector>, chance: StdRng) -> Self {
         let now = Instant::now();
         Self {
             line: link.line.clone(),
             request_timeout: link.request_timeout,
             quarantine,
-            dial,
-            chance,
-            hurried: link.hurried.clone(),
+            connector: dial,
+            rng: chance,
+            pause_skipped: link.pause_skipped.clone(),
             counters: link.counters.clone(),
             connection: None,
             generation: 0,
@@ -256,7 +268,7 @@ impl Connection {
         }
     }
 
-    async fn run(mut self, mut inbox: mpsc::Receiver<Question>) {
+    async fn run(mut self, mut inbox: mpsc::Receiver<QueuedRequest>) {
         while let Some(question) = inbox.recv().await {
             if question.reply.is_closed() {
                 continue; // the client has gone, so the request need not be sent
@@ -266,20 +278,20 @@ impl Connection {
         }
     }
 
-    async fn serve(&mut self, question: &Question) -> Answer {
+    async fn serve(&mut self, question: &QueuedRequest) -> LinkResult {
         let stale = question.generation.is_some_and(|trusted| self.connection.is_none() || trusted != self.generation);
         if stale {
             return Err(LinkFault::Stale);
         }
-        if question.ask == Ask::Distrust {
+        if question.request == LinkRequest::DropConnection {
             self.counters.count(|figures| figures.corrupt += 1);
-            self.give_up();
+            self.drop_connection();
             return Ok((self.generation, Vec::new()));
         }
         if self.connection.is_none() {
             self.open().await?;
         }
-        let answer = self.exchange(question.unit, &question.ask).await;
+        let answer = self.exchange(question.unit, &question.request).await;
         match answer {
             Ok(words) => {
                 if question.generation.is_some() {
@@ -288,13 +300,13 @@ impl Connection {
                 Ok((self.generation, words))
             }
             Err(fault) => {
-                self.account(fault);
+                self.record_fault(fault);
                 Err(fault)
             }
         }
     }
 
-    fn account(&mut self, fault: LinkFault) {
+    fn record_fault(&mut self, fault: LinkFault) {
         self.counters.count(|figures| match fault {
             LinkFault::Exception(_) => figures.exceptions += 1,
             LinkFault::TimedOut => figures.timeouts += 1,
@@ -302,16 +314,16 @@ impl Connection {
             LinkFault::Unreachable(_) | LinkFault::Disconnected | LinkFault::Stale => figures.disconnects += 1,
         });
         if !matches!(fault, LinkFault::Exception(_)) {
-            self.give_up();
+            self.drop_connection();
         }
     }
 
     /// Drops the connection with all data that may still arrive on it, and sets the pause before the next opening.
-    fn give_up(&mut self) {
+    fn drop_connection(&mut self) {
         self.connection = None;
         self.failures = self.failures.saturating_add(1);
-        let full = FIRST_BACKOFF.saturating_mul(1 << (self.failures - 1).min(10)).min(LONGEST_BACKOFF);
-        let jittered = full.mul_f64(0.5 + 0.5 * self.chance.random::<f64>());
+        let full = MIN_BACKOFF.saturating_mul(1 << (self.failures - 1).min(10)).min(MAX_BACKOFF);
+        let jittered = full.mul_f64(0.5 + 0.5 * self.rng.random::<f64>());
         self.not_before = Instant::now() + jittered.max(self.quarantine);
     }
 
@@ -320,10 +332,10 @@ impl Connection {
             biased;
             () = sleep_until(self.not_before) => {}
             // The line is drained, and its sync proved, all the same.
-            () = self.hurried.notified() => {}
+            () = self.pause_skipped.notified() => {}
         }
-        let limit = self.request_timeout.max(Duration::from_secs(1)) + LONGEST_DRAIN;
-        let opened = timeout(limit, connect(&self.line, self.dial.as_mut())).await;
+        let limit = self.request_timeout.max(Duration::from_secs(1)) + MAX_DRAIN_TIME;
+        let opened = timeout(limit, connect(&self.line, self.connector.as_mut())).await;
         let opened = opened.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
         match opened {
             Ok(connection) => {
@@ -334,22 +346,22 @@ impl Connection {
             }
             Err(error) => {
                 self.counters.count(|figures| figures.refused += 1);
-                self.give_up();
+                self.drop_connection();
                 Err(LinkFault::Unreachable(error.kind()))
             }
         }
     }
 
-    async fn exchange(&mut self, unit: u8, ask: &Ask) -> Result<Vec<u16>, LinkFault> {
+    async fn exchange(&mut self, unit: u8, ask: &LinkRequest) -> Result<Vec<u16>, LinkFault> {
         sleep_until(self.silent_from).await;
         let request = match ask {
-            Ask::Read { address, count } => Request::ReadHoldingRegisters(*address, *count),
-            Ask::Write { address, words } => {
+            LinkRequest::Read { address, count } => Request::ReadHoldingRegisters(*address, *count),
+            LinkRequest::Write { address, words } => {
                 Request::WriteMultipleRegisters(*address, std::borrow::Cow::Borrowed(words))
             }
-            Ask::Distrust => return Ok(Vec::new()),
+            LinkRequest::DropConnection => return Ok(Vec::new()),
         };
-        let limit = self.request_timeout + self.line.transmission_at_most();
+        let limit = self.request_timeout + self.line.max_transmission_time();
         let Some(connection) = &mut self.connection else { return Err(LinkFault::Stale) };
         connection.set_slave(Slave(unit));
         self.counters.count(|figures| figures.requests += 1);
@@ -361,7 +373,7 @@ impl Connection {
         self.counters.count(|figures| {
             figures.answers += 1;
             figures.answer_ns += taken_ns;
-            figures.slowest_ns = figures.slowest_ns.max(taken_ns);
+            figures.max_answer_ns = figures.max_answer_ns.max(taken_ns);
         });
         Ok(words)
     }
@@ -369,7 +381,7 @@ impl Connection {
 
 /// Returns the registers if a response is the complete answer to the request and nothing else; otherwise returns the
 /// error.
-fn check(ask: &Ask, response: tokio_modbus::Result<Response>) -> Result<Vec<u16>, LinkFault> {
+fn check(ask: &LinkRequest, response: tokio_modbus::Result<Response>) -> Result<Vec<u16>, LinkFault> {
     let response = response.map_err(fault_of)?;
     let response = response.map_err(|exception| LinkFault::Exception(exception.into()))?;
     let corrupt = |what, expected: usize, found: usize| LinkFault::Corrupt {
@@ -378,13 +390,15 @@ fn check(ask: &Ask, response: tokio_modbus::Result<Response>) -> Result<Vec<u16>
         found: found as u64,
     };
     match (ask, response) {
-        (Ask::Read { count, .. }, Response::ReadHoldingRegisters(words)) if words.len() == usize::from(*count) => {
+        (LinkRequest::Read { count, .. }, Response::ReadHoldingRegisters(words))
+            if words.len() == usize::from(*count) =>
+        {
             Ok(words)
         }
-        (Ask::Read { count, .. }, Response::ReadHoldingRegisters(words)) => {
+        (LinkRequest::Read { count, .. }, Response::ReadHoldingRegisters(words)) => {
             Err(corrupt("number of registers", usize::from(*count), words.len()))
         }
-        (Ask::Write { address, words }, Response::WriteMultipleRegisters(at, count)) => {
+        (LinkRequest::Write { address, words }, Response::WriteMultipleRegisters(at, count)) => {
             if at != *address {
                 Err(corrupt("echo of an address", usize::from(*address), usize::from(at)))
             } else if usize::from(count) != words.len() {
@@ -394,7 +408,7 @@ fn check(ask: &Ask, response: tokio_modbus::Result<Response>) -> Result<Vec<u16>
             }
         }
         (ask, response) => {
-            let expected = if matches!(ask, Ask::Read { .. }) { 3 } else { 16 };
+            let expected = if matches!(ask, LinkRequest::Read { .. }) { 3 } else { 16 };
             Err(corrupt("function", expected, usize::from(response.function_code().value())))
         }
     }
@@ -421,7 +435,7 @@ fn fault_of(error: tokio_modbus::Error) -> LinkFault {
     }
 }
 
-impl Line {
+impl LineAddress {
     /// Returns the silence of 3.5 characters that separates two frames; zero on TCP.
     fn silence(&self) -> Duration {
         match self {
@@ -432,7 +446,7 @@ impl Line {
     }
 
     /// Returns the transmission time of the longest request with the longest answer.
-    fn transmission_at_most(&self) -> Duration {
+    fn max_transmission_time(&self) -> Duration {
         self.transmission(2 * 256)
     }
 
@@ -446,33 +460,33 @@ impl Line {
 }
 
 /// Opens a line, and reads a serial line until it is silent.
-async fn connect(line: &Line, dial: &mut dyn Dial) -> io::Result<tokio_modbus::client::Context> {
-    let mut stream = dial.dial(line).await?;
+async fn connect(line: &LineAddress, dial: &mut dyn Connector) -> io::Result<tokio_modbus::client::Context> {
+    let mut stream = dial.connect(line).await?;
     match line {
-        Line::Tcp { .. } => Ok(tokio_modbus::client::tcp::attach(Listening::new(stream))),
-        Line::Rtu { .. } => {
+        LineAddress::Tcp { .. } => Ok(tokio_modbus::client::tcp::attach(RequestStream::new(stream))),
+        LineAddress::Rtu { .. } => {
             drain(stream.as_mut(), line.silence().max(Duration::from_millis(5))).await?;
-            Ok(tokio_modbus::client::rtu::attach(Listening::new(stream)))
+            Ok(tokio_modbus::client::rtu::attach(RequestStream::new(stream)))
         }
     }
 }
 
 /// Sockets and serial ports of this computer.
 #[derive(Debug)]
-pub(crate) struct OfThisComputer;
+pub(crate) struct SystemConnector;
 
-impl Dial for OfThisComputer {
-    fn dial<'a>(&'a mut self, line: &'a Line) -> Dialled<'a> {
+impl Connector for SystemConnector {
+    fn connect<'a>(&'a mut self, line: &'a LineAddress) -> ConnectFuture<'a> {
         Box::pin(async move {
             match line {
-                Line::Tcp { host, port } => {
+                LineAddress::Tcp { host, port } => {
                     let stream = TcpStream::connect((host.as_str(), *port)).await?;
                     stream.set_nodelay(true)?;
                     // A connection that is given up discards its unsent data: no START arrives after that.
                     stream.set_zero_linger()?;
                     Ok(Box::new(stream) as Box<dyn LineStream>)
                 }
-                Line::Rtu { device, baud, parity, stop_bits } => {
+                LineAddress::Rtu { device, baud, parity, stop_bits } => {
                     Ok(Box::new(port::open(device, *baud, *parity, *stop_bits)?) as Box<dyn LineStream>)
                 }
             }
@@ -482,7 +496,7 @@ impl Dial for OfThisComputer {
 
 /// Reads a serial line until it has been silent for a time.
 async fn drain(port: &mut dyn LineStream, silence: Duration) -> io::Result<()> {
-    let until = Instant::now() + LONGEST_DRAIN;
+    let until = Instant::now() + MAX_DRAIN_TIME;
     let mut bytes = [0; 256];
     while Instant::now() < until {
         match timeout(silence, port.read(&mut bytes)).await {
@@ -496,7 +510,7 @@ async fn drain(port: &mut dyn LineStream, silence: Duration) -> io::Result<()> {
 }
 
 impl LineStream for TcpStream {
-    fn waiting(&mut self, cx: &mut Context<'_>) -> io::Result<usize> {
+    fn waiting_bytes(&mut self, cx: &mut Context<'_>) -> io::Result<usize> {
         let mut byte = [0; 1];
         match self.poll_peek(cx, &mut ReadBuf::new(&mut byte)) {
             Poll::Pending => Ok(0),
@@ -507,7 +521,7 @@ impl LineStream for TcpStream {
 }
 
 impl LineStream for SerialStream {
-    fn waiting(&mut self, _: &mut Context<'_>) -> io::Result<usize> {
+    fn waiting_bytes(&mut self, _: &mut Context<'_>) -> io::Result<usize> {
         Ok(self.bytes_to_read()? as usize)
     }
 }
@@ -516,31 +530,31 @@ impl LineStream for SerialStream {
 /// answer could not be distinguished from them. The flush does not wait until a serial port has sent everything,
 /// because that would block the thread.
 #[derive(Debug)]
-struct Listening {
+struct RequestStream {
     inner: Box<dyn LineStream>,
-    asking: bool,
+    in_request: bool,
 }
 
-impl Listening {
+impl RequestStream {
     fn new(inner: Box<dyn LineStream>) -> Self {
-        Self { inner, asking: false }
+        Self { inner, in_request: false }
     }
 }
 
-impl AsyncRead for Listening {
+impl AsyncRead for RequestStream {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        self.asking = false;
+        self.in_request = false;
         Pin::new(&mut self.inner).poll_read(cx, buffer)
     }
 }
 
-impl AsyncWrite for Listening {
+impl AsyncWrite for RequestStream {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        if !self.asking {
-            if self.inner.waiting(cx)? > 0 {
+        if !self.in_request {
+            if self.inner.waiting_bytes(cx)? > 0 {
                 return Poll::Ready(Err(io::ErrorKind::InvalidData.into()));
             }
-            self.asking = true;
+            self.in_request = true;
         }
         Pin::new(&mut self.inner).poll_write(cx, bytes)
     }
@@ -561,8 +575,8 @@ mod tests {
 
     #[test]
     fn an_answer_is_whole_or_it_is_none() {
-        let read = Ask::Read { address: 64, count: 2 };
-        let write = Ask::Write { address: 40, words: Arc::from([1, 2, 3]) };
+        let read = LinkRequest::Read { address: 64, count: 2 };
+        let write = LinkRequest::Write { address: 40, words: Arc::from([1, 2, 3]) };
         assert_eq!(check(&read, Ok(Ok(Response::ReadHoldingRegisters(vec![7, 8])))), Ok(vec![7, 8]));
         assert_eq!(check(&write, Ok(Ok(Response::WriteMultipleRegisters(40, 3)))), Ok(vec![]));
         for (ask, response) in [
@@ -581,23 +595,24 @@ mod tests {
 
     #[test]
     fn frames_on_a_serial_line_are_three_and_a_half_characters_apart() {
-        let line = |baud| Line::Rtu { device: "x".into(), baud, parity: Parity::Even, stop_bits: 1 };
+        let line = |baud| LineAddress::Rtu { device: "x".into(), baud, parity: Parity::Even, stop_bits: 1 };
         assert_eq!(line(115_200).silence(), Duration::from_micros(1750));
         assert!((line(9_600).silence().as_secs_f64() - 4.0104e-3).abs() < 1e-6);
-        assert_eq!(Line::Tcp { host: "x".into(), port: 502 }.silence(), Duration::ZERO);
+        assert_eq!(LineAddress::Tcp { host: "x".into(), port: 502 }.silence(), Duration::ZERO);
     }
 
     #[tokio::test]
     async fn a_line_waits_longer_after_every_failure_and_says_what_the_system_said() {
-        let wire = Line::Rtu { device: "/dev/no-such-port".into(), baud: 9600, parity: Parity::Even, stop_bits: 1 };
+        let wire =
+            LineAddress::Rtu { device: "/dev/no-such-port".into(), baud: 9600, parity: Parity::Even, stop_bits: 1 };
         let link = Link::new(wire, Duration::from_millis(50), Duration::ZERO).unwrap();
         let began = Instant::now();
         for _ in 0..3 {
-            let answer = link.ask(1, None, Ask::Read { address: 0, count: 1 }).await;
+            let answer = link.request(1, None, LinkRequest::Read { address: 0, count: 1 }).await;
             assert!(matches!(answer, Err(LinkFault::Unreachable(_))), "{answer:?}");
         }
         // At least half of 0.1 s and of 0.2 s, whatever the random numbers are.
         assert!(began.elapsed() >= Duration::from_millis(150), "{:?}", began.elapsed());
-        assert_eq!((link.figures().refused, link.figures().opened), (3, 0));
+        assert_eq!((link.statistics().refused, link.statistics().opened), (3, 0));
     }
 }

@@ -30,35 +30,35 @@ use tokio::time::{Instant, sleep};
 use super::range;
 use super::{
     Answer, Armed, Cmm, Command, Coordinates, CorrectionMap, DeviceError, Fault, Grinder, Identity, Interrupt, Job,
-    Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Preliminary, Reconciled, SignalValue, Started,
-    State, Status, digest,
+    Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, PreliminaryPoints, Reconciled, SignalValue,
+    Started, State, Status, digest,
 };
-use ahead::{Ahead, Misses};
+use ahead::{ReadAhead, ReadAheadFailures};
 #[cfg(fuzzing)]
 pub use any_registers::any_registers;
-use codec::{CommandFrame, Payload, RecordFlaw, crc32};
-use link::Ask;
-pub(crate) use link::OfThisComputer;
-pub use link::{Dial, Dialled, LineStream, Link, LinkFigures};
+use codec::{CommandFrame, Payload, RecordError, crc32};
+use link::LinkRequest;
+pub(crate) use link::SystemConnector;
+pub use link::{ConnectFuture, Connector, LineStream, Link, LinkStatistics};
 pub use settings::{
-    Line, ModbusSettings, Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
+    LineAddress, ModbusSettings, Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
 };
-use unit::{Unit, UnitSettings};
+use unit::{ModbusUnit, UnitSettings};
 
 /// Number of data registers in a full page.
-const PAGE: usize = 112;
+const PAGE_REGISTERS: usize = 112;
 /// Time after which a machine with an unchanged heartbeat counts as frozen.
 const FROZEN_AFTER: Duration = Duration::from_millis(1500);
 /// Time for a machine to acknowledge a command before the same frame is written again.
-const ACKNOWLEDGED_WITHIN: Duration = Duration::from_millis(500);
+const ACKNOWLEDGE_TIMEOUT: Duration = Duration::from_millis(500);
 /// Time for a machine to process a payload, or to reach the announced state.
-const SETTLED_WITHIN: Duration = Duration::from_secs(5);
+const SETTLE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Time over which a start must be seen as not accepted.
-const SEEN_TWICE_OVER: Duration = Duration::from_millis(1050);
+const NOT_STARTED_CONFIRMATION: Duration = Duration::from_millis(1050);
 /// Temperature in the status of a machine without a thermometer.
 const NO_THERMOMETER: i16 = i16::MIN;
 /// Maximum size of a result of a measuring machine, in bytes.
-const RESULT_BYTES: u32 = 64 << 20;
+const MAX_RESULT_BYTES: u32 = 64 << 20;
 
 /// Payload that this driver has brought into force at the machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -71,12 +71,12 @@ struct Slot {
 /// Common part of the drivers of both machines.
 #[derive(Debug)]
 pub struct ModbusMachine {
-    unit: Unit,
+    unit: ModbusUnit,
     owner: u32,
     epoch: u32,
     retries: u32,
     signals: Vec<Signal>,
-    beat_every: Duration,
+    heartbeat_interval: Duration,
     expected_name: Option<String>,
     simulation: Option<bool>,
     sequence: u32,
@@ -84,19 +84,19 @@ pub struct ModbusMachine {
     /// is written.
     owned: bool,
     /// True if this client has connected to the machine before.
-    met: bool,
+    has_connected: bool,
     /// Sequence number of the START that was given last, or that was reconciled last. Only a job that it has begun
     /// belongs to this client.
-    began: Option<u32>,
-    beat: u16,
-    beaten: Option<Instant>,
-    seen_beat: Option<(u16, Instant)>,
+    last_start: Option<u32>,
+    heartbeat: u16,
+    last_heartbeat: Option<Instant>,
+    machine_heartbeat: Option<(u16, Instant)>,
     loaded: BTreeMap<u16, Slot>,
     /// Last status block, for the one step of reading ahead that may follow it.
-    seen: Option<Block>,
+    last_block: Option<StatusBlock>,
     /// Pages of a result that were read while its job ran.
-    ahead: Option<Ahead>,
-    misses: Misses,
+    read_ahead: Option<ReadAhead>,
+    read_ahead_failures: ReadAheadFailures,
 }
 
 impl ModbusMachine {
@@ -108,25 +108,25 @@ impl ModbusMachine {
             lost_after: settings.lost_after,
         };
         Self {
-            unit: Unit::new(kind, link, unit),
+            unit: ModbusUnit::new(kind, link, unit),
             owner: settings.owner,
             epoch: settings.epoch,
             retries: settings.retries,
             signals: settings.signals,
-            beat_every: settings.beat_every,
+            heartbeat_interval: settings.heartbeat_interval,
             expected_name: settings.expected_name,
             simulation: settings.simulation,
             sequence: 0,
             owned: false,
-            met: false,
-            began: None,
-            beat: 0,
-            beaten: None,
-            seen_beat: None,
+            has_connected: false,
+            last_start: None,
+            heartbeat: 0,
+            last_heartbeat: None,
+            machine_heartbeat: None,
             loaded: BTreeMap::new(),
-            seen: None,
-            ahead: None,
-            misses: Misses::default(),
+            last_block: None,
+            read_ahead: None,
+            read_ahead_failures: ReadAheadFailures::default(),
         }
     }
 
@@ -143,19 +143,19 @@ impl ModbusMachine {
     // ---------------------------------------------------------------------------------------------------
 
     async fn connect(&mut self) -> Result<Identity, DeviceError> {
-        self.seen_beat = None;
+        self.machine_heartbeat = None;
         self.owned = false;
         self.loaded.clear();
-        self.ahead = None;
-        let identity = self.unit.meet().await?;
+        self.read_ahead = None;
+        let identity = self.unit.connect().await?;
         // The check comes before the first meaningful write, because this may be another machine.
         self.check_identity(&identity)?;
-        let status = self.look().await?;
+        let status = self.read_status_block().await?;
         self.sequence = self.sequence.max(status.acknowledged);
         // The memory of the machine counts more than a clock: an earlier start of this client may have had a later
         // clock. A client that returns with a higher epoch than this start ever had is another client. This client does
         // not exceed its epoch.
-        if !std::mem::replace(&mut self.met, true) && status.owner == self.owner {
+        if !std::mem::replace(&mut self.has_connected, true) && status.owner == self.owner {
             self.epoch = self.epoch.max(status.epoch.saturating_add(1));
         }
         Ok(identity)
@@ -169,59 +169,59 @@ impl ModbusMachine {
         }
         match self.simulation {
             Some(expected) if expected != identity.simulation => {
-                Err(DeviceError::WrongReality { machine: self.machine(), simulation: identity.simulation })
+                Err(DeviceError::SimulationMismatch { machine: self.machine(), simulation: identity.simulation })
             }
             _ => Ok(()),
         }
     }
 
     /// Writes the heartbeat, unless the last one is recent. Does nothing if this client is not the owner.
-    async fn beat(&mut self) -> Result<(), DeviceError> {
+    async fn send_heartbeat(&mut self) -> Result<(), DeviceError> {
         if !self.owned {
             return Ok(());
         }
-        if self.beaten.is_some_and(|last| last.elapsed() < self.beat_every) {
+        if self.last_heartbeat.is_some_and(|last| last.elapsed() < self.heartbeat_interval) {
             return Ok(());
         }
-        self.beat = self.beat.wrapping_add(1);
-        self.beaten = Some(Instant::now());
+        self.heartbeat = self.heartbeat.wrapping_add(1);
+        self.last_heartbeat = Some(Instant::now());
         let mut beat = self.unit.writer();
-        beat.u16(self.beat).u32(self.owner);
+        beat.u16(self.heartbeat).u32(self.owner);
         self.unit.write("beat", self.unit.map.beat, beat.words()).await
     }
 
     /// Reads the status block, all of one moment, without the additional signals.
-    async fn look(&mut self) -> Result<Block, DeviceError> {
-        self.beat().await?;
+    async fn read_status_block(&mut self) -> Result<StatusBlock, DeviceError> {
+        self.send_heartbeat().await?;
         let address = self.unit.map.status;
         let mut words = self.unit.read("status", address, 48).await?;
         for _ in 0..5 {
             if words[0] == words[47] {
-                return self.understand(&words);
+                return self.decode_status(&words);
             }
             words = self.unit.read("status", address, 48).await?;
         }
-        Err(self.unit.distrust("status block (its two snapshot numbers)", words[0].into(), words[47].into()).await)
+        Err(self.unit.reject_data("status block (its two snapshot numbers)", words[0].into(), words[47].into()).await)
     }
 
-    fn understand(&mut self, words: &[u16]) -> Result<Block, DeviceError> {
+    fn decode_status(&mut self, words: &[u16]) -> Result<StatusBlock, DeviceError> {
         let machine = self.machine();
         let unlisted =
             |field, found: u16| DeviceError::Unlisted { machine: machine.clone(), field, found: found.into() };
         let block = self.unit.registers(words);
-        let state = state_of(words[1]).ok_or_else(|| unlisted("its state", words[1]))?;
+        let state = decode_state(words[1]).ok_or_else(|| unlisted("its state", words[1]))?;
         if !matches!(words[2], 1 | 2) {
             return Err(unlisted("its mode", words[2]));
         }
-        let outcome = codec::outcome(words[18]).map_err(|_| unlisted("the result of its job", words[18]))?;
+        let outcome = codec::decode_outcome(words[18]).map_err(|_| unlisted("the result of its job", words[18]))?;
         let job = Job { job: block.u32(8), cycle: words[10], digest: block.u32(12) };
-        let block = Block {
+        let block = StatusBlock {
             state,
             automatic: words[2] == 1,
             interlocks: words[3],
             acknowledged: block.u32(4),
-            answer: answer_of(words[6]),
-            fault: Fault::of(words[7]),
+            answer: decode_answer(words[6]),
+            fault: Fault::from_number(words[7]),
             job: (job.job != 0).then_some(job),
             token: block.u32(14),
             done: block.u32(16),
@@ -241,56 +241,56 @@ impl ModbusMachine {
         Ok(block)
     }
 
-    fn check_alive(&mut self, status: &Block) -> Result<(), DeviceError> {
+    fn check_alive(&mut self, status: &StatusBlock) -> Result<(), DeviceError> {
         let machine = self.machine();
         let known = self.unit.identity().map_or(0, |identity| identity.boot_id);
         if status.boot_id != known {
-            return Err(DeviceError::Restarted { machine, was: known, is: status.boot_id });
+            return Err(DeviceError::Restarted { machine, old_boot_id: known, new_boot_id: status.boot_id });
         }
         let beat = status.beat;
-        match self.seen_beat {
+        match self.machine_heartbeat {
             Some((seen, since)) if seen == beat => {
                 let still = since.elapsed();
                 if still > FROZEN_AFTER {
-                    return Err(DeviceError::Frozen { machine, beat, still, limit: FROZEN_AFTER });
+                    return Err(DeviceError::Frozen { machine, beat, unchanged_for: still, limit: FROZEN_AFTER });
                 }
             }
-            _ => self.seen_beat = Some((beat, Instant::now())),
+            _ => self.machine_heartbeat = Some((beat, Instant::now())),
         }
         Ok(())
     }
 
     async fn status(&mut self) -> Result<Status, DeviceError> {
-        self.seen = None;
-        let block = self.look().await?;
+        self.last_block = None;
+        let block = self.read_status_block().await?;
         self.check_owner(&block)?;
         let mut status = Status::from(&block);
-        self.seen = Some(block);
+        self.last_block = Some(block);
         for k in 0..self.signals.len() {
             let reading = self.signal(k).await?;
             status.signals.push(reading);
             // A slow signal must not make the machine believe that its client is lost.
-            self.beat().await?;
+            self.send_heartbeat().await?;
         }
         Ok(status)
     }
 
     /// Returns an error if another client has taken the machine: its further actions are not ours to report. An abort
     /// is allowed for every client.
-    fn check_owner(&self, status: &Block) -> Result<(), DeviceError> {
+    fn check_owner(&self, status: &StatusBlock) -> Result<(), DeviceError> {
         let aborts = matches!(status.state, State::Aborting | State::Aborted);
         if !self.owned || status.owner == self.owner || aborts {
             return Ok(());
         }
-        Err(DeviceError::Taken { machine: self.machine(), ours: self.owner, owner: status.owner })
+        Err(DeviceError::OwnedByOther { machine: self.machine(), ours: self.owner, owner: status.owner })
     }
 
     /// Reads a signal. A signal that the machine does not have, or that is not a finite number, has no value but a
     /// cause.
     async fn signal(&mut self, k: usize) -> Result<SignalValue, DeviceError> {
         let signal = self.signals[k].clone();
-        let ask = Ask::Read { address: signal.address, count: signal.kind.registers() };
-        let (value, cause) = match self.unit.few_tries("signal", signal.address, ask).await {
+        let ask = LinkRequest::Read { address: signal.address, count: signal.kind.registers() };
+        let (value, cause) = match self.unit.request_with_limit("signal", signal.address, ask).await {
             Err(error @ DeviceError::Exception { .. }) => (None, Some(error.to_string())),
             words => {
                 let mut words = words?;
@@ -316,16 +316,16 @@ impl ModbusMachine {
         CommandFrame { sequence, command, job: None, owner: self.owner, epoch: self.epoch, token: 0, argument: 0 }
     }
 
-    async fn simply(&mut self, command: Command) -> Result<Block, DeviceError> {
+    async fn run_command(&mut self, command: Command) -> Result<StatusBlock, DeviceError> {
         let frame = self.frame(command);
-        self.order(frame).await
+        self.send_command(frame).await
     }
 
     /// Writes a command until it is acknowledged, with the same frame every time. Returns an error if the machine
     /// refuses it.
-    async fn order(&mut self, frame: CommandFrame) -> Result<Block, DeviceError> {
+    async fn send_command(&mut self, frame: CommandFrame) -> Result<StatusBlock, DeviceError> {
         let CommandFrame { command, sequence, .. } = frame;
-        let status = self.acknowledged(frame).await?;
+        let status = self.write_until_acknowledged(frame).await?;
         self.sequence = self.sequence.max(sequence);
         match status.answer {
             Answer::Accepted => Ok(status),
@@ -333,7 +333,7 @@ impl ModbusMachine {
         }
     }
 
-    async fn acknowledged(&mut self, frame: CommandFrame) -> Result<Block, DeviceError> {
+    async fn write_until_acknowledged(&mut self, frame: CommandFrame) -> Result<StatusBlock, DeviceError> {
         let CommandFrame { command, sequence, .. } = frame;
         let words = frame.words(self.unit.map.word_order);
         let address = self.unit.map.command;
@@ -344,11 +344,11 @@ impl ModbusMachine {
             let written = Instant::now();
             let mut pause = Duration::from_millis(1);
             let last = loop {
-                let status = self.look().await?;
+                let status = self.read_status_block().await?;
                 if status.acknowledged == sequence {
                     return Ok(status);
                 }
-                if written.elapsed() >= ACKNOWLEDGED_WITHIN {
+                if written.elapsed() >= ACKNOWLEDGE_TIMEOUT {
                     break status.acknowledged;
                 }
                 sleep(pause).await;
@@ -370,25 +370,25 @@ impl ModbusMachine {
                 machine,
                 field: "the digest of the payloads",
                 sent: job.digest.into(),
-                held: loaded.into(),
+                found: loaded.into(),
             });
         }
         for kind in self.loaded.keys().copied().collect::<Vec<_>>() {
             self.compare_slot(kind).await?;
         }
         let frame = CommandFrame { job: Some(job), ..self.frame(Command::Prepare) };
-        self.order(frame).await?;
-        let status = self.reaches(|status| status.state == State::Prepared && status.token != 0).await?;
-        self.agree(job, &status)?;
+        self.send_command(frame).await?;
+        let status = self.wait_until(|status| status.state == State::Prepared && status.token != 0).await?;
+        self.check_job(job, &status)?;
         Ok(Armed { job, start_sequence: self.next_sequence(), token: status.token, boot_id: status.boot_id })
     }
 
     /// Waits until a condition on the status holds, and returns that status. A fault or the timeout ends the wait with
     /// an error.
-    async fn reaches(&mut self, holds: impl Fn(&Block) -> bool) -> Result<Block, DeviceError> {
+    async fn wait_until(&mut self, holds: impl Fn(&StatusBlock) -> bool) -> Result<StatusBlock, DeviceError> {
         let began = Instant::now();
         loop {
-            let status = self.look().await?;
+            let status = self.read_status_block().await?;
             if holds(&status) {
                 return Ok(status);
             }
@@ -396,15 +396,15 @@ impl ModbusMachine {
             if status.fault != Fault::None {
                 return Err(DeviceError::Faulted { machine, state: status.state, fault: status.fault });
             }
-            if began.elapsed() > SETTLED_WITHIN {
-                return Err(DeviceError::TimedOut { machine, what: "the state announced", limit: SETTLED_WITHIN });
+            if began.elapsed() > SETTLE_TIMEOUT {
+                return Err(DeviceError::TimedOut { machine, operation: "the state announced", limit: SETTLE_TIMEOUT });
             }
             sleep(Duration::from_millis(5)).await;
         }
     }
 
     /// Returns an error unless the machine has the intended job.
-    fn agree(&self, job: Job, status: &Block) -> Result<(), DeviceError> {
+    fn check_job(&self, job: Job, status: &StatusBlock) -> Result<(), DeviceError> {
         let held = status.job.unwrap_or(Job { job: 0, cycle: 0, digest: 0 });
         let fields = [
             ("the job", u64::from(job.job), u64::from(held.job)),
@@ -417,7 +417,9 @@ impl ModbusMachine {
     /// Returns an error for the first field in which the machine differs from what was sent or intended.
     fn compare<const N: usize>(&self, fields: [(&'static str, u64, u64); N]) -> Result<(), DeviceError> {
         match fields.into_iter().find(|(_, sent, held)| sent != held) {
-            Some((field, sent, held)) => Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held }),
+            Some((field, sent, held)) => {
+                Err(DeviceError::Mismatch { machine: self.machine(), field, sent, found: held })
+            }
             None => Ok(()),
         }
     }
@@ -427,18 +429,18 @@ impl ModbusMachine {
         let known = self.unit.identity().map_or(0, |identity| identity.boot_id);
         if boot_id != known {
             // Nothing was sent: the restart of the machine has discarded the prepared job.
-            return Err(DeviceError::Restarted { machine: self.machine(), was: boot_id, is: known });
+            return Err(DeviceError::Restarted { machine: self.machine(), old_boot_id: boot_id, new_boot_id: known });
         }
         // Nothing was sent yet, so an error here is only a failed read. A prepared job that has expired since is a
         // clear refusal.
-        let before = self.look().await?;
+        let before = self.read_status_block().await?;
         let taken = before.begun_by == start_sequence || before.acknowledged == start_sequence;
         if !taken && (before.state != State::Prepared || before.token != token) {
             let (command, answer, state) = (Command::Start, Answer::DeadToken, before.state);
             return Err(DeviceError::Refused { machine: self.machine(), command, answer, state });
         }
-        self.began = Some(start_sequence);
-        self.ahead = None;
+        self.last_start = Some(start_sequence);
+        self.read_ahead = None;
         let (owner, epoch) = (self.owner, self.epoch);
         let frame = CommandFrame {
             sequence: start_sequence,
@@ -450,71 +452,73 @@ impl ModbusMachine {
             argument: 0,
         };
         let unknown =
-            |machine, why| DeviceError::StartUnknown { machine, job, sequence: start_sequence, why: Box::new(why) };
-        match self.order(frame).await {
+            |machine, why| DeviceError::StartUnknown { machine, job, sequence: start_sequence, cause: Box::new(why) };
+        match self.send_command(frame).await {
             Ok(status) if status.begun_by == start_sequence && status.job == Some(job) => {
                 Ok(Started { job, start_sequence, status: status.into() })
             }
             Ok(status) => {
                 let (sent, held) = (u64::from(start_sequence), u64::from(status.begun_by));
                 let (machine, field) = (self.machine(), "the START that began the job");
-                Err(unknown(self.machine(), DeviceError::Mismatch { machine, field, sent, held }))
+                Err(unknown(self.machine(), DeviceError::Mismatch { machine, field, sent, found: held }))
             }
             // The machine has answered this very START and refused it.
             Err(refused @ DeviceError::Refused { .. }) => Err(refused),
-            Err(DeviceError::NotConnected { machine, what }) => Err(DeviceError::NotConnected { machine, what }),
+            Err(DeviceError::NotConnected { machine, operation: what }) => {
+                Err(DeviceError::NotConnected { machine, operation: what })
+            }
             Err(why) => Err(unknown(self.machine(), why)),
         }
     }
 
-    async fn claim(&mut self) -> Result<Block, DeviceError> {
-        let status = self.simply(Command::Claim).await?;
+    async fn claim(&mut self) -> Result<StatusBlock, DeviceError> {
+        let status = self.run_command(Command::Claim).await?;
         self.owned = true;
         Ok(status)
     }
 
-    async fn release(&mut self) -> Result<Block, DeviceError> {
+    async fn release(&mut self) -> Result<StatusBlock, DeviceError> {
         self.owned = false;
-        self.simply(Command::Release).await
+        self.run_command(Command::Release).await
     }
 
     /// Ends the job at once, whatever the state of the connection and whatever sequence number another client has
     /// reached. It connects by itself without the pause that other commands observe, and uses a number above the one
     /// that the machine has now.
-    async fn abort(&mut self) -> Result<Block, DeviceError> {
-        self.unit.link.hurry();
+    async fn abort(&mut self) -> Result<StatusBlock, DeviceError> {
+        self.unit.link.skip_pause();
         if self.unit.identity().is_none() {
-            self.unit.meet_within(Duration::ZERO).await?;
+            self.unit.connect_within(Duration::ZERO).await?;
         }
-        match self.simply(Command::Abort).await {
+        match self.run_command(Command::Abort).await {
             // Another client has used higher numbers. The state of the machine decides; if it does not abort, an abort
             // justifies a number above theirs.
-            Err(DeviceError::NotAcknowledged { acknowledged, .. }) => match self.look().await? {
+            Err(DeviceError::NotAcknowledged { acknowledged, .. }) => match self.read_status_block().await? {
                 status if matches!(status.state, State::Aborting | State::Aborted) => Ok(status),
                 _ => {
                     self.sequence = self.sequence.max(acknowledged);
-                    self.simply(Command::Abort).await
+                    self.run_command(Command::Abort).await
                 }
             },
             answer => answer,
         }
     }
 
-    async fn acknowledge(&mut self, done: u32) -> Result<Block, DeviceError> {
+    async fn acknowledge(&mut self, done: u32) -> Result<StatusBlock, DeviceError> {
         let frame = CommandFrame { argument: done, ..self.frame(Command::Acknowledge) };
-        self.order(frame).await
+        self.send_command(frame).await
     }
 
     async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
-        self.began = Some(intended.start_sequence);
-        let first = self.look().await?;
-        match what_became(intended, &first) {
+        self.last_start = Some(intended.start_sequence);
+        let first = self.read_status_block().await?;
+        match start_outcome(intended, &first) {
             Some(verdict) => return Ok(verdict),
             None => {
                 let began = Instant::now();
-                while began.elapsed() < SEEN_TWICE_OVER {
-                    sleep(self.beat_every).await;
-                    self.beat().await?;
+                while began.elapsed() < NOT_STARTED_CONFIRMATION {
+                    sleep(self.heartbeat_interval).await;
+                    self.send_heartbeat().await?;
                 }
             }
         }
@@ -522,15 +526,15 @@ impl ModbusMachine {
         // longer accepts this START.
         self.sequence = self.sequence.max(intended.start_sequence).max(first.acknowledged);
         self.claim().await?;
-        let second = self.look().await?;
-        Ok(what_became(intended, &second).unwrap_or(Reconciled::NotStarted(second.into())))
+        let second = self.read_status_block().await?;
+        Ok(start_outcome(intended, &second).unwrap_or(Reconciled::NotStarted(second.into())))
     }
 
     // ---- payloads --------------------------------------------------------------------------------------------------
 
     async fn load<P: Payload>(&mut self, payload: &P, interrupt: &Interrupt) -> Result<(), DeviceError> {
-        if let Some((field, value, limit)) = payload.flaw() {
-            return Err(DeviceError::BadPayload { machine: self.machine(), what: P::WHAT, field, value, limit });
+        if let Some((field, value, limit)) = payload.invalid_field() {
+            return Err(DeviceError::BadPayload { machine: self.machine(), payload: P::NAME, field, value, limit });
         }
         self.loaded.remove(&P::KIND);
         let words = payload.words(self.unit.map.word_order);
@@ -539,7 +543,7 @@ impl ModbusMachine {
             let (field, limit) = ("its size in bytes".to_owned(), "less than 4 GiB");
             return Err(DeviceError::BadPayload {
                 machine: self.machine(),
-                what: P::WHAT,
+                payload: P::NAME,
                 field,
                 value: bytes as f64,
                 limit,
@@ -548,10 +552,10 @@ impl ModbusMachine {
         let slot = Slot { bytes, crc: crc32(&words), identity: payload.identity() };
         let mut tries = 0;
         loop {
-            self.announce::<P>(slot).await?;
+            self.write_inbox_header::<P>(slot).await?;
             let sent = self.send_pages::<P>(&words, interrupt).await;
             let taken = match sent {
-                Ok(()) => self.taken::<P>(slot).await,
+                Ok(()) => self.wait_until_accepted::<P>(slot).await,
                 Err(error @ (DeviceError::Interrupted { .. } | DeviceError::Unreachable { .. })) => return Err(error),
                 Err(error) => Err(error),
             };
@@ -569,16 +573,16 @@ impl ModbusMachine {
         Ok(())
     }
 
-    async fn announce<P: Payload>(&mut self, slot: Slot) -> Result<(), DeviceError> {
+    async fn write_inbox_header<P: Payload>(&mut self, slot: Slot) -> Result<(), DeviceError> {
         let mut header = self.unit.writer();
         header.u16(P::KIND).u16(0).u32(slot.bytes).u32(slot.crc).zeros(2).identity(&slot.identity);
         let address = self.unit.map.inbox_header;
         match self.unit.write("inbox header", address, header.words()).await {
             Err(DeviceError::Exception { code: 3, .. }) => {
-                let state = self.look().await?.state;
+                let state = self.read_status_block().await?.state;
                 let busy = matches!(state, State::Execute | State::Holding | State::Held);
                 let answer = if busy { Answer::WrongState } else { Answer::OutsideLimits };
-                Err(DeviceError::PayloadRefused { machine: self.machine(), what: P::WHAT, answer })
+                Err(DeviceError::PayloadRefused { machine: self.machine(), payload: P::NAME, answer })
             }
             other => other,
         }
@@ -586,11 +590,11 @@ impl ModbusMachine {
 
     async fn send_pages<P: Payload>(&mut self, words: &[u16], interrupt: &Interrupt) -> Result<(), DeviceError> {
         let address = self.unit.map.inbox_page;
-        let of = words.len().div_ceil(PAGE) as u32;
-        for (number, data) in words.chunks(PAGE).enumerate() {
+        let of = words.len().div_ceil(PAGE_REGISTERS) as u32;
+        for (number, data) in words.chunks(PAGE_REGISTERS).enumerate() {
             let done = number as u32;
-            self.break_off(interrupt, P::WHAT, done, of)?;
-            self.beat().await?;
+            self.check_interrupt(interrupt, P::NAME, done, of)?;
+            self.send_heartbeat().await?;
             let mut page = self.unit.writer();
             page.u32(done).u16(data.len() as u16).zeros(5);
             let page = [page.words(), data].concat();
@@ -599,7 +603,7 @@ impl ModbusMachine {
                 Err(DeviceError::Exception { code: 3, .. }) => {
                     let state = self.unit.read("inbox state", self.unit.map.inbox_state, 12).await?;
                     let next = self.unit.registers(&state).u32(2);
-                    return Err(self.unit.distrust("number of the page it expects", done.into(), next.into()).await);
+                    return Err(self.unit.reject_data("number of the page it expects", done.into(), next.into()).await);
                 }
                 written => written?,
             }
@@ -607,18 +611,24 @@ impl ModbusMachine {
         Ok(())
     }
 
-    fn break_off(&self, interrupt: &Interrupt, what: &'static str, done: u32, of: u32) -> Result<(), DeviceError> {
+    fn check_interrupt(
+        &self,
+        interrupt: &Interrupt,
+        what: &'static str,
+        done: u32,
+        of: u32,
+    ) -> Result<(), DeviceError> {
         match interrupt.is_raised() {
-            true => Err(DeviceError::Interrupted { machine: self.machine(), what, done, of }),
+            true => Err(DeviceError::Interrupted { machine: self.machine(), payload: what, done, total: of }),
             false => Ok(()),
         }
     }
 
     /// Waits until the machine reports that it has accepted the payload, and checks that the payload is complete.
-    async fn taken<P: Payload>(&mut self, slot: Slot) -> Result<(), DeviceError> {
+    async fn wait_until_accepted<P: Payload>(&mut self, slot: Slot) -> Result<(), DeviceError> {
         let began = Instant::now();
         loop {
-            self.beat().await?;
+            self.send_heartbeat().await?;
             let words = self.unit.read("inbox state", self.unit.map.inbox_state, 12).await?;
             let block = self.unit.registers(&words);
             let (bytes, crc) = (block.u32(4), block.u32(6));
@@ -626,16 +636,16 @@ impl ModbusMachine {
                 2 if words[0] == P::KIND && bytes == slot.bytes && crc == slot.crc => return Ok(()),
                 2 | 3 => {
                     let (expected, found) = (u64::from(slot.crc), u64::from(crc));
-                    return Err(self.unit.distrust("check number of a payload", expected, found).await);
+                    return Err(self.unit.reject_data("check number of a payload", expected, found).await);
                 }
                 4 => {
-                    let answer = answer_of(words[8]);
-                    return Err(DeviceError::PayloadRefused { machine: self.machine(), what: P::WHAT, answer });
+                    let answer = decode_answer(words[8]);
+                    return Err(DeviceError::PayloadRefused { machine: self.machine(), payload: P::NAME, answer });
                 }
-                _ if began.elapsed() > SETTLED_WITHIN => {
+                _ if began.elapsed() > SETTLE_TIMEOUT => {
                     let found = u64::from(bytes);
                     let (what, expected) = ("bytes arrived of the payload", u64::from(slot.bytes));
-                    return Err(DeviceError::Count { machine: self.machine(), what, expected, found });
+                    return Err(DeviceError::WrongCount { machine: self.machine(), elements: what, expected, found });
                 }
                 _ => sleep(Duration::from_millis(5)).await,
             }
@@ -662,7 +672,7 @@ impl ModbusMachine {
         }
         let [sent, held] = [slot.identity, identity].map(|identity| u64::from(crc32fast::hash(&identity)));
         let field = "the identity of the payload in force (its CRC-32)";
-        Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held })
+        Err(DeviceError::Mismatch { machine: self.machine(), field, sent, found: held })
     }
 
     // ---- results ---------------------------------------------------------------------------------------------------
@@ -673,18 +683,18 @@ impl ModbusMachine {
         job: Job,
         kind: u16,
         interrupt: &Interrupt,
-    ) -> Result<(Block, Header, Vec<u16>), DeviceError> {
+    ) -> Result<(StatusBlock, Header, Vec<u16>), DeviceError> {
         let mut tries = 0;
         loop {
-            let status = self.look().await?;
+            let status = self.read_status_block().await?;
             if status.state != State::Complete || status.done == 0 {
                 return Err(DeviceError::NoResult { machine: self.machine(), job, state: status.state });
             }
-            self.agree(job, &status)?;
-            if let Some(began) = self.began.filter(|began| *began != status.done) {
+            self.check_job(job, &status)?;
+            if let Some(began) = self.last_start.filter(|began| *began != status.done) {
                 let (sent, held) = (u64::from(began), u64::from(status.done));
                 let field = "the START whose job has ended";
-                return Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held });
+                return Err(DeviceError::Mismatch { machine: self.machine(), field, sent, found: held });
             }
             match self.fetch_once(job, kind, status.done, interrupt).await {
                 Ok(Some((header, words))) => return Ok((status, header, words)),
@@ -706,28 +716,28 @@ impl ModbusMachine {
         let before = self.header_words().await?;
         let header = self.header(&before, job, kind, done)?;
         let total = (header.bytes / 2) as usize;
-        let pages = total.div_ceil(PAGE) as u32;
+        let pages = total.div_ceil(PAGE_REGISTERS) as u32;
         let mut words = Vec::with_capacity(total);
-        words.extend(self.kept(job, &header, done).into_iter().flatten());
-        let ahead = (words.len() / PAGE) as u32;
+        words.extend(self.registers_read_ahead(job, &header, done).into_iter().flatten());
+        let ahead = (words.len() / PAGE_REGISTERS) as u32;
         for page in ahead..pages {
-            self.break_off(interrupt, "result", page, pages)?;
-            self.beat().await?;
-            let due = (total - words.len()).min(PAGE);
+            self.check_interrupt(interrupt, "result", page, pages)?;
+            self.send_heartbeat().await?;
+            let due = (total - words.len()).min(PAGE_REGISTERS);
             self.fetch_page(page, due, &mut words).await?;
         }
         let after = self.header_words().await?;
         if before != after {
             let (expected, found) = (u64::from(crc32(&before)), u64::from(crc32(&after)));
-            return Err(self.unit.distrust("header of a result (read twice)", expected, found).await);
+            return Err(self.unit.reject_data("header of a result (read twice)", expected, found).await);
         }
         let crc = crc32(&words);
-        if ahead > 0 && (crc != header.crc || self.kept(job, &header, done).is_none()) {
-            self.ahead = None;
+        if ahead > 0 && (crc != header.crc || self.registers_read_ahead(job, &header, done).is_none()) {
+            self.read_ahead = None;
             return Ok(None);
         }
         if crc != header.crc {
-            return Err(self.unit.distrust("check number of a result", header.crc.into(), crc.into()).await);
+            return Err(self.unit.reject_data("check number of a result", header.crc.into(), crc.into()).await);
         }
         Ok(Some((header, words)))
     }
@@ -746,7 +756,7 @@ impl ModbusMachine {
             ("the number of the finished job", u64::from(done), u64::from(block.u32(46))),
         ])?;
         if words[28] != 1 {
-            return Err(DeviceError::Inches { machine, unit: words[28] });
+            return Err(DeviceError::WrongLengthUnit { machine, unit: words[28] });
         }
         let reals = [("the probe's radius", 12), ("the scale", 16), ("the mean temperature", 20), ("the duration", 24)];
         for (field, at) in reals {
@@ -765,12 +775,17 @@ impl ModbusMachine {
             return Err(DeviceError::Unlisted { machine, field: "the format of the result", found: format.into() });
         };
         let expected = 2 * size as u64 * u64::from(records);
-        if u64::from(bytes) != expected || bytes > RESULT_BYTES {
-            let expected = expected.min(RESULT_BYTES.into());
-            return Err(DeviceError::Count { machine, what: "bytes of the result", expected, found: bytes.into() });
+        if u64::from(bytes) != expected || bytes > MAX_RESULT_BYTES {
+            let expected = expected.min(MAX_RESULT_BYTES.into());
+            return Err(DeviceError::WrongCount {
+                machine,
+                elements: "bytes of the result",
+                expected,
+                found: bytes.into(),
+            });
         }
         if (kind, format) == (4, 2) {
-            range::of_counts(&machine, block.f64(16))?;
+            range::check_count_scale(&machine, block.f64(16))?;
         }
         Ok(Header {
             format,
@@ -803,10 +818,10 @@ impl ModbusMachine {
                 return Ok(());
             }
             if found == page {
-                return Err(self.unit.distrust("number of registers in a page", due as u64, read[2].into()).await);
+                return Err(self.unit.reject_data("number of registers in a page", due as u64, read[2].into()).await);
             }
-            if began.elapsed() > ACKNOWLEDGED_WITHIN {
-                return Err(self.unit.distrust("number of a page", page.into(), found.into()).await);
+            if began.elapsed() > ACKNOWLEDGE_TIMEOUT {
+                return Err(self.unit.reject_data("number of a page", page.into(), found.into()).await);
             }
             sleep(Duration::from_millis(2)).await;
         }
@@ -823,25 +838,25 @@ impl ModbusMachine {
         }
     }
 
-    fn flawed(&self, flaw: RecordFlaw) -> DeviceError {
+    fn record_error(&self, flaw: RecordError) -> DeviceError {
         let machine = self.machine();
         match flaw {
-            RecordFlaw::NotFinite { field, value } => DeviceError::NotFinite { machine, field, value },
-            RecordFlaw::Unlisted { field, found } => DeviceError::Unlisted { machine, field, found },
+            RecordError::NotFinite { field, value } => DeviceError::NotFinite { machine, field, value },
+            RecordError::Unlisted { field, found } => DeviceError::Unlisted { machine, field, found },
         }
     }
 
     fn count(&self, what: &'static str, expected: u64, found: u64) -> Result<(), DeviceError> {
         match expected == found {
             true => Ok(()),
-            false => Err(DeviceError::Count { machine: self.machine(), what, expected, found }),
+            false => Err(DeviceError::WrongCount { machine: self.machine(), elements: what, expected, found }),
         }
     }
 }
 
 /// Status block of docs/modbus.md, as far as it is used, all of one moment.
 #[derive(Debug, Clone, PartialEq)]
-struct Block {
+struct StatusBlock {
     state: State,
     /// True in automatic mode, false in manual mode.
     automatic: bool,
@@ -873,10 +888,10 @@ struct Block {
     boot_id: u32,
 }
 
-impl From<&Block> for Status {
-    fn from(block: &Block) -> Self {
+impl From<&StatusBlock> for Status {
+    fn from(block: &StatusBlock) -> Self {
         let good = |bit: u16| Some(block.interlocks & (1 << bit) != 0);
-        let (temperature_c, progress, signals) = range::of_status(block.temperature_c, block.progress);
+        let (temperature_c, progress, signals) = range::plausible_status(block.temperature_c, block.progress);
         Self {
             state: block.state,
             job: block.job,
@@ -894,8 +909,8 @@ impl From<&Block> for Status {
     }
 }
 
-impl From<Block> for Status {
-    fn from(block: Block) -> Self {
+impl From<StatusBlock> for Status {
+    fn from(block: StatusBlock) -> Self {
         Self::from(&block)
     }
 }
@@ -919,9 +934,9 @@ struct Header {
 
 /// Returns the outcome of a start according to a status. Returns `None` if the start appears not to be accepted, which
 /// must be seen twice.
-fn what_became(intended: &Armed, status: &Block) -> Option<Reconciled> {
+fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
     let Armed { job, start_sequence, boot_id, .. } = *intended;
-    let unknown = |why: String| Some(Reconciled::Unknown { why });
+    let unknown = |why: String| Some(Reconciled::Unknown { reason: why });
     if status.boot_id != boot_id {
         let is = status.boot_id;
         return unknown(format!(
@@ -953,7 +968,7 @@ fn what_became(intended: &Armed, status: &Block) -> Option<Reconciled> {
     }
 }
 
-fn state_of(number: u16) -> Option<State> {
+fn decode_state(number: u16) -> Option<State> {
     const STATES: [State; 10] = [
         State::Idle,
         State::Prepared,
@@ -969,7 +984,7 @@ fn state_of(number: u16) -> Option<State> {
     STATES.get(usize::from(number).checked_sub(1)?).copied()
 }
 
-fn answer_of(number: u16) -> Answer {
+fn decode_answer(number: u16) -> Answer {
     match number {
         0 => Answer::None,
         1 => Answer::Accepted,
@@ -1033,19 +1048,19 @@ macro_rules! modbus_driver {
                 self.0.start(armed).await
             }
             async fn hold(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Hold).await.map(Status::from)
+                self.0.run_command(Command::Hold).await.map(Status::from)
             }
             async fn resume(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Resume).await.map(Status::from)
+                self.0.run_command(Command::Resume).await.map(Status::from)
             }
             async fn stop(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Stop).await.map(Status::from)
+                self.0.run_command(Command::Stop).await.map(Status::from)
             }
             async fn abort(&mut self) -> Result<Status, DeviceError> {
                 self.0.abort().await.map(Status::from)
             }
             async fn clear(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Clear).await.map(Status::from)
+                self.0.run_command(Command::Clear).await.map(Status::from)
             }
             async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
                 self.0.acknowledge(done).await.map(Status::from)
@@ -1076,7 +1091,7 @@ impl Cmm for ModbusCmm {
         self.0.load(plan, interrupt).await
     }
 
-    async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<Preliminary> {
+    async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<PreliminaryPoints> {
         self.0.read_ahead(job, interrupt).await
     }
 
@@ -1095,7 +1110,7 @@ impl Cmm for ModbusCmm {
         let coordinates = machine.coordinates(&header)?;
         let points = words.chunks_exact(header.registers).map(|record| {
             let record = machine.unit.registers(record);
-            codec::point(record, header.format, header.scale_mm).map_err(|flaw| machine.flawed(flaw))
+            codec::decode_point(record, header.format, header.scale_mm).map_err(|flaw| machine.record_error(flaw))
         });
         Ok(Measurement {
             points: points.collect::<Result<_, _>>()?,
@@ -1121,7 +1136,8 @@ impl Grinder for ModbusGrinder {
         let machine = &mut self.0;
         let (status, header, words) = machine.fetch(job, 5, interrupt).await?;
         machine.count("pass records", 1, header.records.into())?;
-        let figures = codec::pass_figures(machine.unit.registers(&words)).map_err(|flaw| machine.flawed(flaw))?;
+        let figures =
+            codec::decode_pass_record(machine.unit.registers(&words)).map_err(|flaw| machine.record_error(flaw))?;
         let (number, cycle, outcome, [path_mm, removed_mm3, deepest_mm, idle_share, spindle_load, wheel_radius_mm]) =
             figures;
         machine.compare([
@@ -1132,13 +1148,13 @@ impl Grinder for ModbusGrinder {
         if let Some(map) = machine.loaded.get(&CorrectionMap::KIND).filter(|map| map.identity != header.identity) {
             let (sent, held) = (digest(&[map.identity]).into(), digest(&[header.identity]).into());
             let field = "the identity of the map that was ground (its CRC-32)";
-            return Err(DeviceError::Mismatch { machine: machine.machine(), field, sent, held });
+            return Err(DeviceError::Mismatch { machine: machine.machine(), field, sent, found: held });
         }
         Ok(PassRecord {
             outcome,
             path_mm: Some(path_mm),
             removed_mm3: Some(removed_mm3),
-            deepest_mm: Some(deepest_mm),
+            max_depth_mm: Some(deepest_mm),
             idle_share: Some(idle_share),
             spindle_load: Some(spindle_load),
             wheel_radius_mm: Some(wheel_radius_mm),

@@ -7,7 +7,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::port;
-use crate::place::Place;
+use crate::place::MachineTable;
 use regrind_document::Document;
 
 /// Number of registers that a Modbus device can have.
@@ -40,7 +40,7 @@ impl WordOrder {
     }
 
     /// Returns the order with the other word first.
-    pub fn other(self) -> Self {
+    pub fn with_words_swapped(self) -> Self {
         match self {
             Self::Big => Self::Little,
             Self::Little => Self::Big,
@@ -50,7 +50,7 @@ impl WordOrder {
     }
 
     /// Returns the order with the other byte of each register first.
-    pub fn with_other_bytes(self) -> Self {
+    pub fn with_bytes_swapped(self) -> Self {
         match self {
             Self::Big => Self::Badc,
             Self::Little => Self::Dcba,
@@ -94,7 +94,7 @@ pub enum Parity {
 /// Address of a line.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 #[expect(missing_docs, reason = "the fields are told above them")]
-pub enum Line {
+pub enum LineAddress {
     /// Modbus TCP: a host by name or address, and a port, 502 by the standard.
     Tcp { host: String, port: u16 },
     /// Modbus RTU on a serial port, preferably by its persistent name under /dev/serial/by-id, with the baud rate in
@@ -102,7 +102,7 @@ pub enum Line {
     Rtu { device: String, baud: u32, parity: Parity, stop_bits: u8 },
 }
 
-impl std::fmt::Display for Line {
+impl std::fmt::Display for LineAddress {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Tcp { host, port } => write!(f, "{host}:{port}"),
@@ -133,11 +133,11 @@ impl Default for TcpWire {
 }
 
 impl TcpWire {
-    pub(super) fn line(&self) -> Line {
-        Line::Tcp { host: self.host.clone(), port: self.port }
+    pub(super) fn line(&self) -> LineAddress {
+        LineAddress::Tcp { host: self.host.clone(), port: self.port }
     }
 
-    pub(super) fn check_address(&self, place: &Place<'_>, document: &mut Document) {
+    pub(super) fn check_address(&self, place: &MachineTable<'_>, document: &mut Document) {
         let host = &self.host;
         let is_here = host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
         if host.is_empty() {
@@ -205,13 +205,13 @@ impl Default for RtuWire {
 }
 
 impl RtuWire {
-    pub(super) fn line(&self) -> Line {
+    pub(super) fn line(&self) -> LineAddress {
         let Self { device, baud, parity, stop_bits, .. } = self.clone();
-        Line::Rtu { device, baud, parity, stop_bits }
+        LineAddress::Rtu { device, baud, parity, stop_bits }
     }
 
     /// Does nothing: only the system can check the name of a port, see [`Self::missing`].
-    pub(super) fn check_address(&self, _: &Place<'_>, _: &mut Document) {}
+    pub(super) fn check_address(&self, _: &MachineTable<'_>, _: &mut Document) {}
 
     /// Reports to the document if both machines have the same unit on one line, or different settings of that line.
     pub(super) fn compare(&self, grinder: &Self, document: &mut Document) {
@@ -319,7 +319,7 @@ impl RegisterMap {
     }
 
     /// Reports to the document the blocks that overlap or end outside the address range.
-    pub fn check(&self, place: &Place<'_>, document: &mut Document) {
+    pub fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         let blocks = self.blocks();
         for (k, &(name, first, count)) in blocks.iter().enumerate() {
             let end = u32::from(first) + u32::from(count);
@@ -425,10 +425,10 @@ pub struct Signal {
 impl Signal {
     /// Checks the signals of a cell file and returns them. Returns `None` if one is incomplete; the schema has reported
     /// that.
-    pub fn all(
+    pub fn from_tables(
         written: &[SignalTable],
         word_order: WordOrder,
-        place: &Place<'_>,
+        place: &MachineTable<'_>,
         document: &mut Document,
     ) -> Option<Vec<Self>> {
         let mut signals = Vec::new();
@@ -443,7 +443,7 @@ impl Signal {
             if table.scale == 0.0 {
                 document.report(&key("scale"), "is 0", "every value would be 0", "1 leaves the number as it is");
             }
-            let Some(signal) = Self::of(table, word_order) else { continue };
+            let Some(signal) = Self::from_table(table, word_order) else { continue };
             if signal.range[0] >= signal.range[1] {
                 let found = format!("is [{}, {}]", signal.range[0], signal.range[1]);
                 document.report(&key("range"), found, "the first must be less than the second", "interchange them");
@@ -458,7 +458,7 @@ impl Signal {
         (signals.len() == written.len()).then_some(signals)
     }
 
-    fn of(table: &SignalTable, word_order: WordOrder) -> Option<Self> {
+    fn from_table(table: &SignalTable, word_order: WordOrder) -> Option<Self> {
         Some(Self {
             name: table.name.clone()?,
             address: table.address?,
@@ -475,7 +475,7 @@ impl Signal {
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModbusSettings {
     /// Line of the machine.
-    pub line: Line,
+    pub line: LineAddress,
     /// Unit number of the machine.
     pub unit: u8,
     /// Addresses of its blocks, and its word order.
@@ -496,7 +496,7 @@ pub struct ModbusSettings {
     /// Additional signals to read.
     pub signals: Vec<Signal>,
     /// Interval of the heartbeat. A machine regards its client as lost after 1.5 s without a heartbeat.
-    pub beat_every: Duration,
+    pub heartbeat_interval: Duration,
     /// Name that the machine must report; `None` accepts any name.
     pub expected_name: Option<String>,
     /// True if the machine must be a simulation, false if it must not be one; `None` accepts both.
@@ -505,7 +505,7 @@ pub struct ModbusSettings {
 
 impl ModbusSettings {
     /// Returns settings for a machine on a quiet network, to be adapted field by field.
-    pub fn new(line: Line) -> Self {
+    pub fn new(line: LineAddress) -> Self {
         Self {
             line,
             unit: 1,
@@ -517,7 +517,7 @@ impl ModbusSettings {
             owner: 1,
             epoch: 1,
             signals: Vec::new(),
-            beat_every: Duration::from_millis(250),
+            heartbeat_interval: Duration::from_millis(250),
             expected_name: None,
             simulation: None,
         }

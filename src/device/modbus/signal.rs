@@ -23,7 +23,7 @@ impl Signal {
     pub(super) fn cause(&self, words: &[u16]) -> Option<String> {
         let is_good = |value: &f64| (self.range[0]..=self.range[1]).contains(value);
         let value = self.value(words, self.word_order);
-        let other = self.word_order.other();
+        let other = self.word_order.with_words_swapped();
         let name = other.name();
         let swapped =
             Some(self.value(words, other)).filter(|swapped| !is_good(&value) && words.len() > 1 && is_good(swapped));

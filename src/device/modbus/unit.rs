@@ -10,7 +10,7 @@ use std::time::Duration;
 use tokio::time::{Instant, sleep};
 
 use super::codec::{Registers, Writer};
-use super::link::{Ask, Link, LinkFault};
+use super::link::{Link, LinkFault, LinkRequest};
 use super::settings::{RegisterMap, WordOrder};
 use crate::{DeviceError, Identity, MachineKind};
 
@@ -22,19 +22,19 @@ const VERSION: u16 = 2;
 const IDENTITY_REGISTERS: u16 = 32;
 /// Flags of an identity block.
 const SIMULATION: u16 = 1;
-const GIVES_AHEAD: u16 = 2;
+const OFFERS_READ_AHEAD: u16 = 2;
 /// Pause before a busy machine is asked again.
 const BUSY_PAUSE: Duration = Duration::from_millis(50);
 /// Time for which a busy machine is retried at connection. It is shorter than the time that the cell waits for the
 /// machine, so that the answer of the machine is reported.
-const BUSY_WHEN_MET: Duration = Duration::from_secs(15);
+const CONNECT_BUSY_TIMEOUT: Duration = Duration::from_secs(15);
 /// Sentinels that prove the word order.
 const SENTINEL_WHOLE: u32 = 0x1234_5678;
 const SENTINEL_REAL: f64 = -2.5e-7;
 
 /// One machine on a line.
 #[derive(Debug)]
-pub(super) struct Unit {
+pub(super) struct ModbusUnit {
     pub(super) name: Arc<str>,
     pub(super) link: Link,
     pub(super) map: RegisterMap,
@@ -43,7 +43,7 @@ pub(super) struct Unit {
     retries: u32,
     lost_after: Duration,
     /// Generation of the line on which the machine was proved.
-    trusted: Option<u64>,
+    verified_generation: Option<u64>,
     identity: Option<Identity>,
     /// Flags of its identity.
     flags: u16,
@@ -57,11 +57,11 @@ pub(super) struct UnitSettings {
     pub(super) lost_after: Duration,
 }
 
-impl Unit {
+impl ModbusUnit {
     pub(super) fn new(kind: MachineKind, link: Link, settings: UnitSettings) -> Self {
         let UnitSettings { unit, map, retries, lost_after } = settings;
         let name = format!("{kind} at {}, unit {unit}", link.line()).into();
-        Self { name, link, map, unit, kind, retries, lost_after, trusted: None, identity: None, flags: 0 }
+        Self { name, link, map, unit, kind, retries, lost_after, verified_generation: None, identity: None, flags: 0 }
     }
 
     /// Returns the proved identity of the machine.
@@ -70,14 +70,14 @@ impl Unit {
     }
 
     /// Returns true if the machine offers full pages of a result while its job still runs.
-    pub(super) fn gives_ahead(&self) -> bool {
-        self.identity.is_some() && self.flags & GIVES_AHEAD != 0
+    pub(super) fn offers_read_ahead(&self) -> bool {
+        self.identity.is_some() && self.flags & OFFERS_READ_AHEAD != 0
     }
 
     /// Returns the generation of the line on which the machine was proved, as long as that line is valid as far as
     /// known here.
     pub(super) fn generation(&self) -> Option<u64> {
-        self.trusted
+        self.verified_generation
     }
 
     pub(super) fn registers<'a>(&self, words: &'a [u16]) -> Registers<'a> {
@@ -89,143 +89,158 @@ impl Unit {
     }
 
     /// Discards the known identity and proves the machine again.
-    pub(super) async fn meet(&mut self) -> Result<Identity, DeviceError> {
-        self.meet_within(BUSY_WHEN_MET).await
+    pub(super) async fn connect(&mut self) -> Result<Identity, DeviceError> {
+        self.connect_within(CONNECT_BUSY_TIMEOUT).await
     }
 
     /// Does the same as [`Self::meet`], with a limit of `busy` for a machine whose program is still starting.
-    pub(super) async fn meet_within(&mut self, busy: Duration) -> Result<Identity, DeviceError> {
+    pub(super) async fn connect_within(&mut self, busy: Duration) -> Result<Identity, DeviceError> {
         self.identity = None;
-        self.trusted = None;
+        self.verified_generation = None;
         let began = Instant::now();
         for tries in 0.. {
-            match self.prove().await {
+            match self.verify_identity().await {
                 Ok(_) => break,
                 // Its program may still be starting: the machine is there and answers so.
-                Err(error) if is_starting(&error) && began.elapsed() < busy => self.ask_again(&error).await,
-                Err(error) if self.gives_up(&error, tries, began) => return Err(error),
-                Err(error) => self.ask_again(&error).await,
+                Err(error) if is_starting(&error) && began.elapsed() < busy => self.pause_before_retry(&error).await,
+                Err(error) if self.is_final(&error, tries, began) => return Err(error),
+                Err(error) => self.pause_before_retry(&error).await,
             }
         }
-        self.identity.clone().ok_or(DeviceError::NotConnected { machine: self.name.clone(), what: "identity" })
+        self.identity.clone().ok_or(DeviceError::NotConnected { machine: self.name.clone(), operation: "identity" })
     }
 
     /// Reads registers, on a proved connection only.
     pub(super) async fn read(&mut self, what: &'static str, address: u16, count: u16) -> Result<Vec<u16>, DeviceError> {
-        self.exchange(what, address, Ask::Read { address, count }).await
+        self.exchange(what, address, LinkRequest::Read { address, count }).await
     }
 
     /// Writes registers, on a proved connection only. The write may be carried out more than once.
     pub(super) async fn write(&mut self, what: &'static str, address: u16, words: &[u16]) -> Result<(), DeviceError> {
-        self.exchange(what, address, Ask::Write { address, words: words.into() }).await.map(drop)
+        self.exchange(what, address, LinkRequest::Write { address, words: words.into() }).await.map(drop)
     }
 
     /// Sends a request once, on the proved connection that exists. For requests that may fail and that are not
     /// essential.
-    pub(super) async fn once(&mut self, what: &'static str, address: u16, ask: Ask) -> Result<Vec<u16>, DeviceError> {
-        let Some(generation) = self.trusted else {
-            return Err(DeviceError::NotConnected { machine: self.name.clone(), what });
+    pub(super) async fn request_once(
+        &mut self,
+        what: &'static str,
+        address: u16,
+        ask: LinkRequest,
+    ) -> Result<Vec<u16>, DeviceError> {
+        let Some(generation) = self.verified_generation else {
+            return Err(DeviceError::NotConnected { machine: self.name.clone(), operation: what });
         };
-        let answer = self.ask(Some(generation), ask).await;
-        answer.map(|(_, words)| words).map_err(|fault| self.failed(what, address, fault))
+        let answer = self.send(Some(generation), ask).await;
+        answer.map(|(_, words)| words).map_err(|fault| self.device_error(what, address, fault))
     }
 
     /// Sends one request. The bytes of each register have the order of the contract here, and the order of the machine
     /// on the line.
-    async fn ask(&self, generation: Option<u64>, ask: Ask) -> Result<(u64, Vec<u16>), LinkFault> {
+    async fn send(&self, generation: Option<u64>, ask: LinkRequest) -> Result<(u64, Vec<u16>), LinkFault> {
         let order = self.map.word_order;
         let ask = match ask {
-            Ask::Write { address, words } if order.swaps_bytes() => {
-                Ask::Write { address, words: order.bytes_in_order(words.to_vec()).into() }
+            LinkRequest::Write { address, words } if order.swaps_bytes() => {
+                LinkRequest::Write { address, words: order.bytes_in_order(words.to_vec()).into() }
             }
             ask => ask,
         };
-        let (generation, words) = self.link.ask(self.unit, generation, ask).await?;
+        let (generation, words) = self.link.request(self.unit, generation, ask).await?;
         Ok((generation, order.bytes_in_order(words)))
     }
 
     /// Gives the connection up because data that came over it are invalid. Returns the error that describes them.
-    pub(super) async fn distrust(&mut self, what: &'static str, expected: u64, found: u64) -> DeviceError {
-        if let Some(generation) = self.trusted.take() {
+    pub(super) async fn reject_data(&mut self, what: &'static str, expected: u64, found: u64) -> DeviceError {
+        if let Some(generation) = self.verified_generation.take() {
             // A stale generation is equally good: then another machine has given the connection up already.
-            let _ = self.link.ask(self.unit, Some(generation), Ask::Distrust).await;
+            let _ = self.link.request(self.unit, Some(generation), LinkRequest::DropConnection).await;
         }
-        DeviceError::Corrupt { machine: self.name.clone(), what, expected, found }
+        DeviceError::Corrupt { machine: self.name.clone(), data: what, expected, found }
     }
 
     /// Returns true if a request is not retried. A machine that answers that it is busy has the whole time; one that
     /// does not answer has a few retries.
-    fn gives_up(&self, error: &DeviceError, tries: u32, began: Instant) -> bool {
+    fn is_final(&self, error: &DeviceError, tries: u32, began: Instant) -> bool {
         !error.is_link() || (tries >= self.retries && !error.is_busy()) || began.elapsed() >= self.lost_after
     }
 
     /// Counts a retry, and pauses before it if the machine is busy.
-    async fn ask_again(&self, error: &DeviceError) {
+    async fn pause_before_retry(&self, error: &DeviceError) {
         self.link.count_retry();
         if error.is_busy() {
             sleep(BUSY_PAUSE).await;
         }
     }
 
-    async fn exchange(&mut self, what: &'static str, address: u16, ask: Ask) -> Result<Vec<u16>, DeviceError> {
+    async fn exchange(&mut self, what: &'static str, address: u16, ask: LinkRequest) -> Result<Vec<u16>, DeviceError> {
         if self.identity.is_none() {
-            return Err(DeviceError::NotConnected { machine: self.name.clone(), what });
+            return Err(DeviceError::NotConnected { machine: self.name.clone(), operation: what });
         }
-        self.tried(what, address, ask, false).await
+        self.request_with_retries(what, address, ask, false).await
     }
 
     /// Sends a request with a limited number of retries, also if the machine answers that it is busy. For requests
     /// between two reads of the status.
-    pub(super) async fn few_tries(
+    pub(super) async fn request_with_limit(
         &mut self,
         what: &'static str,
         address: u16,
-        ask: Ask,
+        ask: LinkRequest,
     ) -> Result<Vec<u16>, DeviceError> {
-        self.tried(what, address, ask, true).await
+        self.request_with_retries(what, address, ask, true).await
     }
 
-    async fn tried(&mut self, what: &'static str, address: u16, ask: Ask, few: bool) -> Result<Vec<u16>, DeviceError> {
+    async fn request_with_retries(
+        &mut self,
+        what: &'static str,
+        address: u16,
+        ask: LinkRequest,
+        few: bool,
+    ) -> Result<Vec<u16>, DeviceError> {
         let began = Instant::now();
         let mut tries = 0;
         loop {
             match self.attempt(what, address, &ask).await {
                 Ok(words) => return Ok(words),
-                Err(error) if self.gives_up(&error, tries, began) || few && tries >= self.retries => return Err(error),
-                Err(error) => self.ask_again(&error).await,
+                Err(error) if self.is_final(&error, tries, began) || few && tries >= self.retries => return Err(error),
+                Err(error) => self.pause_before_retry(&error).await,
             }
             tries += 1;
         }
     }
 
-    async fn attempt(&mut self, what: &'static str, address: u16, ask: &Ask) -> Result<Vec<u16>, DeviceError> {
+    async fn attempt(&mut self, what: &'static str, address: u16, ask: &LinkRequest) -> Result<Vec<u16>, DeviceError> {
         loop {
-            let generation = match self.trusted {
+            let generation = match self.verified_generation {
                 Some(generation) => generation,
-                None => self.prove().await?,
+                None => self.verify_identity().await?,
             };
-            match self.ask(Some(generation), ask.clone()).await {
+            match self.send(Some(generation), ask.clone()).await {
                 Ok((_, words)) => return Ok(words),
                 // Another machine on the line has met an error. Prove this machine again; the request itself was not
                 // sent yet.
-                Err(LinkFault::Stale) => self.trusted = None,
-                Err(fault) => return Err(self.failed(what, address, fault)),
+                Err(LinkFault::Stale) => self.verified_generation = None,
+                Err(fault) => return Err(self.device_error(what, address, fault)),
             }
         }
     }
 
-    fn failed(&mut self, what: &'static str, address: u16, fault: LinkFault) -> DeviceError {
+    fn device_error(&mut self, what: &'static str, address: u16, fault: LinkFault) -> DeviceError {
         let machine = self.name.clone();
         if let LinkFault::Exception(code) = fault {
-            return DeviceError::Exception { machine, what, address, code };
+            return DeviceError::Exception { machine, operation: what, address, code };
         }
-        self.trusted = None;
+        self.verified_generation = None;
         match fault {
-            LinkFault::Unreachable(why) => DeviceError::Unreachable { machine, why, limit: self.lost_after },
-            LinkFault::TimedOut => DeviceError::TimedOut { machine, what, limit: self.link.request_timeout() },
-            LinkFault::Corrupt { what, expected, found } => DeviceError::Corrupt { machine, what, expected, found },
+            LinkFault::Unreachable(why) => DeviceError::Unreachable { machine, kind: why, limit: self.lost_after },
+            LinkFault::TimedOut => {
+                DeviceError::TimedOut { machine, operation: what, limit: self.link.request_timeout() }
+            }
+            LinkFault::Corrupt { what, expected, found } => {
+                DeviceError::Corrupt { machine, data: what, expected, found }
+            }
             LinkFault::Disconnected | LinkFault::Stale | LinkFault::Exception(_) => {
-                DeviceError::Disconnected { machine, what }
+                DeviceError::Disconnected { machine, operation: what }
             }
         }
     }
@@ -233,24 +248,24 @@ impl Unit {
     /// Proves the identity of the machine at the far end of the present connection and returns the generation of the
     /// line. First the identity block, which is only read. Then two random words that the machine has to invert, so
     /// that the answer cannot be older than this moment. Then the identity block once more.
-    async fn prove(&mut self) -> Result<u64, DeviceError> {
+    async fn verify_identity(&mut self) -> Result<u64, DeviceError> {
         let first = self.map.identity;
-        let read = Ask::Read { address: first, count: IDENTITY_REGISTERS };
-        let asked = self.ask(None, read.clone()).await;
-        let (generation, words) = asked.map_err(|fault| self.failed("identity", first, fault))?;
-        let identity = self.recognise(&words)?;
+        let read = LinkRequest::Read { address: first, count: IDENTITY_REGISTERS };
+        let asked = self.send(None, read.clone()).await;
+        let (generation, words) = asked.map_err(|fault| self.device_error("identity", first, fault))?;
+        let identity = self.decode_identity(&words)?;
         self.synchronise(generation).await?;
-        let again = self.ask(Some(generation), read).await;
-        let (_, again) = again.map_err(|fault| self.failed("identity", first, fault))?;
-        self.trusted = Some(generation);
+        let again = self.send(Some(generation), read).await;
+        let (_, again) = again.map_err(|fault| self.device_error("identity", first, fault))?;
+        self.verified_generation = Some(generation);
         if again != words {
-            return Err(self.distrust("second reading of the identity", crc(&words), crc(&again)).await);
+            return Err(self.reject_data("second reading of the identity", crc(&words), crc(&again)).await);
         }
         let machine = self.name.clone();
         match &self.identity {
             Some(known) if known.boot_id != identity.boot_id => {
-                self.trusted = None;
-                Err(DeviceError::Restarted { machine, was: known.boot_id, is: identity.boot_id })
+                self.verified_generation = None;
+                Err(DeviceError::Restarted { machine, old_boot_id: known.boot_id, new_boot_id: identity.boot_id })
             }
             _ => {
                 self.identity = Some(identity);
@@ -263,25 +278,25 @@ impl Unit {
     async fn synchronise(&mut self, generation: u64) -> Result<(), DeviceError> {
         let address = self.map.sync;
         let nonce: [u16; 2] = rand::random();
-        let write = Ask::Write { address, words: Arc::from(&nonce[..]) };
-        let written = self.ask(Some(generation), write).await;
-        written.map_err(|fault| self.failed("proof of sync", address, fault))?;
-        let read = self.ask(Some(generation), Ask::Read { address, count: 4 }).await;
-        let (_, found) = read.map_err(|fault| self.failed("proof of sync", address, fault))?;
+        let write = LinkRequest::Write { address, words: Arc::from(&nonce[..]) };
+        let written = self.send(Some(generation), write).await;
+        written.map_err(|fault| self.device_error("proof of sync", address, fault))?;
+        let read = self.send(Some(generation), LinkRequest::Read { address, count: 4 }).await;
+        let (_, found) = read.map_err(|fault| self.device_error("proof of sync", address, fault))?;
         let expected = [nonce[0], nonce[1], !nonce[0], !nonce[1]];
         if found != expected {
-            self.trusted = Some(generation);
+            self.verified_generation = Some(generation);
             let number = |words: &[u16]| words.iter().fold(0, |bits, word| (bits << 16) | u64::from(*word));
-            return Err(self.distrust("proof of sync", number(&expected), number(&found)).await);
+            return Err(self.reject_data("proof of sync", number(&expected), number(&found)).await);
         }
         Ok(())
     }
 
     /// Decodes an identity block, or returns an error that describes the device that answers.
-    pub(super) fn recognise(&self, words: &[u16]) -> Result<Identity, DeviceError> {
+    pub(super) fn decode_identity(&self, words: &[u16]) -> Result<Identity, DeviceError> {
         let machine = self.name.clone();
         if let Some(how) = layout_fault(words, self.map.word_order) {
-            return Err(DeviceError::OtherLayout { machine, how });
+            return Err(DeviceError::WrongLayout { machine, description: how });
         }
         for (at, required) in MAGIC.into_iter().enumerate() {
             if words[at] != required {
@@ -303,8 +318,13 @@ impl Unit {
             block.u32(4) == SENTINEL_WHOLE && block.f64(6).to_bits() == SENTINEL_REAL.to_bits()
         };
         if !sentinels_fit(self.map.word_order) {
-            let fits = sentinels_fit(self.map.word_order.other()).then_some(self.map.word_order.other().name());
-            return Err(DeviceError::WrongWordOrder { machine, configured: self.map.word_order.name(), fits });
+            let fits = sentinels_fit(self.map.word_order.with_words_swapped())
+                .then_some(self.map.word_order.with_words_swapped().name());
+            return Err(DeviceError::WrongWordOrder {
+                machine,
+                configured: self.map.word_order.name(),
+                matching: fits,
+            });
         }
         let block = self.registers(words);
         let kind = match words[3] {
@@ -316,7 +336,7 @@ impl Unit {
             return Err(DeviceError::WrongKind { machine, expected: self.kind, found: kind });
         }
         if words[13] != 1 {
-            return Err(DeviceError::Inches { machine, unit: words[13] });
+            return Err(DeviceError::WrongLengthUnit { machine, unit: words[13] });
         }
         let silence_ms = if words[15] == 0 { 3000 } else { words[15] };
         Ok(Identity {
@@ -347,9 +367,9 @@ fn layout_fault(words: &[u16], order: WordOrder) -> Option<Cow<'static, str>> {
     let (as_it_is, swapped) = (|word: u16| word, u16::swap_bytes);
     if begins(1, swapped) {
         let exchanged: Vec<u16> = words.iter().copied().map(u16::swap_bytes).collect();
-        let other = order.with_other_bytes();
+        let other = order.with_bytes_swapped();
         let is_whole = |order| Registers::new(&exchanged, order).u32(4) == SENTINEL_WHOLE;
-        let fits = if is_whole(other) { other } else { other.other() };
+        let fits = if is_whole(other) { other } else { other.with_words_swapped() };
         Some(format!(
             "with the two bytes of each register the other way round than the cell file says: write word_order = \"{}\", or have its server or the \
              gateway send the other one first",

@@ -1,23 +1,23 @@
 //! The two Modbus wires, for the table of drivers.
 
-use super::settings::{Line, ModbusSettings, RtuWire, TcpWire};
+use super::settings::{LineAddress, ModbusSettings, RtuWire, TcpWire};
 use super::{Link, ModbusCmm, ModbusGrinder};
-use crate::place::Place;
-use crate::wiring::{Making, MakingError, Wired};
+use crate::place::MachineTable;
+use crate::wiring::{DriverContext, DriverError, DriverFactory};
 use regrind_document::Document;
 
 macro_rules! modbus_wire {
     ($wire:ident) => {
-        impl Wired for $wire {
+        impl DriverFactory for $wire {
             type Cmm = ModbusCmm;
             type Grinder = ModbusGrinder;
             const HAS_REGISTERS: bool = true;
 
-            fn check(&self, place: &Place<'_>, document: &mut Document) {
+            fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
                 self.check_address(place, document);
             }
 
-            fn check_beside(&self, grinder: &Self, document: &mut Document) {
+            fn check_against_grinder(&self, grinder: &Self, document: &mut Document) {
                 self.compare(grinder, document);
             }
 
@@ -25,12 +25,12 @@ macro_rules! modbus_wire {
                 self.missing().into_iter().collect()
             }
 
-            fn cmm(&self, making: &Making<'_>) -> Result<ModbusCmm, MakingError> {
+            fn create_cmm(&self, making: &DriverContext<'_>) -> Result<ModbusCmm, DriverError> {
                 let (link, settings) = link(self.line(), self.unit, self.missing(), making)?;
                 Ok(ModbusCmm::on(link, settings))
             }
 
-            fn grinder(&self, making: &Making<'_>) -> Result<ModbusGrinder, MakingError> {
+            fn create_grinder(&self, making: &DriverContext<'_>) -> Result<ModbusGrinder, DriverError> {
                 let (link, settings) = link(self.line(), self.unit, self.missing(), making)?;
                 Ok(ModbusGrinder::on(link, settings))
             }
@@ -39,7 +39,7 @@ macro_rules! modbus_wire {
                 Some(cmm.link())
             }
 
-            fn line(&self) -> Option<(Line, u8)> {
+            fn modbus_line(&self) -> Option<(LineAddress, u8)> {
                 Some((self.line(), self.unit))
             }
         }
@@ -51,7 +51,7 @@ modbus_wire!(RtuWire);
 
 impl ModbusSettings {
     /// Returns the settings for a unit on a line, from the cell file.
-    pub fn of(line: Line, unit: u8, making: &Making<'_>) -> Self {
+    pub fn from_context(line: LineAddress, unit: u8, making: &DriverContext<'_>) -> Self {
         let timing = making.timing;
         Self {
             unit,
@@ -63,7 +63,7 @@ impl ModbusSettings {
             owner: making.owner,
             epoch: making.epoch,
             signals: making.signals.to_vec(),
-            beat_every: timing.heartbeat,
+            heartbeat_interval: timing.heartbeat,
             expected_name: making.expected_name.map(str::to_owned),
             simulation: Some(making.simulated),
             ..Self::new(line)
@@ -74,19 +74,19 @@ impl ModbusSettings {
 /// Creates the line of a machine, or shares the line of the other machine, and returns it with all settings of the
 /// driver.
 fn link(
-    line: Line,
+    line: LineAddress,
     unit: u8,
     missing: Option<String>,
-    making: &Making<'_>,
-) -> Result<(Link, ModbusSettings), MakingError> {
+    making: &DriverContext<'_>,
+) -> Result<(Link, ModbusSettings), DriverError> {
     if let Some(missing) = missing {
-        return Err(MakingError::NoPort { missing });
+        return Err(DriverError::NoPort { missing });
     }
-    let settings = ModbusSettings::of(line, unit, making);
-    let link = match making.beside.filter(|link| *link.line() == settings.line) {
+    let settings = ModbusSettings::from_context(line, unit, making);
+    let link = match making.shared_link.filter(|link| *link.line() == settings.line) {
         Some(link) => link.clone(),
         None => Link::new(settings.line.clone(), settings.request_timeout, settings.quarantine)
-            .map_err(|source| MakingError::Line { line: settings.line.to_string(), source })?,
+            .map_err(|source| DriverError::Line { line: settings.line.to_string(), source })?,
     };
     Ok((link, settings))
 }

@@ -432,7 +432,7 @@ impl<'a> Rewriter<'a> {
         let largest_mm = shifts.iter().map(Vector::norm).fold(0.0, f64::max);
         if largest_mm > self.amendment.largest_mm {
             let found = format!("the map would move the tool by {:.1} um", 1e3 * largest_mm);
-            return Err((found, "is it the right map, in the right unit? allow more by --largest-correction-um"));
+            return Err((found, "is it the right map, in the right unit? allow more by --max-correction-um"));
         }
         self.done.largest_mm = self.done.largest_mm.max(largest_mm);
         let count = shifts.len() - 1;

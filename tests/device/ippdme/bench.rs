@@ -9,7 +9,7 @@ use regrind::device::{
     State, Status, Target, TargetKind, digest,
 };
 use regrind_sim::dme::Server;
-use regrind_sim::dme::faults::Faults;
+use regrind_sim::dme::faults::CommandFaults;
 use regrind_sim::dme::machine::{self, Options};
 use regrind_sim::spec::{CmmSpec, WorldSpec};
 use regrind_sim::wire::dme::ServingDme;
@@ -22,7 +22,7 @@ const LONG: Duration = Duration::from_secs(60);
 
 pub struct Bench {
     pub world: World,
-    pub faults: Faults,
+    pub faults: CommandFaults,
     pub serving: ServingDme,
     pub cmm: IppdmeCmm,
 }
@@ -74,8 +74,8 @@ impl Bench {
 
     pub async fn measuring(cmm: CmmSpec, speed: f64, limits: Limits, options: Options) -> Self {
         let world = World::new(WorldSpec { cmm, ..WorldSpec::default() }).unwrap();
-        let faults = Faults::none();
-        let server = Server::new(machine::Machine::new(world.led(), options), speed, faults.clone());
+        let faults = CommandFaults::none();
+        let server = Server::new(machine::DmeMachine::new(world.touch_probe(), options), speed, faults.clone());
         let serving = ServingDme::tcp("127.0.0.1:0", server).await.unwrap();
         let cmm = IppdmeCmm::new(settings(serving.local_addr().port(), limits));
         Self { world, faults, serving, cmm }
@@ -92,7 +92,7 @@ impl Bench {
             let k = (index * 7) % count;
             let (x, y) = (f64::from(k % 5) * 6.0 - 12.0, f64::from(k / 5) * 6.0 - 6.0);
             let (point_mm, normal) = self.world.nominal(x, y);
-            Target { index: 10 + index, what: TargetKind::Part, point_mm, normal }
+            Target { index: 10 + index, kind: TargetKind::Part, point_mm, normal }
         };
         Plan {
             targets: (0..count).map(target).collect(),
@@ -101,7 +101,7 @@ impl Bench {
             search_mm: 2.0,
             speed_mm_s: 3.0,
             safe_height_mm: 20.0,
-            careful: None,
+            careful_start: None,
         }
     }
 
@@ -112,14 +112,14 @@ impl Bench {
     }
 
     /// Asserts that every touched point lies on the true part.
-    pub fn are_true(&self, plan: &Plan, measurement: &Measurement) {
+    pub fn assert_on_part(&self, plan: &Plan, measurement: &Measurement) {
         assert_eq!(measurement.points.len(), plan.targets.len());
         for (point, target) in measurement.points.iter().zip(&plan.targets) {
             assert_eq!(point.index, target.index, "points come in the order of the plan");
             if point.status != PointStatus::Touched {
                 continue;
             }
-            let along: f64 = (0..3).map(|k| (point.at_mm[k] - target.point_mm[k]) * target.normal[k]).sum();
+            let along: f64 = (0..3).map(|k| (point.position_mm[k] - target.point_mm[k]) * target.normal[k]).sum();
             let [x, y, _] = target.point_mm;
             let off_mm = along - RADIUS_MM - self.world.deviation_mm(x, y);
             assert!(off_mm.abs() < 1e-3, "target {} is off by {off_mm} mm", target.index);
@@ -154,7 +154,7 @@ pub async fn until(cmm: &mut IppdmeCmm, is_so: impl Fn(&Status) -> bool) -> Resu
 
 /// Polls until nothing moves any more.
 pub async fn until_still(cmm: &mut IppdmeCmm) -> Result<Status, DeviceError> {
-    until(cmm, |status| !status.state.moves()).await
+    until(cmm, |status| !status.state.is_moving()).await
 }
 
 /// Polls until this number of points is present.
@@ -162,6 +162,6 @@ pub async fn until_points(cmm: &mut IppdmeCmm, count: u32) {
     until(cmm, |status| status.progress.is_some_and(|(done, _)| done >= count)).await.unwrap();
 }
 
-pub fn is(status: &Status, state: State) -> bool {
+pub fn has_state(status: &Status, state: State) -> bool {
     status.state == state
 }

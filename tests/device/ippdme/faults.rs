@@ -12,11 +12,14 @@ use super::bench::{Bench, hasty, job, patient, until, until_points, until_still}
 const FAST: f64 = 5000.0;
 
 /// Runs a job with a fault at the third touch.
-async fn touching(fault: Fault, limits: regrind::device::ippdme::Limits) -> (Bench, Result<Status, DeviceError>) {
-    going_wrong("PtMeas", 2, fault, limits).await
+async fn run_with_touch_fault(
+    fault: Fault,
+    limits: regrind::device::ippdme::Limits,
+) -> (Bench, Result<Status, DeviceError>) {
+    run_with_fault("PtMeas", 2, fault, limits).await
 }
 
-async fn going_wrong(
+async fn run_with_fault(
     method: &str,
     skip: u32,
     fault: Fault,
@@ -33,17 +36,17 @@ async fn going_wrong(
 }
 
 /// Asserts that the job finished anyway, with true points.
-async fn is_measured(bench: &mut Bench, ended: Result<Status, DeviceError>) {
+async fn assert_measured(bench: &mut Bench, ended: Result<Status, DeviceError>) {
     let status = ended.unwrap();
     assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
     let plan = bench.plan(8);
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
-    bench.are_true(&plan, &measurement);
+    bench.assert_on_part(&plan, &measurement);
 }
 
 /// Asserts that the connection was given up; after a new connection, the machine is at rest, the job is held, and a
 /// resume brings the missing points.
-async fn is_taken_up(bench: &mut Bench, ended: Result<Status, DeviceError>) {
+async fn assert_resumed(bench: &mut Bench, ended: Result<Status, DeviceError>) {
     let error = ended.unwrap_err();
     assert!(error.is_link(), "{error}");
     let plan = bench.plan(8);
@@ -56,7 +59,7 @@ async fn is_taken_up(bench: &mut Bench, ended: Result<Status, DeviceError>) {
             bench.cmm.resume().await.unwrap();
         }
         match until_still(&mut bench.cmm).await {
-            Ok(status) if status.state == State::Complete => return is_measured(bench, Ok(status)).await,
+            Ok(status) if status.state == State::Complete => return assert_measured(bench, Ok(status)).await,
             Ok(status) if status.state == State::Idle => {
                 super::bench::begin(&mut bench.cmm, &plan).await.unwrap();
             }
@@ -68,65 +71,66 @@ async fn is_taken_up(bench: &mut Bench, ended: Result<Status, DeviceError>) {
 
 #[tokio::test]
 async fn a_late_acknowledgement_is_waited_for() {
-    let (mut bench, ended) = touching(Fault::LateAcknowledgement(Duration::from_millis(50)), patient()).await;
-    is_measured(&mut bench, ended).await;
+    let (mut bench, ended) =
+        run_with_touch_fault(Fault::LateAcknowledgement(Duration::from_millis(50)), patient()).await;
+    assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn an_acknowledgement_that_does_not_come_in_time_ends_the_connection() {
-    let (mut bench, ended) = touching(Fault::LateAcknowledgement(Duration::from_secs(3600)), hasty()).await;
+    let (mut bench, ended) = run_with_touch_fault(Fault::LateAcknowledgement(Duration::from_secs(3600)), hasty()).await;
     assert!(matches!(ended, Err(DeviceError::TimedOut { .. })), "{ended:?}");
-    is_taken_up(&mut bench, ended).await;
+    assert_resumed(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn a_touch_that_is_never_said_to_be_over_ends_the_connection() {
-    let (mut bench, ended) = touching(Fault::NoCompletion, hasty()).await;
+    let (mut bench, ended) = run_with_touch_fault(Fault::NoCompletion, hasty()).await;
     assert!(matches!(ended, Err(DeviceError::TimedOut { .. })), "{ended:?}");
-    is_taken_up(&mut bench, ended).await;
+    assert_resumed(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn data_that_come_twice_are_one_point() {
-    let (mut bench, ended) = touching(Fault::Twice, patient()).await;
-    is_measured(&mut bench, ended).await;
+    let (mut bench, ended) = run_with_touch_fault(Fault::Twice, patient()).await;
+    assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn a_line_that_comes_byte_for_byte_is_one_line() {
-    let (mut bench, ended) = touching(Fault::Split, patient()).await;
-    is_measured(&mut bench, ended).await;
+    let (mut bench, ended) = run_with_touch_fault(Fault::Split, patient()).await;
+    assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn fields_are_known_by_their_names_in_whatever_order_they_come() {
-    let (mut bench, ended) = touching(Fault::Reordered, patient()).await;
-    is_measured(&mut bench, ended).await;
+    let (mut bench, ended) = run_with_touch_fault(Fault::Reordered, patient()).await;
+    assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn a_quality_that_comes_twice_spoils_no_coordinate() {
-    let (mut bench, ended) = touching(Fault::UnaskedQuality, patient()).await;
-    is_measured(&mut bench, ended).await;
+    let (mut bench, ended) = run_with_touch_fault(Fault::UnaskedQuality, patient()).await;
+    assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn a_garbled_line_is_no_point_and_ends_the_connection() {
-    let (mut bench, ended) = touching(Fault::Garbled, patient()).await;
+    let (mut bench, ended) = run_with_touch_fault(Fault::Garbled, patient()).await;
     assert!(matches!(ended, Err(DeviceError::Unreadable { .. })), "{ended:?}");
-    is_taken_up(&mut bench, ended).await;
+    assert_resumed(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn data_of_a_command_that_was_never_given_are_no_point() {
-    let (mut bench, ended) = touching(Fault::Stranger, patient()).await;
+    let (mut bench, ended) = run_with_touch_fault(Fault::Stranger, patient()).await;
     assert!(matches!(ended, Err(DeviceError::Unreadable { .. })), "{ended:?}");
-    is_taken_up(&mut bench, ended).await;
+    assert_resumed(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn a_connection_that_ends_in_a_job_loses_no_point() {
-    let (mut bench, ended) = touching(Fault::Disconnect, patient()).await;
+    let (mut bench, ended) = run_with_touch_fault(Fault::Disconnect, patient()).await;
     assert!(matches!(ended, Err(DeviceError::Disconnected { .. })), "{ended:?}");
     let plan = bench.plan(8);
     bench.cmm.connect().await.unwrap();
@@ -136,18 +140,18 @@ async fn a_connection_that_ends_in_a_job_loses_no_point() {
     assert_eq!((status.state, status.progress, status.clear_of_part), (State::Held, Some((2, 8)), None));
     bench.cmm.resume().await.unwrap();
     let ended = until_still(&mut bench.cmm).await;
-    is_measured(&mut bench, ended).await;
+    assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn an_error_in_a_session_that_is_being_opened_is_cleared_away() {
-    let (mut bench, ended) = going_wrong("GetPropX", 0, Fault::Twice, patient()).await;
-    is_measured(&mut bench, ended).await;
+    let (mut bench, ended) = run_with_fault("GetPropX", 0, Fault::Twice, patient()).await;
+    assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn an_emergency_stop_faults_and_is_told_as_that() {
-    let (mut bench, ended) = touching(Fault::EmergencyStop, patient()).await;
+    let (mut bench, ended) = run_with_touch_fault(Fault::EmergencyStop, patient()).await;
     let status = ended.unwrap();
     assert_eq!((status.state, status.fault), (State::Faulted, Some(MachineFault::StopCircuit)));
     assert_eq!((status.outcome, status.clear_of_part), (Outcome::Failed, None));
@@ -214,5 +218,5 @@ async fn a_silence_in_a_motion_is_asked_about_and_the_motion_goes_on() {
     bench.begin(&plan).await.unwrap();
     until_points(&mut bench.cmm, 2).await;
     let ended = until_still(&mut bench.cmm).await;
-    is_measured(&mut bench, ended).await;
+    assert_measured(&mut bench, ended).await;
 }

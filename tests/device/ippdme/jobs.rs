@@ -1,13 +1,13 @@
 //! Jobs from their beginning to their end, with interventions of people and crashes.
 
 use regrind::device::{
-    Careful, Cmm, DeviceError, Interrupt, IppdmeCmm, Machine, Outcome, Plan, PointStatus, Reconciled, State,
+    CarefulStart, Cmm, DeviceError, Interrupt, IppdmeCmm, Machine, Outcome, Plan, PointStatus, Reconciled, State,
 };
 use regrind_sim::dme::machine::Options;
 use regrind_sim::spec::CmmSpec;
 use regrind_sim::wire::dme::ServingDme;
 
-use super::bench::{Bench, begin, is, job, patient, settings, until, until_points, until_still};
+use super::bench::{Bench, begin, has_state, job, patient, settings, until, until_points, until_still};
 
 /// Speed at which a touch takes about a millisecond.
 const FAST: f64 = 5000.0;
@@ -17,13 +17,13 @@ const SLOW: f64 = 50.0;
 #[tokio::test]
 async fn a_plan_is_measured_and_its_points_are_those_of_the_part() {
     let mut bench = Bench::new(FAST, patient()).await;
-    let plan = Plan { careful: Some(Careful { targets: 2, speed_mm_s: 0.5 }), ..bench.plan(20) };
+    let plan = Plan { careful_start: Some(CarefulStart { target_count: 2, speed_mm_s: 0.5 }), ..bench.plan(20) };
     let armed = bench.begin(&plan).await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
     assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
     assert_eq!((status.done, status.clear_of_part), (armed.start_sequence, Some(true)));
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
-    bench.are_true(&plan, &measurement);
+    bench.assert_on_part(&plan, &measurement);
     assert!(measurement.points.iter().all(|point| point.status == PointStatus::Touched));
     assert_eq!(measurement.probe_radius_mm, Some(1.5));
     assert_eq!(bench.cmm.acknowledge(status.done).await.unwrap().state, State::Idle);
@@ -41,7 +41,7 @@ async fn the_part_in_a_frame_of_its_own_gives_the_same_points() {
         cmm.connect().await.unwrap();
         begin(&mut cmm, &plan).await.unwrap();
         until_still(&mut cmm).await.unwrap();
-        bench.are_true(&plan, &cmm.collect(job(&plan), &Interrupt::new()).await.unwrap());
+        bench.assert_on_part(&plan, &cmm.collect(job(&plan), &Interrupt::new()).await.unwrap());
         cmm.release().await.unwrap();
     }
 }
@@ -53,9 +53,9 @@ async fn points_come_ahead_each_once_and_in_the_order_of_the_plan() {
     bench.begin(&plan).await.unwrap();
     let mut ahead = Vec::new();
     loop {
-        let over = is(&bench.cmm.status().await.unwrap(), State::Complete);
+        let over = has_state(&bench.cmm.status().await.unwrap(), State::Complete);
         if let Some(more) = bench.cmm.read_ahead(job(&plan), &Interrupt::new()).await {
-            assert_eq!(more.from, ahead.len());
+            assert_eq!(more.first_index, ahead.len());
             ahead.extend(more.points);
         }
         if over {
@@ -73,7 +73,7 @@ async fn a_hold_retracts_and_a_resume_touches_what_is_left() {
     bench.begin(&plan).await.unwrap();
     until_points(&mut bench.cmm, 2).await;
     assert_eq!(bench.cmm.hold().await.unwrap().state, State::Holding);
-    let held = until(&mut bench.cmm, |status| is(status, State::Held)).await.unwrap();
+    let held = until(&mut bench.cmm, |status| has_state(status, State::Held)).await.unwrap();
     assert!(held.progress.is_some_and(|(done, _)| done < 10) && held.clear_of_part == Some(true));
     let highest = plan.targets.iter().map(|t| t.point_mm[2]).fold(f64::MIN, f64::max);
     let height = bench.serving.with(|server| server.machine().at_mm()[2]);
@@ -82,7 +82,7 @@ async fn a_hold_retracts_and_a_resume_touches_what_is_left() {
     let status = until_still(&mut bench.cmm).await.unwrap();
     assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
-    bench.are_true(&plan, &measurement);
+    bench.assert_on_part(&plan, &measurement);
 }
 
 #[tokio::test]
@@ -176,12 +176,12 @@ async fn a_real_machine_is_not_taken_for_a_simulation() {
     let class = "CartCMM".to_owned();
     let mut bench = Bench::with(FAST, patient(), Options { class, ..Options::default() }).await;
     let error = bench.cmm.connect().await.unwrap_err();
-    assert!(matches!(error, DeviceError::WrongReality { simulation: false, .. }), "{error}");
+    assert!(matches!(error, DeviceError::SimulationMismatch { simulation: false, .. }), "{error}");
 }
 
 #[tokio::test]
 async fn speeds_that_the_machine_keeps_lower_are_told_and_used() {
-    let mut bench = Bench::with(FAST, patient(), Options { fastest_mm_s: [50.0, 2.0], ..Options::default() }).await;
+    let mut bench = Bench::with(FAST, patient(), Options { max_speeds_mm_s: [50.0, 2.0], ..Options::default() }).await;
     let plan = bench.plan(5);
     bench.begin(&plan).await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
@@ -198,7 +198,7 @@ async fn targets_that_are_missed_are_tried_again_and_then_told() {
     let status = until_still(&mut bench.cmm).await.unwrap();
     assert_eq!(status.outcome, Outcome::Complete, "{:?}", bench.cmm.notes());
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
-    bench.are_true(&plan, &measurement);
+    bench.assert_on_part(&plan, &measurement);
     let missed = measurement.points.iter().filter(|point| point.status == PointStatus::NotFound).count();
     // Half of the first tries, and a quarter after the second ones.
     assert!((1..15).contains(&missed), "{missed}");
@@ -222,7 +222,7 @@ async fn a_job_that_nobody_looks_at_holds_by_itself() {
     bench.cmm = IppdmeCmm::new(settings);
     let plan = bench.plan(10);
     bench.begin(&plan).await.unwrap();
-    let held = until(&mut bench.cmm, |status| is(status, State::Held)).await.unwrap();
+    let held = until(&mut bench.cmm, |status| has_state(status, State::Held)).await.unwrap();
     assert!(held.progress.is_some_and(|(done, _)| done < 10));
     assert!(bench.cmm.notes()[0].contains("nobody looked"), "{:?}", bench.cmm.notes());
 }

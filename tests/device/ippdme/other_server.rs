@@ -41,7 +41,7 @@ async fn a_cap_of_a_sphere_is_measured() {
         let normal = [tilt.sin() * turn.cos(), tilt.sin() * turn.sin(), tilt.cos()];
         // A little off the surface, like a real part.
         let point_mm = [60.01 * normal[0], 60.01 * normal[1], 60.01 * normal[2] - 50.0];
-        Target { index, what: TargetKind::Part, point_mm, normal }
+        Target { index, kind: TargetKind::Part, point_mm, normal }
     };
     let plan = Plan {
         targets: (0..30).map(target).collect(),
@@ -50,14 +50,14 @@ async fn a_cap_of_a_sphere_is_measured() {
         search_mm: 2.0,
         speed_mm_s: 3.0,
         safe_height_mm: 10.0,
-        careful: None,
+        careful_start: None,
     };
     begin(&mut cmm, &plan).await.unwrap();
     let status = until_still(&mut cmm).await.unwrap();
     assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", cmm.notes());
     let measurement = cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
     for point in &measurement.points {
-        let [x, y, z] = point.at_mm;
+        let [x, y, z] = point.position_mm;
         let distance = (x * x + y * y + (z + 50.0).powi(2)).sqrt();
         assert!(point.status == PointStatus::Touched && (distance - 61.5).abs() < 1e-6, "{point:?}");
     }

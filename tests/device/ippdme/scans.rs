@@ -28,12 +28,12 @@ fn rows(bench: &Bench) -> Plan {
     let places = (0..3).flat_map(row).chain([(-12.0, -6.0)]);
     let targets = places.enumerate().map(|(index, (x, y))| {
         let (point_mm, normal) = bench.world.nominal(x, y);
-        Target { index: 10 + index as u32, what: TargetKind::Part, point_mm, normal }
+        Target { index: 10 + index as u32, kind: TargetKind::Part, point_mm, normal }
     });
     Plan { targets: targets.collect(), ..bench.plan(1) }
 }
 
-async fn going_wrong(fault: Option<Fault>) -> (Bench, Result<Status, DeviceError>) {
+async fn run_with_fault(fault: Option<Fault>) -> (Bench, Result<Status, DeviceError>) {
     let mut bench = scanning(FAST, CmmSpec::perfect()).await;
     if let Some(fault) = fault {
         bench.faults.add("ScanOnCurve", 1, fault);
@@ -44,40 +44,40 @@ async fn going_wrong(fault: Option<Fault>) -> (Bench, Result<Status, DeviceError
     (bench, ended)
 }
 
-async fn is_measured(bench: &mut Bench, ended: Result<Status, DeviceError>) {
+async fn assert_measured(bench: &mut Bench, ended: Result<Status, DeviceError>) {
     let status = ended.unwrap();
     assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
     let plan = rows(bench);
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
-    bench.are_true(&plan, &measurement);
+    bench.assert_on_part(&plan, &measurement);
     assert!(measurement.points.iter().all(|point| point.status == PointStatus::Touched));
 }
 
 #[tokio::test]
 async fn rows_are_scanned_and_each_point_lies_at_its_target() {
-    let (mut bench, ended) = going_wrong(None).await;
-    is_measured(&mut bench, ended).await;
+    let (mut bench, ended) = run_with_fault(None).await;
+    assert_measured(&mut bench, ended).await;
     // A scan counts as one contact, however many points it brings: three rows and a touch, compared with 37 touches.
     assert_eq!(bench.serving.with(|server| server.machine().contacts()), 4);
 }
 
 #[tokio::test]
 async fn a_quality_that_nobody_asked_for_is_no_coordinate() {
-    let (mut bench, ended) = going_wrong(Some(Fault::UnaskedQuality)).await;
-    is_measured(&mut bench, ended).await;
+    let (mut bench, ended) = run_with_fault(Some(Fault::UnaskedQuality)).await;
+    assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
 async fn lines_that_come_twice_or_byte_for_byte_are_one() {
     for fault in [Fault::Twice, Fault::Split] {
-        let (mut bench, ended) = going_wrong(Some(fault)).await;
-        is_measured(&mut bench, ended).await;
+        let (mut bench, ended) = run_with_fault(Some(fault)).await;
+        assert_measured(&mut bench, ended).await;
     }
 }
 
 /// Asserts that a scan with this fault is rejected completely, and that the machine is at rest.
-async fn is_refused(fault: Fault, says: &str) {
-    let (bench, ended) = going_wrong(Some(fault)).await;
+async fn assert_scan_refused(fault: Fault, says: &str) {
+    let (bench, ended) = run_with_fault(Some(fault)).await;
     let status = ended.unwrap();
     assert_eq!((status.state, status.outcome), (State::Faulted, Outcome::Failed));
     assert_eq!(status.progress, Some((12, 37)), "the first row alone");
@@ -86,17 +86,17 @@ async fn is_refused(fault: Fault, says: &str) {
 
 #[tokio::test]
 async fn a_point_that_is_missing_makes_no_other_one_wrong() {
-    is_refused(Fault::PointLost, "one point at each target").await;
+    assert_scan_refused(Fault::PointLost, "one point at each target").await;
 }
 
 #[tokio::test]
 async fn points_that_stand_for_their_neighbours_are_refused() {
-    is_refused(Fault::PointsShifted, "beside target").await;
+    assert_scan_refused(Fault::PointsShifted, "beside target").await;
 }
 
 #[tokio::test]
 async fn a_connection_that_ends_in_a_scan_takes_nothing_of_it_and_the_row_is_scanned_again() {
-    let (mut bench, ended) = going_wrong(Some(Fault::CutInScan)).await;
+    let (mut bench, ended) = run_with_fault(Some(Fault::CutInScan)).await;
     let error = ended.unwrap_err();
     assert!(error.is_link(), "{error}");
     bench.cmm.connect().await.unwrap();
@@ -104,7 +104,7 @@ async fn a_connection_that_ends_in_a_scan_takes_nothing_of_it_and_the_row_is_sca
     assert_eq!((held.state, held.progress, held.clear_of_part), (State::Held, Some((12, 37)), None));
     bench.cmm.resume().await.unwrap();
     let ended = until_still(&mut bench.cmm).await;
-    is_measured(&mut bench, ended).await;
+    assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
@@ -117,7 +117,7 @@ async fn a_row_that_loses_the_surface_is_touched() {
     let status = ended.unwrap();
     assert_eq!(status.outcome, Outcome::Complete, "{:?}", bench.cmm.notes());
     let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
-    bench.are_true(&plan, &measurement);
+    bench.assert_on_part(&plan, &measurement);
 }
 
 /// Returns a job in its second row, which takes as long as a real one.
@@ -144,7 +144,7 @@ async fn a_hold_in_a_scan_begins_no_other_row_until_it_is_resumed() {
     assert_eq!(bench.serving.with(|server| (server.due(), server.machine().contacts())), (None, 2));
     bench.cmm.resume().await.unwrap();
     let ended = until_still(&mut bench.cmm).await;
-    is_measured(&mut bench, ended).await;
+    assert_measured(&mut bench, ended).await;
 }
 
 #[tokio::test]
@@ -162,24 +162,24 @@ async fn an_abort_in_a_scan_ends_it_there() {
 
 #[tokio::test]
 async fn numbers_that_come_in_another_order_are_no_points() {
-    is_refused(Fault::Reordered, "from where it was sent").await;
+    assert_scan_refused(Fault::Reordered, "from where it was sent").await;
 }
 
 #[tokio::test]
 async fn where_nobody_knows_the_radius_of_the_tool_rows_are_touched() {
     let mut bench = scanning(FAST, CmmSpec::perfect()).await;
-    bench.serving.with(|server| server.machine().tells_no_radius());
+    bench.serving.with(|server| server.machine().hide_radius());
     let plan = rows(&bench);
     bench.begin(&plan).await.unwrap();
     let ended = until_still(&mut bench.cmm).await;
-    is_measured(&mut bench, ended).await;
+    assert_measured(&mut bench, ended).await;
     assert_eq!(bench.serving.with(|server| server.machine().contacts()), 37);
 }
 
 #[tokio::test]
 async fn a_probe_that_cannot_scan_is_told_as_a_matter_of_the_tool() {
     let mut bench = scanning(FAST, CmmSpec::perfect()).await;
-    bench.serving.with(|server| server.machine().touches_only());
+    bench.serving.with(|server| server.machine().disable_scanning());
     let plan = rows(&bench);
     bench.begin(&plan).await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();

@@ -75,7 +75,7 @@ fn plan() -> Plan {
     Plan {
         targets: vec![Target {
             index: 3,
-            what: TargetKind::Part,
+            kind: TargetKind::Part,
             point_mm: [10.0, 20.0, 5.1],
             normal: [0.0, 0.0, 1.0],
         }],
@@ -84,7 +84,7 @@ fn plan() -> Plan {
         search_mm: 2.0,
         speed_mm_s: 3.0,
         safe_height_mm: 20.0,
-        careful: None,
+        careful_start: None,
     }
 }
 
@@ -97,7 +97,7 @@ async fn a_session_is_written_as_the_standard_has_it() {
     let status = until_still(&mut cmm).await.unwrap();
     assert_eq!(status.state, State::Complete, "{:?}", cmm.notes());
     let measurement = cmm.collect(job(&plan()), &Interrupt::new()).await.unwrap();
-    assert_eq!(measurement.points[0].at_mm, [10.0, 20.0, 6.6]);
+    assert_eq!(measurement.points[0].position_mm, [10.0, 20.0, 6.6]);
     let golden = "\
 00001 EndSession()
 00002 StartSession()

@@ -29,7 +29,7 @@ fn a_study_is_made_by_whoever_works_and_each_run_is_that_of_its_seed() {
             "--vary",
             vary,
             "--vary",
-            "cycle.most_cycles=3",
+            "cycle.max_cycles=3",
             "--plant",
             "planner.toml",
         ];

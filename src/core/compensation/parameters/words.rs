@@ -8,7 +8,7 @@ use super::{EXPANDED, NOTHING, Parameter, ParameterKind, ParameterOptions};
 /// Minimum share, relative to the largest, with which another column is named as a cause of an inseparable one.
 const NAMED: f64 = 0.2;
 pub(super) const NO_DATUM: &str =
-    "how well the datum holds the part, which nobody states (registration.hold_uncertainty_um)";
+    "how well the datum holds the part, which nobody states (registration.lock_uncertainty_um)";
 
 /// Returns the name of a parameter, for people.
 pub fn name(kind: ParameterKind) -> &'static str {

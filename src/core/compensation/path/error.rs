@@ -59,13 +59,13 @@ pub enum PathError {
     #[error("a table of Z over X and Y knows nothing of a wheel that is tilted; grind by the program")]
     TableOfTilted,
     #[error(
-        "the wheel would be tilted to {letter} {found_deg:.3} degrees at x {x_mm:.3}, y {y_mm:.3} mm, beyond the {least_deg} to {most_deg} degrees of the \
+        "the wheel would be tilted to {letter} {found_deg:.3} degrees at x {x_mm:.3}, y {y_mm:.3} mm, beyond the {min_deg} to {max_deg} degrees of the \
          axis (grinder.rotary); change grinding.tilt.angle_deg by {by_deg:.1} degrees or more towards the range, or turn the part"
     )]
-    Tilt { letter: char, found_deg: f64, x_mm: f64, y_mm: f64, least_deg: f64, most_deg: f64, by_deg: f64 },
+    Tilt { letter: char, found_deg: f64, x_mm: f64, y_mm: f64, min_deg: f64, max_deg: f64, by_deg: f64 },
     #[error(
         "the path turns {letter} at {found_deg_min:.1} degrees a minute at x {x_mm:.3}, y {y_mm:.3} mm, faster than the axis' {limit_deg_min} \
-         (grinder.rotary.largest_rate_deg_min); lower the feed to {feed_mm_min:.1} mm/min, or tilt the wheel by a constant angle"
+         (grinder.rotary.max_rate_deg_min); lower the feed to {feed_mm_min:.1} mm/min, or tilt the wheel by a constant angle"
     )]
     Rate { letter: char, found_deg_min: f64, x_mm: f64, y_mm: f64, limit_deg_min: f64, feed_mm_min: f64 },
     #[error(

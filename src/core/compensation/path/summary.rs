@@ -332,13 +332,13 @@ impl Turned {
 
     fn check(&self) -> Result<(), PathError> {
         let Rotary { letter, range_rad, rate_rad_s, .. } = self.rotary;
-        let [least_deg, most_deg] = range_rad.map(f64::to_degrees);
+        let [min_deg, max_deg] = range_rad.map(f64::to_degrees);
         for Peak { value, at_mm: [x_mm, y_mm], .. } in [self.least_rad, self.most_rad] {
             let found_deg = self.rotary.on_scale_rad(value).to_degrees();
             // Tolerate rounding errors.
-            let by_deg = (least_deg - found_deg).max(found_deg - most_deg);
+            let by_deg = (min_deg - found_deg).max(found_deg - max_deg);
             if by_deg > 1e-9 {
-                return Err(PathError::Tilt { letter, found_deg, x_mm, y_mm, least_deg, most_deg, by_deg });
+                return Err(PathError::Tilt { letter, found_deg, x_mm, y_mm, min_deg, max_deg, by_deg });
             }
         }
         let Peak { value, at_mm: [x_mm, y_mm], feed_mm_min } = self.rate_rad_s;

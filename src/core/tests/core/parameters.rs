@@ -136,7 +136,7 @@ fn a_datum_tells_no_better_than_it_holds() {
         of(&parameters(&contacts, None, &options).unwrap(), ParameterKind::SettingX).clone()
     };
     let unknown = told(None);
-    assert!(!unknown.offered && unknown.message.contains("registration.hold_uncertainty_um"), "{}", unknown.message);
+    assert!(!unknown.offered && unknown.message.contains("registration.lock_uncertainty_um"), "{}", unknown.message);
     let badly = told(Some([0.01, 0.0]));
     assert!(!badly.offered && (badly.sigma - 0.01).abs() < 1e-4, "{}", badly.message);
     assert!(told(Some([0.001, 0.0])).offered);

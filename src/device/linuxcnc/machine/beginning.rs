@@ -6,19 +6,19 @@ use rand::RngExt as _;
 use tokio::time::{Instant, sleep};
 
 use super::looking::standing_fault;
-use super::{LOOK_EVERY, LinuxcncGrinder, SEEN_TWICE_OVER};
-use crate::error::{Answered, DeviceError};
-use crate::linuxcnc::controller::{Interpreter, Seen};
-use crate::linuxcnc::program::{Program, RECORD, Record, opening, path};
+use super::{LinuxcncGrinder, NOT_STARTED_CONFIRMATION, POLL_INTERVAL};
+use crate::error::{DeviceError, DeviceResult};
+use crate::linuxcnc::controller::{ControllerState, Interpreter};
+use crate::linuxcnc::program::{Program, ProgramRecord, RECORD, opening, path};
 use crate::linuxcnc::protocol::{Mode, Set};
-use crate::linuxcnc::work::{Stage, Work};
+use crate::linuxcnc::work::{ActiveJob, Stage};
 use crate::words::{Answer, Armed, Command, Fault, Job, State, Status};
 
 impl LinuxcncGrinder {
-    pub(super) async fn prepared(&mut self, job: Job, program: Arc<Program>) -> Answered<Armed> {
-        let (seen, _) = self.look().await?;
+    pub(super) async fn prepare_program(&mut self, job: Job, program: Arc<Program>) -> DeviceResult<Armed> {
+        let (seen, _) = self.read_status().await?;
         self.check_ready(&seen)?;
-        if !self.controller.owned {
+        if !self.controller.has_control {
             return Err(self.refused(Command::Prepare, Answer::NotOwner));
         }
         let name = program.name.clone();
@@ -26,25 +26,35 @@ impl LinuxcncGrinder {
         if before.begun > 0 {
             return Err(self.refused(Command::Prepare, Answer::AlreadyBegun));
         }
-        let token = self.chance.random::<u32>().max(1);
+        let token = self.rng.random::<u32>().max(1);
         self.controller.errors().await?;
         self.open_record(&program, token).await?;
         self.controller.enter(Mode::Auto, Command::Prepare).await?;
         let path = self.path(&program);
         self.controller.open(&path, Command::Prepare).await?;
         let sequence = u32::from(job.cycle).max(1);
-        let (stage, wanted, errors, round) = (Stage::Prepared, None, Vec::new(), (0, 0));
-        self.work = Some(Work { job, sequence, token, program: Some(program), path, stage, wanted, errors, round });
+        let (stage, requested_outcome, errors, round) = (Stage::Prepared, None, Vec::new(), (0, 0));
+        self.job = Some(ActiveJob {
+            job,
+            sequence,
+            token,
+            program: Some(program),
+            path,
+            stage,
+            requested_outcome,
+            errors,
+            round,
+        });
         (self.began, self.duration_s, self.fault, self.clear_at) = (None, None, Fault::None, None);
         self.notes.clear();
-        self.last = Some(State::Prepared);
+        self.last_state = Some(State::Prepared);
         Ok(Armed { job, start_sequence: sequence, token, boot_id: 0 })
     }
 
     /// Checks that the machine is ready. Only a person at the machine can make it ready.
-    pub(super) fn check_ready(&self, seen: &Seen) -> Answered<()> {
+    pub(super) fn check_ready(&self, seen: &ControllerState) -> DeviceResult<()> {
         match () {
-            () if seen.stopped || !seen.on => {
+            () if seen.stop_circuit_open || !seen.drives_on => {
                 let (state, fault) = (State::Faulted, standing_fault(seen).unwrap_or(Fault::None));
                 Err(DeviceError::Faulted { machine: self.machine(), state, fault })
             }
@@ -58,13 +68,13 @@ impl LinuxcncGrinder {
     }
 
     fn unready(&self, why: &'static str) -> DeviceError {
-        DeviceError::Unready { machine: self.machine(), why }
+        DeviceError::NotReady { machine: self.machine(), reason: why }
     }
 
     /// Has the controller open the record and reads the token in it. This proves that both see one folder, that the
     /// controller can write in it, and that later lines of the record are of this preparation.
-    async fn open_record(&mut self, program: &Program, token: u32) -> Answered<()> {
-        let record = path(&self.folders.there, &program.name, RECORD);
+    async fn open_record(&mut self, program: &Program, token: u32) -> DeviceResult<()> {
+        let record = path(&self.folders.remote, &program.name, RECORD);
         self.controller.enter(Mode::Mdi, Command::Prepare).await?;
         for line in opening(&record, token) {
             self.controller.order(Set::Mdi(line), Command::Prepare).await?;
@@ -73,24 +83,24 @@ impl LinuxcncGrinder {
         loop {
             let name = program.name.clone();
             let found = self.in_folders(move |folders| folders.record(&name)).await?;
-            if found == Some(Record { prepared: Some(token), begun: 0, ended: 0 }) {
+            if found == Some(ProgramRecord { token: Some(token), begun: 0, ended: 0 }) {
                 return Ok(());
             }
-            if began.elapsed() > self.settings.settle_within {
-                let (here, there) = (self.folders.here.display(), &self.folders.there);
+            if began.elapsed() > self.settings.settle_timeout {
+                let (here, there) = (self.folders.local.display(), &self.folders.remote);
                 let errors = self.controller.errors().await?.join("; ");
                 let why = format!(
                     "what the controller writes to {record} is not seen in {here}: is {there} the same folder, and may the account that \
                      LinuxCNC runs by write there? {errors}"
                 );
-                return Err(DeviceError::Folder { machine: self.machine(), why });
+                return Err(DeviceError::Folder { machine: self.machine(), reason: why });
             }
-            sleep(LOOK_EVERY).await;
+            sleep(POLL_INTERVAL).await;
         }
     }
 
     /// Sends the start and waits until its effect is seen.
-    pub(super) async fn run(&mut self) -> Answered<Status> {
+    pub(super) async fn send_start(&mut self) -> DeviceResult<Status> {
         let heard = self.controller.order(Set::Run, Command::Start).await;
         let refused = match heard {
             Ok(()) => None,
@@ -98,14 +108,14 @@ impl LinuxcncGrinder {
             Err(error) => return Err(error),
         };
         let sent = Instant::now();
-        let limit = if refused.is_some() { SEEN_TWICE_OVER } else { self.settings.settle_within };
+        let limit = if refused.is_some() { NOT_STARTED_CONFIRMATION } else { self.settings.settle_timeout };
         loop {
             match self.has_begun().await {
                 Ok(Some(status)) => return Ok(status),
-                Ok(None) if sent.elapsed() < limit => sleep(LOOK_EVERY).await,
+                Ok(None) if sent.elapsed() < limit => sleep(POLL_INTERVAL).await,
                 Ok(None) => {
                     let machine = self.machine();
-                    return Err(refused.unwrap_or(DeviceError::TimedOut { machine, what: "a start", limit }));
+                    return Err(refused.unwrap_or(DeviceError::TimedOut { machine, operation: "a start", limit }));
                 }
                 Err(error) => return Err(error),
             }
@@ -113,9 +123,9 @@ impl LinuxcncGrinder {
     }
 
     /// Returns the status if the program of the job is seen to run, or has recorded that it began.
-    async fn has_begun(&mut self) -> Answered<Option<Status>> {
-        let (seen, status) = self.look().await?;
-        let Some(work) = self.work.clone() else { return Ok(None) };
+    async fn has_begun(&mut self) -> DeviceResult<Option<Status>> {
+        let (seen, status) = self.read_status().await?;
+        let Some(work) = self.job.clone() else { return Ok(None) };
         let is_ours = seen.program.as_deref() == Some(&work.path);
         let runs = is_ours && seen.interpreter != Interpreter::Idle;
         let wrote = self.record(&work).await?.is_some_and(|record| record.begun > 0);

@@ -69,9 +69,9 @@ impl Bench {
             programs,
             simulated: false,
             joints: 3,
-            answer_within: Duration::from_secs(30),
-            settle_within: Duration::from_secs(30),
-            record_within: Duration::from_millis(500),
+            answer_timeout: Duration::from_secs(30),
+            settle_timeout: Duration::from_secs(30),
+            record_timeout: Duration::from_millis(500),
             expected_name: None,
         };
         Self { folder, settings }

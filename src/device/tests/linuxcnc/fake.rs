@@ -32,7 +32,7 @@ pub enum Fault {
 
 /// The controller.
 #[derive(Default)]
-pub struct Plant {
+pub struct FakeController {
     owner: Option<u64>,
     pub stopped: bool,
     pub off: bool,
@@ -57,19 +57,19 @@ pub struct Plant {
 
 /// A server of a plant, on a port that was free.
 #[derive(Clone)]
-pub struct Fake {
+pub struct FakeServer {
     pub port: u16,
-    plant: Arc<Mutex<Plant>>,
+    controller: Arc<Mutex<FakeController>>,
     heard: Arc<Notify>,
 }
 
-impl Fake {
+impl FakeServer {
     pub async fn serve() -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let plant = Plant { mode: "MANUAL".into(), interpreter: "IDLE".into(), ..Plant::default() };
+        let plant = FakeController { mode: "MANUAL".into(), interpreter: "IDLE".into(), ..FakeController::default() };
         let fake = Self {
             port: listener.local_addr().unwrap().port(),
-            plant: Arc::new(Mutex::new(plant)),
+            controller: Arc::new(Mutex::new(plant)),
             heard: Arc::default(),
         };
         let served = fake.clone();
@@ -82,15 +82,15 @@ impl Fake {
         fake
     }
 
-    pub fn plant(&self) -> MutexGuard<'_, Plant> {
-        self.plant.lock().unwrap()
+    pub fn controller(&self) -> MutexGuard<'_, FakeController> {
+        self.controller.lock().unwrap()
     }
 
     /// Waits until a line was heard that begins so.
     pub async fn has_heard(&self, begins: &str) {
         loop {
             let heard = self.heard.notified();
-            if self.plant().heard.iter().any(|line| line.starts_with(begins)) {
+            if self.controller().heard.iter().any(|line| line.starts_with(begins)) {
                 return;
             }
             heard.await;
@@ -99,7 +99,7 @@ impl Fake {
 
     /// A second client takes control.
     pub fn steal(&self) {
-        self.plant().owner = Some(u64::MAX);
+        self.controller().owner = Some(u64::MAX);
     }
 
     async fn attend(self, client: u64, stream: TcpStream) {
@@ -107,15 +107,15 @@ impl Fake {
         let mut lines = BufReader::new(from).lines();
         while let Ok(Some(line)) = lines.next_line().await {
             let line = line.trim().to_owned();
-            let fault = self.plant().fault(&line);
+            let fault = self.controller().fault(&line);
             // Nobody else is heard between a line and what it does.
             let answer = match &fault {
                 Some(Fault::Close) => return,
                 Some(Fault::Nak) => nak(&line),
                 Some(Fault::Ignore) => ack(&line),
-                Some(Fault::DoAndNak) => self.plant().obey(client, &line).map(|_| nak(&line)).unwrap_or_default(),
+                Some(Fault::DoAndNak) => self.controller().obey(client, &line).map(|_| nak(&line)).unwrap_or_default(),
                 Some(Fault::Instead(bytes)) => (*bytes).to_owned(),
-                _ => self.plant().obey(client, &line).unwrap_or_default(),
+                _ => self.controller().obey(client, &line).unwrap_or_default(),
             };
             self.heard.notify_waiters();
             let answer = match fault {
@@ -151,7 +151,7 @@ fn nak(line: &str) -> String {
     format!("{first} {second} NAK\n\r")
 }
 
-impl Plant {
+impl FakeController {
     fn fault(&mut self, line: &str) -> Option<Fault> {
         self.heard.push(line.to_owned());
         let number = self.heard.len() - 1;
@@ -169,7 +169,7 @@ impl Plant {
         match first.as_str() {
             "HELLO" if second == "EMC" => Some("HELLO ACK EMCNETSVR 1.1\r\n".into()),
             "HELLO" => Some("HELLO NAK\r\n".into()),
-            "GET" => Some(format!("{second} {}\r\n", self.tell(client, &second))),
+            "GET" => Some(format!("{second} {}\r\n", self.query(client, &second))),
             "SET" if second == "ECHO" => Some(format!("{line}\r\n")),
             "SET" if second == "VERBOSE" => Some(ack(line)),
             "SET" if second == "ENABLE" => match rest {
@@ -193,7 +193,7 @@ impl Plant {
         }
     }
 
-    fn tell(&mut self, client: u64, what: &str) -> String {
+    fn query(&mut self, client: u64, what: &str) -> String {
         let switch = |on: bool| if on { "ON" } else { "OFF" }.to_owned();
         match what {
             "ENABLE" => switch(self.owner == Some(client)),

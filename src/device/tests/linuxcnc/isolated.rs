@@ -18,7 +18,7 @@ const ACCOUNT: &str = "65534";
 pub const PORT: u16 = 5007;
 
 /// Runs a test beside a controller of its own; `name` is its path in this program.
-pub fn beside_a_controller<F: Future<Output = ()>>(name: &str, test: impl FnOnce(Controller) -> F) {
+pub fn with_controller<F: Future<Output = ()>>(name: &str, test: impl FnOnce(Controller) -> F) {
     if std::env::var_os(WITHIN).is_some() {
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
         return runtime.block_on(async { test(Controller::start().await).await });

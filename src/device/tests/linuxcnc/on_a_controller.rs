@@ -6,7 +6,7 @@ use std::time::Duration;
 use regrind_device::{DeviceError, Fault, Grinder, Interrupt, Machine, Outcome, Reconciled, State};
 
 use crate::bench::{Bench, job, map, pass, program, to_and_fro, until};
-use crate::isolated::{Controller, Operator, PORT, beside_a_controller, give_away};
+use crate::isolated::{Controller, Operator, PORT, give_away, with_controller};
 use crate::refuses;
 
 fn bench(text: &str) -> Bench {
@@ -49,7 +49,7 @@ macro_rules! on_a_controller {
         #[test]
         #[ignore = "needs a controller: Debian package linuxcnc-uspace, and root for namespaces"]
         fn $name() {
-            beside_a_controller(concat!("on_a_controller::", stringify!($name)), |$controller: Controller| async move { $body });
+            with_controller(concat!("on_a_controller::", stringify!($name)), |$controller: Controller| async move { $body });
         }
     )+};
 }
@@ -146,11 +146,11 @@ on_a_controller! {
         operator.ask("set mode auto").await;
         operator.ask(&format!("set open {}", old.display())).await;
         bench.settings.programs_at_controller = "/tmp/controller".into();
-        bench.settings.settle_within = Duration::from_millis(500);
+        bench.settings.settle_timeout = Duration::from_millis(500);
         let mut grinder = bench.grinder();
         grinder.connect().await.unwrap();
         grinder.claim().await.unwrap();
-        let error = refuses!(grinder.load_pass(&map(), &pass(), &Interrupt::new()).await, DeviceError::Reports { .. });
+        let error = refuses!(grinder.load_pass(&map(), &pass(), &Interrupt::new()).await, DeviceError::ControllerErrors { .. });
         assert!(error.to_string().contains("can't open /tmp/controller"), "{error}");
         refuses!(grinder.prepare(job()).await, DeviceError::Refused { .. });
         assert_eq!(operator.ask("get program").await, format!("PROGRAM {}", old.display()));
@@ -294,7 +294,7 @@ on_a_controller! {
 
     a_task_that_has_died_answers_no_order(_controller) {
         let mut bench = bench(&to_and_fro(600));
-        bench.settings.answer_within = Duration::from_secs(1);
+        bench.settings.answer_timeout = Duration::from_secs(1);
         let (mut grinder, _) = bench.started().await;
         let killed = std::process::Command::new("pkill").args(["-STOP", "-x", "milltask"]).status().unwrap();
         assert!(killed.success());

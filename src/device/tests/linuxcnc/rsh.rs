@@ -5,25 +5,25 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use regrind_device::{
-    Answer, Armed, DeviceError, Fault as Told, Grinder, Interrupt, LinuxcncGrinder, Machine, Outcome, Reconciled,
-    State, Word,
+    Answer, Armed, DeviceError, Fault as Told, Grinder, Interrupt, LinuxcncGrinder, Machine, OperatorConfirmation,
+    Outcome, Reconciled, State,
 };
 use tokio::sync::Notify;
 
 use crate::bench::{Bench, is_unknown, job, map, pass, program, to_and_fro, until};
-use crate::fake::{Fake, Fault};
+use crate::fake::{FakeServer, Fault};
 use crate::refuses;
 
-async fn bench() -> (Fake, Bench) {
-    let fake = Fake::serve().await;
+async fn bench() -> (FakeServer, Bench) {
+    let fake = FakeServer::serve().await;
     let mut bench = Bench::new(fake.port, &to_and_fro(10));
-    bench.settings.record_within = Duration::from_millis(20);
+    bench.settings.record_timeout = Duration::from_millis(20);
     (fake, bench)
 }
 
 /// With short waits for what is not to come.
 fn hasty(mut bench: Bench) -> Bench {
-    bench.settings.settle_within = Duration::from_millis(200);
+    bench.settings.settle_timeout = Duration::from_millis(200);
     bench
 }
 
@@ -32,7 +32,7 @@ async fn a_pass_is_loaded_prepared_started_and_ended_by_these_lines_alone() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.started().await;
     assert_eq!(grinder.status().await.unwrap().state, State::Execute);
-    fake.plant().end();
+    fake.controller().end();
     let status = until(&mut grinder, State::Complete).await;
     assert_eq!(
         (status.outcome, status.done, status.clear_of_part),
@@ -40,7 +40,7 @@ async fn a_pass_is_loaded_prepared_started_and_ended_by_these_lines_alone() {
     );
     grinder.acknowledge(status.done).await.unwrap();
     grinder.release().await.unwrap();
-    let heard = fake.plant().heard.clone();
+    let heard = fake.controller().heard.clone();
     let told: Vec<_> = heard.iter().filter(|line| !line.starts_with("get ")).map(String::as_str).collect();
     let (program, record) = (bench.file("ngc").display().to_string(), bench.file("log").display().to_string());
     let (open, log) = (format!("set open {program}"), format!("set mdi (LOGOPEN,{record})"));
@@ -66,13 +66,13 @@ async fn a_pass_is_loaded_prepared_started_and_ended_by_these_lines_alone() {
 #[tokio::test]
 async fn what_is_no_linuxcnc_hears_a_greeting_and_nothing_more() {
     let (fake, mut bench) = bench().await;
-    bench.settings.answer_within = Duration::from_millis(100);
-    fake.plant().faults.push(("hello", Fault::Instead("220 mail.example.com ESMTP\r\n")));
+    bench.settings.answer_timeout = Duration::from_millis(100);
+    fake.controller().faults.push(("hello", Fault::Instead("220 mail.example.com ESMTP\r\n")));
     refuses!(bench.grinder().connect().await, DeviceError::NotLinuxcnc { .. });
-    assert_eq!(fake.plant().heard, ["hello EMC regrind 1.1"]);
-    fake.plant().faults.push(("get mode", Fault::Instead("MODE GRINDING\r\n")));
+    assert_eq!(fake.controller().heard, ["hello EMC regrind 1.1"]);
+    fake.controller().faults.push(("get mode", Fault::Instead("MODE GRINDING\r\n")));
     refuses!(bench.grinder().connect().await, DeviceError::NotLinuxcnc { .. });
-    assert!(!fake.plant().heard.iter().any(|line| line.starts_with("set enable")));
+    assert!(!fake.controller().heard.iter().any(|line| line.starts_with("set enable")));
 }
 
 #[tokio::test]
@@ -91,7 +91,7 @@ async fn another_machine_and_a_wrong_password_are_told_apart() {
     refuses!(grinder.claim().await, DeviceError::Password { key: "control_password", .. });
     bench.settings.connect_password = "OTHER".into();
     refuses!(bench.grinder().connect().await, DeviceError::Password { key: "connect_password", .. });
-    assert_eq!(fake.plant().runs, 0);
+    assert_eq!(fake.controller().runs, 0);
 }
 
 #[tokio::test]
@@ -100,40 +100,40 @@ async fn lines_that_answer_nothing_are_left_aside() {
     let garbage = "\u{1}\u{fffd}\r\nSET RUN ACK EXTRA\n\r\n\rPROGRAM_LINES 7\r\nERROR: what\r\n";
     let lines =
         ["hello", "set enable", "get mode", "get program_line", "set open", "set mdi", "set run", "get program_status"];
-    fake.plant().faults.extend(lines.map(|line| (line, Fault::Say(garbage))));
+    fake.controller().faults.extend(lines.map(|line| (line, Fault::Say(garbage))));
     let (mut grinder, _) = bench.started().await;
-    fake.plant().end();
+    fake.controller().end();
     until(&mut grinder, State::Complete).await;
-    assert!(fake.plant().faults.is_empty());
+    assert!(fake.controller().faults.is_empty());
 }
 
 #[tokio::test]
 async fn an_open_that_is_acknowledged_and_not_done_is_no_load() {
     let (fake, bench) = bench().await;
     let bench = hasty(bench);
-    fake.plant().program = Some("/old.ngc".into());
-    fake.plant().faults.push(("set open", Fault::Ignore));
+    fake.controller().program = Some("/old.ngc".into());
+    fake.controller().faults.push(("set open", Fault::Ignore));
     let mut grinder = bench.grinder();
     grinder.connect().await.unwrap();
     grinder.claim().await.unwrap();
     refuses!(grinder.load_pass(&map(), &pass(), &Interrupt::new()).await, DeviceError::TimedOut { .. });
     refuses!(grinder.prepare(job()).await, DeviceError::Refused { answer: Answer::PayloadMissing, .. });
-    assert_eq!(fake.plant().runs, 0);
+    assert_eq!(fake.controller().runs, 0);
 }
 
 #[tokio::test]
 async fn a_program_that_is_changed_behind_our_back_is_not_started() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.prepared().await;
-    fake.plant().program = Some("/old.ngc".into());
+    fake.controller().program = Some("/old.ngc".into());
     refuses!(grinder.start(armed.clone()).await, DeviceError::Refused { .. });
     let (mut grinder, armed) = {
         drop(grinder);
         bench.prepared().await
     };
-    fake.plant().mode = "MANUAL".into();
+    fake.controller().mode = "MANUAL".into();
     refuses!(grinder.start(armed).await, DeviceError::Refused { .. });
-    assert_eq!(fake.plant().runs, 0);
+    assert_eq!(fake.controller().runs, 0);
 }
 
 #[tokio::test]
@@ -151,22 +151,22 @@ async fn only_the_program_of_the_map_and_of_the_cycle_is_taken() {
     fs::write(bench.settings.run_folder.join("cycle-1/toolpath.ngc"), program("").replace("G64 P0.0001 Q0\n", ""))
         .unwrap();
     refuses!(grinder.load_pass(&map(), &pass(), &Interrupt::new()).await, DeviceError::Folder { .. });
-    assert_eq!(fake.plant().runs, 0);
+    assert_eq!(fake.controller().runs, 0);
 }
 
 #[tokio::test]
 async fn a_machine_that_is_not_ready_is_not_prepared() {
     let (fake, bench) = bench().await;
     let mut grinder = bench.loaded().await;
-    fake.plant().not_homed = true;
-    refuses!(grinder.prepare(job()).await, DeviceError::Unready { .. });
-    fake.plant().not_homed = false;
-    fake.plant().interpreter = "PAUSED".into();
-    refuses!(grinder.prepare(job()).await, DeviceError::Unready { .. });
-    fake.plant().interpreter = "IDLE".into();
-    fake.plant().stopped = true;
+    fake.controller().not_homed = true;
+    refuses!(grinder.prepare(job()).await, DeviceError::NotReady { .. });
+    fake.controller().not_homed = false;
+    fake.controller().interpreter = "PAUSED".into();
+    refuses!(grinder.prepare(job()).await, DeviceError::NotReady { .. });
+    fake.controller().interpreter = "IDLE".into();
+    fake.controller().stopped = true;
     refuses!(grinder.prepare(job()).await, DeviceError::Faulted { fault: Told::StopCircuit, .. });
-    fake.plant().stopped = false;
+    fake.controller().stopped = false;
     grinder.prepare(job()).await.unwrap();
 }
 
@@ -174,14 +174,14 @@ async fn a_machine_that_is_not_ready_is_not_prepared() {
 async fn a_start_that_is_refused_has_not_begun_unless_it_shows() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.prepared().await;
-    fake.plant().faults.push(("set run", Fault::Nak));
+    fake.controller().faults.push(("set run", Fault::Nak));
     refuses!(grinder.start(armed.clone()).await, DeviceError::Refused { .. });
     refuses!(grinder.start(armed).await, DeviceError::Refused { .. });
-    assert_eq!(fake.plant().runs, 0);
+    assert_eq!(fake.controller().runs, 0);
     let armed = grinder.prepare(job()).await.unwrap();
-    fake.plant().faults.push(("set run", Fault::DoAndNak));
+    fake.controller().faults.push(("set run", Fault::DoAndNak));
     grinder.start(armed).await.unwrap();
-    assert_eq!(fake.plant().runs, 1);
+    assert_eq!(fake.controller().runs, 1);
 }
 
 #[tokio::test]
@@ -189,29 +189,29 @@ async fn a_start_that_is_acknowledged_and_does_not_show_is_unknown_until_it_is_k
     let (fake, bench) = bench().await;
     let bench = hasty(bench);
     let (mut grinder, armed) = bench.prepared().await;
-    fake.plant().faults.push(("set run", Fault::Ignore));
+    fake.controller().faults.push(("set run", Fault::Ignore));
     assert!(is_unknown(&grinder.start(armed.clone()).await));
     refuses!(grinder.start(armed.clone()).await, DeviceError::Refused { .. });
     assert!(matches!(grinder.reconcile(&armed).await.unwrap(), Reconciled::NotStarted(_)));
     // Not before a claim, behind which no older line begins anything.
-    let heard = fake.plant().heard.clone();
+    let heard = fake.controller().heard.clone();
     let mut behind = heard.iter().rev().take_while(|line| *line != "set run");
     assert!(behind.any(|line| line == "set enable EMCTOO"), "{heard:?}");
     let armed = grinder.prepare(job()).await.unwrap();
     grinder.start(armed).await.unwrap();
-    assert_eq!(fake.plant().runs, 1);
+    assert_eq!(fake.controller().runs, 1);
 }
 
 #[tokio::test]
 async fn a_program_that_has_begun_is_not_prepared_again() {
     let (fake, bench) = bench().await;
     let (mut grinder, _) = bench.started().await;
-    fake.plant().end();
+    fake.controller().end();
     let status = until(&mut grinder, State::Complete).await;
     grinder.acknowledge(status.done).await.unwrap();
     grinder.load_pass(&map(), &pass(), &Interrupt::new()).await.unwrap();
     refuses!(grinder.prepare(job()).await, DeviceError::Refused { answer: Answer::AlreadyBegun, .. });
-    assert_eq!(fake.plant().runs, 1);
+    assert_eq!(fake.controller().runs, 1);
 }
 
 #[tokio::test]
@@ -219,7 +219,7 @@ async fn an_abort_is_on_the_wire_while_an_answer_is_awaited() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.prepared().await;
     let late = Arc::new(Notify::new());
-    fake.plant().faults.push(("set run", Fault::Late(late.clone())));
+    fake.controller().faults.push(("set run", Fault::Late(late.clone())));
     tokio::select! {
         biased;
         started = grinder.start(armed) => panic!("{started:?}"),
@@ -234,7 +234,7 @@ async fn an_abort_is_on_the_wire_while_an_answer_is_awaited() {
     });
     aborted.unwrap();
     until(&mut grinder, State::Aborted).await;
-    let heard = fake.plant().heard.clone();
+    let heard = fake.controller().heard.clone();
     let run = heard.iter().position(|line| line == "set run").unwrap();
     assert_eq!(heard[run + 1..run + 3], ["set enable EMCTOO", "set abort"]);
 }
@@ -244,13 +244,13 @@ async fn an_abort_connects_by_itself() {
     let (fake, bench) = bench().await;
     let (mut grinder, _) = bench.started().await;
     // Before anything was known of it, and after.
-    fake.plant().faults.push(("set abort", Fault::Close));
+    fake.controller().faults.push(("set abort", Fault::Close));
     grinder.abort().await.unwrap();
     assert_eq!(until(&mut grinder, State::Aborted).await.outcome, Outcome::Aborted);
-    fake.plant().faults.push(("get enable", Fault::Close));
+    fake.controller().faults.push(("get enable", Fault::Close));
     refuses!(grinder.status().await, DeviceError::Disconnected { .. });
     grinder.abort().await.unwrap();
-    assert_eq!(fake.plant().heard.iter().filter(|line| *line == "set abort").count(), 3);
+    assert_eq!(fake.controller().heard.iter().filter(|line| *line == "set abort").count(), 3);
 }
 
 #[tokio::test]
@@ -258,19 +258,19 @@ async fn a_pause_that_comes_when_the_program_has_ended_is_taken_back() {
     let (fake, bench) = bench().await;
     let (mut grinder, _) = bench.started().await;
     grinder.status().await.unwrap();
-    fake.plant().end();
+    fake.controller().end();
     let status = grinder.hold().await.unwrap();
     assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete));
-    assert_eq!(fake.plant().interpreter, "IDLE");
+    assert_eq!(fake.controller().interpreter, "IDLE");
     refuses!(grinder.hold().await, DeviceError::Refused { .. });
-    assert_eq!(fake.plant().heard.iter().filter(|line| *line == "set pause").count(), 1);
+    assert_eq!(fake.controller().heard.iter().filter(|line| *line == "set pause").count(), 1);
 }
 
 #[tokio::test]
 async fn errors_are_told_and_break_the_pass_off() {
     let (fake, bench) = bench().await;
     let (mut grinder, _) = bench.started().await;
-    fake.plant().fail("joint 1 following error");
+    fake.controller().fail("joint 1 following error");
     let status = until(&mut grinder, State::Faulted).await;
     assert_eq!((status.outcome, status.fault), (Outcome::Failed, Some(Told::Drive)));
     assert!(grinder.notes().iter().any(|note| note.contains("joint 1 following error")));
@@ -286,7 +286,7 @@ async fn who_takes_control_is_noticed_and_not_outbid() {
     grinder.connect().await.unwrap();
     refuses!(grinder.claim().await, DeviceError::ControlTaken { .. });
     grinder.abort().await.unwrap();
-    assert_eq!((grinder.clear().await.unwrap().state, fake.plant().runs), (State::Idle, 0));
+    assert_eq!((grinder.clear().await.unwrap().state, fake.controller().runs), (State::Idle, 0));
 }
 
 #[tokio::test]
@@ -294,7 +294,7 @@ async fn control_that_is_taken_at_the_last_moment_leaves_the_start_unknown() {
     let (fake, bench) = bench().await;
     let (mut grinder, armed) = bench.prepared().await;
     let late = Arc::new(Notify::new());
-    fake.plant().faults.push(("set run", Fault::Late(late.clone())));
+    fake.controller().faults.push(("set run", Fault::Late(late.clone())));
     let thief = fake.clone();
     let (started, ()) = tokio::join!(grinder.start(armed.clone()), async move {
         thief.has_heard("set run").await;
@@ -305,27 +305,28 @@ async fn control_that_is_taken_at_the_last_moment_leaves_the_start_unknown() {
     // It is seen to run all the same, and is nobody's to begin again.
     grinder.connect().await.unwrap();
     assert!(matches!(grinder.reconcile(&armed).await.unwrap(), Reconciled::Running(_)));
-    assert_eq!(fake.plant().runs, 1);
+    assert_eq!(fake.controller().runs, 1);
 }
 
 #[tokio::test]
 async fn what_nobody_wrote_down_a_person_has_to_tell() {
-    for (word, outcome) in
-        [(Word::Done { map_identity: None, file: None }, Outcome::Complete), (Word::Still, Outcome::Stopped)]
-    {
+    for (word, outcome) in [
+        (OperatorConfirmation::Done { map_identity: None, file: None }, Outcome::Complete),
+        (OperatorConfirmation::Still, Outcome::Stopped),
+    ] {
         let (fake, bench) = bench().await;
         let (mut grinder, armed) = bench.prepared().await;
-        fake.plant().writes_nothing = true;
+        fake.controller().writes_nothing = true;
         grinder.start(armed.clone()).await.unwrap();
-        refuses!(grinder.confirm(word.clone()).await, DeviceError::TellsItself { .. });
-        fake.plant().end();
+        refuses!(grinder.confirm(word.clone()).await, DeviceError::ConfirmationNotNeeded { .. });
+        fake.controller().end();
         for _ in 0..10 {
             assert_eq!(grinder.status().await.unwrap().state, State::Execute);
-            tokio::time::sleep(bench.settings.record_within / 2).await;
+            tokio::time::sleep(bench.settings.record_timeout / 2).await;
         }
         assert!(grinder.notes().iter().any(|note| note.contains("regrind confirm")));
-        let other = Word::Done { map_identity: Some([1; 32]), file: None };
-        refuses!(grinder.confirm(other).await, DeviceError::NotTaken { .. });
+        let other = OperatorConfirmation::Done { map_identity: Some([1; 32]), file: None };
+        refuses!(grinder.confirm(other).await, DeviceError::NotAccepted { .. });
         grinder.confirm(word).await.unwrap();
         let status = grinder.status().await.unwrap();
         assert_eq!((status.state, status.outcome), (State::Complete, outcome));
@@ -343,11 +344,11 @@ async fn a_record_that_is_gone_leaves_the_start_unknown() {
     grinder.connect().await.unwrap();
     grinder.claim().await.unwrap();
     assert!(matches!(grinder.reconcile(&armed).await.unwrap(), Reconciled::Unknown { .. }));
-    assert_eq!(fake.plant().runs, 0);
+    assert_eq!(fake.controller().runs, 0);
 }
 
 /// What a cell does when the wire is lost: it meets the machine again, and asks what became of its start.
-async fn again(grinder: &mut LinuxcncGrinder, armed: Option<&Armed>) -> Option<Reconciled> {
+async fn reconnect_and_reconcile(grinder: &mut LinuxcncGrinder, armed: Option<&Armed>) -> Option<Reconciled> {
     grinder.connect().await.unwrap();
     grinder.claim().await.unwrap();
     match armed {
@@ -357,7 +358,7 @@ async fn again(grinder: &mut LinuxcncGrinder, armed: Option<&Armed>) -> Option<R
 }
 
 /// A whole pass, whose wire is lost once; returns how it ended.
-async fn whole(bench: &Bench, fake: &Fake) -> Outcome {
+async fn run_pass(bench: &Bench, fake: &FakeServer) -> Outcome {
     let mut grinder = bench.grinder();
     let (mut armed, mut is_started) = (None, false);
     for _ in 0..6 {
@@ -367,7 +368,7 @@ async fn whole(bench: &Bench, fake: &Fake) -> Outcome {
             if let Some(armed) = armed.as_ref().filter(|_| is_started) {
                 match grinder.reconcile(armed).await? {
                     Reconciled::NotStarted(_) => is_started = false,
-                    Reconciled::Unknown { why } => panic!("{why}"),
+                    Reconciled::Unknown { reason: why } => panic!("{why}"),
                     _ => {}
                 }
             }
@@ -378,8 +379,8 @@ async fn whole(bench: &Bench, fake: &Fake) -> Outcome {
                 is_started = true;
                 grinder.start(prepared).await?;
             }
-            if fake.plant().interpreter == "RUNNING" {
-                fake.plant().end();
+            if fake.controller().interpreter == "RUNNING" {
+                fake.controller().end();
             }
             loop {
                 let status = grinder.status().await?;
@@ -405,9 +406,9 @@ async fn whole(bench: &Bench, fake: &Fake) -> Outcome {
 #[tokio::test]
 async fn a_wire_that_is_lost_at_any_line_begins_nothing_twice() {
     let (fake, bench) = bench().await;
-    assert_eq!(whole(&bench, &fake).await, Outcome::Complete);
-    let lines = fake.plant().heard.len();
-    let run = fake.plant().heard.iter().position(|line| line == "set run").unwrap();
+    assert_eq!(run_pass(&bench, &fake).await, Outcome::Complete);
+    let lines = fake.controller().heard.len();
+    let run = fake.controller().heard.iter().position(|line| line == "set run").unwrap();
     assert!(lines > 60, "{lines}");
     // Every line once, in one of two ways; what is about the start in both.
     let ways = |at: usize| match at.abs_diff(run) < 8 {
@@ -420,9 +421,9 @@ async fn a_wire_that_is_lost_at_any_line_begins_nothing_twice() {
         tries.spawn(async move {
             let (fake, bench) = self::bench().await;
             let hint = format!("{fault:?} at {at}");
-            fake.plant().fault_at = Some((at, fault));
-            assert_eq!(whole(&bench, &fake).await, Outcome::Complete, "{hint}");
-            assert_eq!((fake.plant().runs, bench.wrote("begin"), bench.wrote("end")), (1, 1, 1), "{hint}");
+            fake.controller().fault_at = Some((at, fault));
+            assert_eq!(run_pass(&bench, &fake).await, Outcome::Complete, "{hint}");
+            assert_eq!((fake.controller().runs, bench.wrote("begin"), bench.wrote("end")), (1, 1, 1), "{hint}");
         });
     }
     while let Some(tried) = tries.join_next().await {
@@ -437,9 +438,9 @@ async fn a_driver_that_begins_anew_at_a_server_that_runs_goes_on() {
     drop(grinder);
     let mut grinder = bench.grinder();
     grinder.restore(&armed);
-    let verdict = again(&mut grinder, Some(&armed)).await;
+    let verdict = reconnect_and_reconcile(&mut grinder, Some(&armed)).await;
     assert!(matches!(verdict, Some(Reconciled::Running(status)) if status.job == Some(job())));
-    fake.plant().end();
+    fake.controller().end();
     assert_eq!(until(&mut grinder, State::Complete).await.outcome, Outcome::Complete);
     assert_eq!(grinder.collect(job(), &Interrupt::new()).await.unwrap().done, armed.start_sequence);
 }
