@@ -19,13 +19,14 @@
 use faer::Mat;
 
 use super::{Anisotropy, Smoothness};
+use crate::geometry::bounds;
 
 /// Margin of the rectangle on each side of the part, as a share of the longer side of the part.
 const WIDER: f64 = 0.15;
 
 /// Cosines of the lowest wavenumbers over a rectangle, preceded by polynomials over the part.
 pub(super) struct Basis {
-    lay: Anisotropy,
+    pub(super) lay: Anisotropy,
     corner_mm: [f64; 2],
     lengths_mm: [f64; 2],
     /// Centre and half lengths of the rectangle around the part, on which the polynomials are defined.
@@ -48,14 +49,11 @@ impl Basis {
     /// The cosines are those with the largest variance in a field of this anisotropy, in descending order. The
     /// polynomials begin at degree 2, because a constant and a tilt are rigid motions of the part.
     pub(super) fn over(places: &[[f64; 2]], lay: Anisotropy, count: usize, degree: usize) -> Self {
-        let spans = [0, 1].map(|axis| {
-            let of = places.iter().map(|&place| rotated(lay, place)[axis]);
-            [of.clone().fold(f64::INFINITY, f64::min), of.fold(f64::NEG_INFINITY, f64::max)]
-        });
-        let longest_mm = spans.iter().map(|[low, high]| high - low).fold(0.0, f64::max);
-        let wider_mm = WIDER * longest_mm.max(f64::MIN_POSITIVE.sqrt());
-        let corner_mm = spans.map(|[low, _]| low - wider_mm);
-        let lengths_mm = spans.map(|[low, high]| high - low + 2.0 * wider_mm);
+        let [low, high] = bounds(places.iter().map(|&place| lay.rotated(place)));
+        let spans_mm = [0, 1].map(|axis| high[axis] - low[axis]);
+        let wider_mm = WIDER * spans_mm[0].max(spans_mm[1]).max(f64::MIN_POSITIVE.sqrt());
+        let corner_mm = low.map(|low| low - wider_mm);
+        let lengths_mm = spans_mm.map(|span_mm| span_mm + 2.0 * wider_mm);
         let root = lay.stretch.sqrt();
         let steps = [root / lengths_mm[0], 1.0 / (root * lengths_mm[1])].map(|step| step * std::f64::consts::PI);
         // The quarter ellipse with these half axes has the area of `count` unit cells, so it contains at least `count`
@@ -68,9 +66,9 @@ impl Basis {
         orders.truncate(count);
         let counts = [0, 1].map(|axis| orders.iter().map(|order| order[axis] + 1).max().unwrap_or(1));
         let numbers2 = orders.iter().map(|&order| number2(order)).collect();
-        let middle_mm = spans.map(|[low, high]| 0.5 * (low + high));
+        let middle_mm = [0, 1].map(|axis| 0.5 * (low[axis] + high[axis]));
         // If the points lie on a line, a minimum width avoids a division by zero.
-        let halves_mm = spans.map(|[low, high]| (0.5 * (high - low)).max(0.01 * wider_mm));
+        let halves_mm = spans_mm.map(|span_mm| (0.5 * span_mm).max(0.01 * wider_mm));
         let degrees = (2..=degree).flat_map(|whole| (0..=whole).map(move |b| [whole - b, b])).collect();
         Self {
             lay,
@@ -122,7 +120,7 @@ impl Basis {
 
     /// Evaluates every basis function at the places: one row for each place, one column for each polynomial and cosine.
     pub(super) fn at(&self, places: &[[f64; 2]]) -> Mat<f64> {
-        let at_mm = [0, 1].map(|axis| places.iter().map(|&place| rotated(self.lay, place)[axis]).collect::<Vec<f64>>());
+        let at_mm = [0, 1].map(|axis| places.iter().map(|&place| self.lay.rotated(place)[axis]).collect::<Vec<f64>>());
         let polynomials = [0, 1].map(|axis| self.polynomials(axis, &at_mm[axis]));
         let cosines = [0, 1].map(|axis| self.cosines(axis, &at_mm[axis]));
         let of_polynomials = self.degrees.iter().map(|order| (&polynomials, order));
@@ -186,11 +184,6 @@ impl Basis {
         self.orders.iter().zip(cosines).for_each(|([a, b], of)| square[(first[0] + a, first[1] + b)] = *of);
         along * &square * across.transpose()
     }
-
-    /// Rotates a place to the axes u and v along and across the anisotropy.
-    pub(super) fn rotated(&self, place: [f64; 2]) -> [f64; 2] {
-        rotated(self.lay, place)
-    }
 }
 
 /// Square grid along the axes u and v of the basis.
@@ -199,11 +192,6 @@ pub(super) struct BasisGrid {
     pub(super) corner_mm: [f64; 2],
     pub(super) spacing_mm: f64,
     pub(super) counts: [usize; 2],
-}
-
-fn rotated(lay: Anisotropy, [x, y]: [f64; 2]) -> [f64; 2] {
-    let [c, s] = lay.along;
-    [c * x + s * y, c * y - s * x]
 }
 
 /// Returns the spectral density of a field of variance 1, in mm^2.

@@ -8,10 +8,10 @@ use faer::linalg::solvers::{Llt, Solve};
 use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector};
 
-use super::Observed;
 use super::hypotheses::FieldHypotheses;
 use super::machine_uncertainty::UncertaintySource;
 use super::posterior::Posterior;
+use super::{Observed, orthonormal_base};
 
 /// Contribution of one source to the standard uncertainties of the figures; the squares of all contributions add up.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
@@ -170,9 +170,7 @@ fn slopes(drawn: &SampledFigures) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
             ground_in.iter_mut().zip(of).for_each(|(sum, of)| sum[k] += of * of / count as f64);
         }
     }
-    if drawn.effects.ncols() > 0 {
-        let base = drawn.effects.clone().qr().q();
-        slopes.iter_mut().for_each(|slope| *slope -= &base * base.tr_mul(slope));
-    }
+    let base = orthonormal_base(drawn.effects.clone());
+    slopes.iter_mut().for_each(|slope| *slope -= &base * base.tr_mul(slope));
     (slopes, ground_in)
 }

@@ -59,6 +59,12 @@ impl Anisotropy {
         Self { along: [angle_rad.cos(), angle_rad.sin()], stretch }
     }
 
+    /// Rotates a place to the axes along and across the anisotropy.
+    pub(super) fn rotated(self, [x, y]: [f64; 2]) -> [f64; 2] {
+        let [c, s] = self.along;
+        [c * x + s * y, c * y - s * x]
+    }
+
     /// Returns the angle to the x axis, in rad, above -90° and at most 90°; `None` if all directions are alike.
     pub fn angle_rad(&self) -> Option<f64> {
         let [c, s] = self.along;
@@ -85,13 +91,13 @@ impl Field {
     }
 
     /// Maps a place into the plane in which the field is isotropic; the map preserves areas.
-    pub(super) fn straightened(&self, at: [f64; 2]) -> [f64; 2] {
-        let Anisotropy { along: [c, s], stretch } = self.lay;
-        if stretch == 1.0 {
+    fn straightened(&self, at: [f64; 2]) -> [f64; 2] {
+        if self.lay.stretch == 1.0 {
             return at;
         }
-        let root = stretch.sqrt();
-        [(c * at[0] + s * at[1]) / root, (c * at[1] - s * at[0]) * root]
+        let root = self.lay.stretch.sqrt();
+        let [along, across] = self.lay.rotated(at);
+        [along / root, across * root]
     }
 
     /// Checks that strength, range and lay are possible.

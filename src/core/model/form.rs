@@ -17,9 +17,8 @@ use super::intermediate::IntermediateNodes;
 use super::machine_uncertainty::{MachineEffects, MachineUncertainty, UncertaintySource, unsound};
 use super::normals::Normals;
 use super::posterior::{HypothesisSet, NoisePrior, Posterior, PosteriorSamples, select_hypotheses};
-use super::spacing_mm;
 use super::{AreaOptions, IsoFigures, SlopeFigures};
-use super::{Hyperparameters, ModelError, Observed, Prediction, Prior};
+use super::{Hyperparameters, ModelError, Observed, Prediction, Prior, orthonormal_base, spacing_mm};
 use crate::form::{IsoFits, SlopesAt};
 use crate::geometry::{Nearest, Point, Vector};
 use crate::registration::{Deviation, LEAST_SIGMA_MM, PointStatus, Registration, robust_sigma};
@@ -734,8 +733,7 @@ impl SampledForms {
         // The residuals also contain motions and random effects. Neither is noise. Between the touches the samples keep
         // all of their motions.
         let seen = observed.subset(&self.chosen);
-        let effects = seen.all_effects();
-        let base = if effects.ncols() > 0 { effects.qr().q() } else { effects };
+        let base = orthonormal_base(seen.all_effects());
         let fitted = |column: DMatrix<f64>| &column - &base * base.tr_mul(&column);
         let found = &seen.deviations_mm;
         if is_of_few(posterior, inputs) {
@@ -978,11 +976,8 @@ fn parted(scatter_mm: f64, narrow_mm: f64, inputs: &ModelInputs, normals: &mut N
 
 /// Subtracts from each form its own best fit.
 fn best_fitted(mut forms: DMatrix<f64>, effects: &DMatrix<f64>) -> DMatrix<f64> {
-    if effects.ncols() > 0 {
-        let base = effects.clone().qr().q();
-        let fitted: DMatrix<f64> = &base * base.tr_mul(&forms);
-        forms -= fitted;
-    }
+    let base = orthonormal_base(effects.clone());
+    forms -= &base * base.tr_mul(&forms);
     forms
 }
 

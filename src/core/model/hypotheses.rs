@@ -29,7 +29,7 @@ use nalgebra::DMatrix;
 use rayon::prelude::*;
 
 use super::basis::Basis;
-use super::{Anisotropy, ModelError, Observed, Smoothness, spacing_mm};
+use super::{Anisotropy, ModelError, Observed, Smoothness, orthonormal_base, spacing_mm};
 
 /// Smoothnesses of the hypotheses, from rough to smooth.
 pub(super) const KINDS: [Smoothness; 3] = [Smoothness::Never, Smoothness::Once, Smoothness::Endless];
@@ -185,7 +185,7 @@ impl FieldHypotheses {
         let factor = super::dense::checked_cholesky(effects.tr_mul(&effects))?;
         let log_whitened =
             whitening.iter().map(|[own, _]| own.ln()).sum::<f64>() - factor.l().diagonal().map(f64::ln).sum();
-        let base = if effects.ncols() > 0 { effects.qr().q() } else { effects };
+        let base = orthonormal_base(effects);
         let free = (n - base.ncols()) as f64;
         let reduced = Reduced { rows: Mat::new(), pivots: None };
         let mut fields = Self {

@@ -7,7 +7,7 @@ use nalgebra::DMatrix;
 
 use super::basis::{Basis, BasisGrid};
 use super::spacing_mm;
-use crate::geometry::{Nearest, Point};
+use crate::geometry::{Nearest, Point, bounds};
 
 /// Maximum number of grid points, and grid points per spacing of the touched points where that maximum allows it.
 const MOST: f64 = 3000.0;
@@ -31,20 +31,18 @@ pub(super) struct IntermediateNodes {
 impl IntermediateNodes {
     /// Lays a grid along the axes of some waves; returns `None` if it would have no node.
     pub(super) fn of(places: &[[f64; 2]], waves: &Basis) -> Option<Self> {
-        let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.rotated(place)).collect();
+        let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.lay.rotated(place)).collect();
         let distance_mm = spacing_mm(&places);
-        let spans = [0, 1].map(|axis| {
-            let of = places.iter().map(|place| place[axis]);
-            [of.clone().fold(f64::INFINITY, f64::min), of.fold(f64::NEG_INFINITY, f64::max)]
-        });
-        let area_mm2: f64 = spans.iter().map(|[low, high]| high - low).product();
+        let [low, high] = bounds(places.iter().copied());
+        let spans_mm = [0, 1].map(|axis| high[axis] - low[axis]);
+        let area_mm2 = spans_mm[0] * spans_mm[1];
         let spacing_mm = (distance_mm / A_DISTANCE).max((area_mm2 / MOST).sqrt());
         if !(area_mm2 > 0.0 && spacing_mm > 0.0 && spacing_mm.is_finite()) {
             return None;
         }
-        let counts = spans.map(|[low, high]| ((high - low) / spacing_mm) as usize + 1);
+        let counts = spans_mm.map(|span_mm| (span_mm / spacing_mm) as usize + 1);
         let corner_mm =
-            [0, 1].map(|axis: usize| 0.5 * (spans[axis][0] + spans[axis][1] - spacing_mm * (counts[axis] - 1) as f64));
+            [0, 1].map(|axis: usize| 0.5 * (low[axis] + high[axis] - spacing_mm * (counts[axis] - 1) as f64));
         let grid = BasisGrid { corner_mm, spacing_mm, counts };
         let at = |node: &usize| {
             let [i, j] = [node % counts[0], node / counts[0]];
@@ -58,7 +56,7 @@ impl IntermediateNodes {
         }
         let degree = (0..MOST_DEGREE).take_while(|degree| 3 * (degree + 2) * (degree + 3) / 2 <= places.len()).count();
         let at_nodes: Vec<[f64; 2]> = nodes.iter().map(at).collect();
-        let terms = [&places, &at_nodes].map(|places| polynomials(places, spans, degree));
+        let terms = [&places, &at_nodes].map(|places| polynomials(places, [low, high], degree));
         Some(Self { grid, nodes, corners, terms })
     }
 
@@ -107,11 +105,10 @@ fn beside(at: [f64; 2], places: &[[f64; 2]], tree: &Nearest, near_mm: f64) -> Op
 }
 
 /// Evaluates products of Chebyshev polynomials up to a total degree over a rectangle: a row per place.
-fn polynomials(places: &[[f64; 2]], spans: [[f64; 2]; 2], degree: usize) -> DMatrix<f64> {
+fn polynomials(places: &[[f64; 2]], [low, high]: [[f64; 2]; 2], degree: usize) -> DMatrix<f64> {
     let orders: Vec<[usize; 2]> = (0..=degree).flat_map(|a| (0..=degree - a).map(move |b| [a, b])).collect();
     let along = |place: &[f64; 2], axis: usize| {
-        let [low, high] = spans[axis];
-        ((2.0 * place[axis] - low - high) / (high - low)).clamp(-1.0, 1.0).acos()
+        ((2.0 * place[axis] - low[axis] - high[axis]) / (high[axis] - low[axis])).clamp(-1.0, 1.0).acos()
     };
     let angles: Vec<[f64; 2]> = places.iter().map(|place| [along(place, 0), along(place, 1)]).collect();
     DMatrix::from_fn(places.len(), orders.len(), |r, c| {

@@ -62,6 +62,8 @@ pub use stopping::{
 
 use nalgebra::DMatrix;
 
+use crate::geometry::bounds;
+
 /// Hyperparameters of the Gaussian-process model.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hyperparameters {
@@ -104,7 +106,7 @@ impl Observed {
             deviations_mm: chosen.iter().map(|&k| self.deviations_mm[k]).collect(),
             fixed_effects: self.fixed_effects.select_rows(chosen),
             random_effects: self.random_effects.select_rows(chosen),
-            path: self.path_of(chosen),
+            path: if self.path.is_empty() { Vec::new() } else { chosen.iter().map(|&k| self.path[k]).collect() },
         }
     }
 
@@ -114,10 +116,6 @@ impl Observed {
         DMatrix::from_fn(n, p + self.random_effects.ncols(), |r, c| {
             if c < p { self.fixed_effects[(r, c)] } else { self.random_effects[(r, c - p)] }
         })
-    }
-
-    fn path_of(&self, chosen: &[usize]) -> Vec<f64> {
-        if self.path.is_empty() { Vec::new() } else { chosen.iter().map(|&k| self.path[k]).collect() }
     }
 
     /// Checks the shapes, the number of points and that every number is finite.
@@ -149,13 +147,15 @@ impl Observed {
     }
 }
 
+/// Returns an orthonormal base of the space that the columns span.
+fn orthonormal_base(columns: DMatrix<f64>) -> DMatrix<f64> {
+    if columns.ncols() > 0 { columns.qr().q() } else { columns }
+}
+
 /// Returns the typical spacing of the points, in mm: the root of the area of the rectangle around them per point.
 fn spacing_mm(places: &[[f64; 2]]) -> f64 {
-    let span = |axis: usize| {
-        let of = places.iter().map(|place| place[axis]);
-        of.clone().fold(f64::NEG_INFINITY, f64::max) - of.fold(f64::INFINITY, f64::min)
-    };
-    (span(0) * span(1) / places.len() as f64).sqrt()
+    let [low, high] = bounds(places.iter().copied());
+    ((high[0] - low[0]) * (high[1] - low[1]) / places.len() as f64).sqrt()
 }
 
 impl Hyperparameters {

@@ -11,6 +11,7 @@ use rayon::prelude::*;
 use super::hypotheses::{NoiseKind, size_mm};
 use super::nelder_mead::maximize;
 use super::{Anisotropy, DensePosterior, Field, Hyperparameters, Observed, Prior, spacing_mm};
+use crate::geometry::bounds;
 
 /// Maximum number of points of a block, and of blocks.
 const POINTS_A_BLOCK: usize = 48;
@@ -70,11 +71,8 @@ impl CompositeLikelihood {
                 done.push(block);
                 continue;
             }
-            let span = |axis: usize| {
-                let of = block.iter().map(|&k| observed.places[k][axis]);
-                of.clone().fold(f64::NEG_INFINITY, f64::max) - of.fold(f64::INFINITY, f64::min)
-            };
-            let axis = usize::from(span(1) > span(0));
+            let [low, high] = bounds(block.iter().map(|&k| observed.places[k]));
+            let axis = usize::from(high[1] - low[1] > high[0] - low[0]);
             block.sort_by(|&a, &b| observed.places[a][axis].total_cmp(&observed.places[b][axis]).then(a.cmp(&b)));
             let rest = block.split_off(block.len() / 2);
             whole.extend([block, rest]);

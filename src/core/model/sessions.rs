@@ -19,7 +19,7 @@ use nalgebra::DMatrix;
 
 use super::form::Motions;
 use super::nelder_mead::maximize;
-use super::{DensePosterior, Field, Hyperparameters, ModelError, Observed, Prior};
+use super::{DensePosterior, Field, Hyperparameters, ModelError, Observed, Prior, orthonormal_base};
 use crate::registration::{Deviation, PointStatus, Registration};
 
 /// Observed points, and the session of each.
@@ -308,8 +308,7 @@ struct BestFitBasis {
 
 impl BestFitBasis {
     fn of(effects: &DMatrix<f64>) -> Self {
-        let q = if effects.ncols() > 0 { effects.clone().qr().q() } else { effects.clone() };
-        Self { q }
+        Self { q: orthonormal_base(effects.clone()) }
     }
 
     fn after_best_fit(&self, values: &[f64]) -> Vec<f64> {
