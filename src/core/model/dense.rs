@@ -61,17 +61,29 @@ impl DensePosterior {
         hyperparameters: Hyperparameters,
         shared_mm2: impl Fn(usize, usize) -> f64,
     ) -> Result<Self, ModelError> {
+        observed.check()?;
+        hyperparameters.check()?;
+        let covariance = covariance_mm2(observed, &hyperparameters, shared_mm2);
+        let factor = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
         let Observed { places, deviations_mm, .. } = observed;
-        let Solved { effects, factor, solved, gram, towards, log_det, .. } =
-            Solved::with(observed, &hyperparameters, shared_mm2)?;
+        let effects = observed.all_effects();
         let (n, p, vague) = (places.len(), effects.ncols(), observed.fixed_effects.ncols());
-        let gram = checked_cholesky(with_stated(gram, vague))?;
-        let found = gram.solve(&towards);
+        let mut right = Mat::zeros(n, p + 1);
+        (0..p).for_each(|c| right.col_as_slice_mut(c).copy_from_slice(effects.column(c).as_slice()));
+        right.col_as_slice_mut(p).copy_from_slice(deviations_mm);
+        let solved = factor.solve(&right);
+        let mut gram = DMatrix::from_fn(p, p, |a, b| dot(right.col_as_slice(a), solved.col_as_slice(b)));
+        // The random effects have the prior precision 1, the fixed effects have none.
+        (vague..p).for_each(|k| gram[(k, k)] += 1.0);
+        let gram = checked_cholesky(gram)?;
+        let found = gram.solve(&DVector::from_fn(p, |a, _| dot(right.col_as_slice(a), solved.col_as_slice(p))));
         let mut weights = solved.col_as_slice(p).to_vec();
         for a in 0..p {
             weights.iter_mut().zip(solved.col_as_slice(a)).for_each(|(weight, of)| *weight -= of * found[a]);
         }
         let squares = dot(deviations_mm, &weights);
+        let diagonal = factor.L().diagonal();
+        let log_det: f64 = 2.0 * (0..n).map(|k| diagonal[k].ln()).sum::<f64>();
         let log_gram: f64 = 2.0 * gram.l_dirty().diagonal().iter().map(|v| v.ln()).sum::<f64>();
         Ok(Self {
             hyperparameters,
@@ -137,68 +149,33 @@ impl DensePosterior {
     }
 }
 
-/// Products of the inverse covariance of the points with effects and deviations.
-struct Solved {
-    /// Columns of H, followed by those of E.
-    effects: DMatrix<f64>,
-    factor: Llt<f64>,
-    /// K^-1 times these columns, followed by the column K^-1 d.
-    solved: Mat<f64>,
-    /// H'K^-1 H and H'K^-1 d, with the columns of E appended to H; K does not contain E.
-    gram: DMatrix<f64>,
-    towards: DVector<f64>,
-    log_det: f64,
-}
-
-impl Solved {
-    fn with(
-        observed: &Observed,
-        hyperparameters: &Hyperparameters,
-        shared_mm2: impl Fn(usize, usize) -> f64,
-    ) -> Result<Self, ModelError> {
-        observed.check()?;
-        hyperparameters.check()?;
-        let Observed { places, deviations_mm, path, .. } = observed;
-        let effects = observed.all_effects();
-        let (n, p) = (places.len(), effects.ncols());
-        let scatter2 = hyperparameters.noise_sigma_mm * hyperparameters.noise_sigma_mm;
-        let pairs = hyperparameters.field.pairs();
-        let mut covariance = Mat::zeros(n, n);
-        for c in 0..n {
-            // The factorization reads only the lower triangle.
-            let column = &mut covariance.col_as_slice_mut(c)[c..];
-            pairs.column(places[c], &places[c..], column);
-            column.iter_mut().zip(c..).for_each(|(v, r)| *v += shared_mm2(r, c));
-            match path.is_empty() {
-                true => column[0] += scatter2,
-                false => column
-                    .iter_mut()
-                    .zip(&path[c..])
-                    .for_each(|(v, at)| *v += scatter2 * hyperparameters.noise_correlation(at - path[c])),
-            }
+/// Returns the lower triangle of the covariance K of the points, without the effects.
+fn covariance_mm2(
+    observed: &Observed,
+    hyperparameters: &Hyperparameters,
+    shared_mm2: impl Fn(usize, usize) -> f64,
+) -> Mat<f64> {
+    let Observed { places, path, .. } = observed;
+    let scatter2 = hyperparameters.noise_sigma_mm * hyperparameters.noise_sigma_mm;
+    let pairs = hyperparameters.field.pairs();
+    let mut covariance = Mat::zeros(places.len(), places.len());
+    for c in 0..places.len() {
+        let column = &mut covariance.col_as_slice_mut(c)[c..];
+        pairs.column(places[c], &places[c..], column);
+        column.iter_mut().zip(c..).for_each(|(v, r)| *v += shared_mm2(r, c));
+        match path.is_empty() {
+            true => column[0] += scatter2,
+            false => column
+                .iter_mut()
+                .zip(&path[c..])
+                .for_each(|(v, at)| *v += scatter2 * hyperparameters.noise_correlation(at - path[c])),
         }
-        let factor = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
-        let mut right = Mat::zeros(n, p + 1);
-        (0..p).for_each(|c| right.col_as_slice_mut(c).copy_from_slice(effects.column(c).as_slice()));
-        right.col_as_slice_mut(p).copy_from_slice(deviations_mm);
-        let solved = factor.solve(&right);
-        let gram = DMatrix::from_fn(p, p, |a, b| dot(right.col_as_slice(a), solved.col_as_slice(b)));
-        let towards = DVector::from_fn(p, |a, _| dot(right.col_as_slice(a), solved.col_as_slice(p)));
-        let diagonal = factor.L().diagonal();
-        let log_det: f64 = 2.0 * (0..n).map(|k| diagonal[k].ln()).sum::<f64>();
-        Ok(Self { effects, factor, solved, gram, towards, log_det })
     }
+    covariance
 }
 
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
-}
-
-/// Adds the prior precision 1 of the random effects to the diagonal; the first `vague` columns are fixed effects and
-/// get none.
-fn with_stated(mut gram: DMatrix<f64>, vague: usize) -> DMatrix<f64> {
-    (vague..gram.nrows()).for_each(|k| gram[(k, k)] += 1.0);
-    gram
 }
 
 /// Returns the Cholesky factor of H'K^-1 H.
