@@ -73,7 +73,7 @@ fn a_batch_after_400_points_in_place(bencher: Bencher) {
         path: Vec::new(),
     };
     let effects = motions(&map);
-    let mut before = IncrementalPosterior::over(map, effects, HYPER).unwrap();
+    let mut before = IncrementalPosterior::over(&map, &effects, &DMatrix::zeros(map.len(), 0), HYPER).unwrap();
     before.update(&only(0, 400)).unwrap();
     let batch = only(400, 420);
     bencher.with_inputs(|| before.clone()).bench_values(|mut model| {

@@ -226,13 +226,13 @@ impl ExpectedTouches {
             )
         };
         let ((before, _), (found, of_targets)) = (of(false), of(true));
-        let places = targets.iter().map(|(point, _)| [point.x, point.y]).collect();
+        let places: Vec<[f64; 2]> = targets.iter().map(|(point, _)| [point.x, point.y]).collect();
         let (rows, columns) = (motions.rows(targets.iter().copied()), stated.columns(targets.iter().copied()));
-        let mut growing = IncrementalPosterior::with_random_effects(places, rows, &columns, form.hyperparameters)?;
+        let mut growing = IncrementalPosterior::over(&places, &rows, &columns, form.hyperparameters)?;
         growing.update(&before)?;
         // With no more points than fixed effects the motions are not determined, so the model predicts nothing.
         let is_held = before.places.len() > before.fixed_effects.ncols();
-        let off = if is_held { growing.standardized_innovations(&found) } else { vec![0.0; found.places.len()] };
+        let off = if is_held { growing.standardized_innovations(&found)? } else { vec![0.0; found.places.len()] };
         growing.update(&found)?;
         let is_far = |d: &Deviation| d.status != PointStatus::OffPart && !d.in_fit;
         let outliers = all.iter().filter(|(d, _)| is_far(d)).map(|(_, target)| *target).collect();
