@@ -21,6 +21,7 @@
 //! These are nearly independent from point to point, and add the same amount to every l.
 
 use std::f64::consts::LN_2;
+use std::ops::Range;
 
 use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
@@ -134,44 +135,26 @@ impl FieldHypotheses {
     /// Inconsistent shapes, numbers that are not finite, too few points, or linearly dependent fixed effects.
     pub(super) fn over(observed: &Observed, kind: NoiseKind) -> Result<Self, ModelError> {
         let mut fields = Self::bare(observed, kind)?;
-        let ranges_mm = fields.ranges_mm(RANGES);
         // Rough fields hardly differ from one range to the next, and cost most: every second range is enough.
         let is_laid = |k: usize, smoothness: Smoothness| smoothness != Smoothness::Never || k.is_multiple_of(2);
-        let all = ranges_mm.enumerate().flat_map(|(k, range_mm)| KINDS.map(|smoothness| (k, smoothness, range_mm)));
-        let all: Vec<_> =
-            all.filter(|of| is_laid(of.0, of.1)).map(|(_, smoothness, range_mm)| (smoothness, range_mm)).collect();
-        fields.hypotheses = fields.laid(&all);
+        let all = fields.ranges_mm().enumerate().flat_map(|(k, range_mm)| KINDS.map(|of| (k, of, range_mm)));
+        let all: Vec<_> = all.filter(|&(k, smoothness, _)| is_laid(k, smoothness)).collect();
+        let node = |&(_, smoothness, range_mm): &(usize, Smoothness, f64)| fields.node(smoothness, range_mm);
+        fields.hypotheses = all.par_iter().filter_map(node).collect();
         // Each rough node represents two ranges, so its prior doubles.
         let rough = fields.hypotheses.iter_mut().filter(|node| node.smoothness == Smoothness::Never);
         rough.for_each(|node| node.prior.iter_mut().for_each(|of| *of += LN_2));
         Ok(fields)
     }
 
-    /// Returns `count` ranges in equal steps of their logarithm, from the shortest that the points and the basis
-    /// resolve to more than the size of the part.
-    fn ranges_mm(&self, count: usize) -> impl Iterator<Item = f64> + use<> {
+    /// Returns the ranges in equal steps of their logarithm, from the shortest that the points and the basis resolve to
+    /// more than the size of the part.
+    fn ranges_mm(&self) -> impl Iterator<Item = f64> + use<> {
         let least_mm =
             (LEAST_RANGE * spacing_mm(&self.places)).max(WAVES_A_RANGE * self.basis.min_half_wavelength_mm());
         let most_mm = (MOST_RANGE * size_mm(&self.places)).max(1.5 * least_mm);
-        let ratio = (most_mm / least_mm).ln() / (count - 1) as f64;
-        (0..count).map(move |k| least_mm * (ratio * k as f64).exp())
-    }
-
-    /// Solves the eigenproblems of the given nodes only.
-    #[cfg(test)]
-    pub(super) fn of_nodes(
-        observed: &Observed,
-        kind: NoiseKind,
-        nodes: &[(Smoothness, f64)],
-    ) -> Result<Self, ModelError> {
-        let mut fields = Self::bare(observed, kind)?;
-        fields.hypotheses = fields.laid(nodes);
-        Ok(fields)
-    }
-
-    fn laid(&self, nodes: &[(Smoothness, f64)]) -> Vec<FieldHypothesis> {
-        let node = |&(smoothness, range_mm): &(Smoothness, f64)| self.node(smoothness, range_mm);
-        nodes.par_iter().filter_map(node).collect()
+        let ratio = (most_mm / least_mm).ln() / (RANGES - 1) as f64;
+        (0..RANGES).map(move |k| least_mm * (ratio * k as f64).exp())
     }
 
     fn bare(observed: &Observed, kind: NoiseKind) -> Result<Self, ModelError> {
@@ -206,7 +189,7 @@ impl FieldHypotheses {
 
     /// Computes R W phi with each point as a coordinate, and Q'W phi.
     fn whole(&self) -> (Reduced, Mat<f64>) {
-        let mut rows = self.rows_of(0, self.places.len());
+        let mut rows = self.rows_of(0..self.places.len());
         let (n, p) = self.base.shape();
         let base = Mat::from_fn(n, p, |r, c| self.base[(r, c)]);
         let taken = base.transpose() * &rows;
@@ -217,27 +200,41 @@ impl FieldHypotheses {
     /// Computes the products of the basis functions over all points, with the best fit removed, and factorizes them
     /// until the remaining variance is negligible. Also returns Q'W phi.
     fn reduced_by_products(&self) -> (Reduced, Mat<f64>) {
-        let (n, p, count) = (self.places.len(), self.base.ncols(), self.basis.len());
-        let of = |first: &usize| {
-            let rows = self.rows_of(*first, (first + ROWS).min(n));
-            let base = Mat::from_fn(rows.nrows(), p, |r, c| self.base[(first + r, c)]);
+        let (p, count) = (self.base.ncols(), self.basis.len());
+        let of = |points: Range<usize>| {
+            let base = Mat::from_fn(points.len(), p, |r, c| self.base[(points.start + r, c)]);
+            let rows = self.rows_of(points);
             let mut products = Mat::zeros(count, count);
             lower_product(&mut products, &rows);
-            (products, base.transpose() * &rows)
+            [products, base.transpose() * &rows]
         };
-        let firsts: Vec<usize> = (0..n).step_by(ROWS).collect();
-        let zero = || (Mat::zeros(count, count), Mat::zeros(p, count));
-        let both = |(a, b): (Mat<f64>, Mat<f64>), (c, d): (Mat<f64>, Mat<f64>)| (a + c, b + d);
-        let (mut products, taken) = firsts.par_iter().map(of).reduce(zero, both);
+        let [mut products, taken] = self.sum_over_blocks([(count, count), (p, count)], of);
         products -= taken.transpose() * &taken;
         (pivoted_cholesky(&products), taken)
     }
 
-    /// Computes W phi for the points from `first` up to, but not including, `until`.
-    fn rows_of(&self, first: usize, until: usize) -> Mat<f64> {
+    /// Sums matrices of the given shapes over blocks of points, in parallel.
+    fn sum_over_blocks<const N: usize>(
+        &self,
+        shapes: [(usize, usize); N],
+        of: impl Fn(Range<usize>) -> [Mat<f64>; N] + Sync,
+    ) -> [Mat<f64>; N] {
+        let n = self.places.len();
+        let firsts: Vec<usize> = (0..n).step_by(ROWS).collect();
+        let zero = || shapes.map(|(rows, columns)| Mat::zeros(rows, columns));
+        let add = |mut a: [Mat<f64>; N], b: [Mat<f64>; N]| {
+            a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+            a
+        };
+        firsts.par_iter().map(|&first| of(first..(first + ROWS).min(n))).reduce(zero, add)
+    }
+
+    /// Computes W phi for the given points.
+    fn rows_of(&self, points: Range<usize>) -> Mat<f64> {
+        let first = points.start;
         let before = first.saturating_sub(1);
-        let waves = self.basis.at(&self.places[before..until]);
-        let mut rows = Mat::zeros(until - first, self.basis.len());
+        let waves = self.basis.at(&self.places[before..points.end]);
+        let mut rows = Mat::zeros(points.len(), self.basis.len());
         for c in 0..self.basis.len() {
             let (from, into) = (waves.col_as_slice(c), rows.col_as_slice_mut(c));
             for (r, value) in into.iter_mut().enumerate() {
@@ -260,13 +257,11 @@ impl FieldHypotheses {
         let Some(pivots) = &self.reduced.pivots else {
             return (Mat::from_fn(n, count, |r, c| columns[(r, c)]), products);
         };
-        let of = |first: &usize| {
-            let rows = self.rows_of(*first, (first + ROWS).min(n));
-            rows.transpose() * Mat::from_fn(rows.nrows(), count, |r, c| columns[(first + r, c)])
+        let of = |points: Range<usize>| {
+            let columns = Mat::from_fn(points.len(), count, |r, c| columns[(points.start + r, c)]);
+            [self.rows_of(points).transpose() * columns]
         };
-        let firsts: Vec<usize> = (0..n).step_by(ROWS).collect();
-        let zero = || Mat::zeros(self.basis.len(), count);
-        let by_waves = firsts.par_iter().map(of).reduce(zero, |a, b| a + b);
+        let [by_waves] = self.sum_over_blocks([(self.basis.len(), count)], of);
         let mut coordinates = Mat::from_fn(pivots.len(), count, |r, c| by_waves[(pivots[r], c)]);
         let factor = Mat::from_fn(pivots.len(), pivots.len(), |r, c| self.reduced.rows[(c, pivots[r])]);
         solve_lower_triangular_in_place(factor.as_ref(), coordinates.as_mut(), Par::Seq);
@@ -366,15 +361,11 @@ impl FieldHypotheses {
     /// Sums each basis function over the points with the given weights: one row for each column of weights, one column
     /// for each basis function.
     pub(super) fn sums(&self, weights: &DMatrix<f64>) -> DMatrix<f64> {
-        let n = self.places.len();
-        let of = |first: &usize| {
-            let until = (first + ROWS).min(n);
-            let weights = Mat::from_fn(weights.ncols(), until - first, |r, c| weights[(first + c, r)]);
-            weights * self.basis.at(&self.places[*first..until])
+        let of = |points: Range<usize>| {
+            let weights = Mat::from_fn(weights.ncols(), points.len(), |r, c| weights[(points.start + c, r)]);
+            [weights * self.basis.at(&self.places[points])]
         };
-        let firsts: Vec<usize> = (0..n).step_by(ROWS).collect();
-        let zero = || Mat::zeros(weights.ncols(), self.basis.len());
-        let sums = firsts.par_iter().map(of).reduce(zero, |a, b| a + b);
+        let [sums] = self.sum_over_blocks([(weights.ncols(), self.basis.len())], of);
         DMatrix::from_fn(sums.nrows(), sums.ncols(), |r, c| sums[(r, c)])
     }
 

@@ -138,20 +138,19 @@ impl<'f> Posterior<'f> {
         let of = |(k, node): (usize, &FieldHypothesis)| {
             let likelihoods: Vec<f64> =
                 variance_ratios().map(|tau| posterior.noise_likelihood(k, tau).log_marginal()).collect();
-            let expected = |(at, likelihood): (usize, &f64)| {
-                let expected = priors.map_or(node.prior[at], |priors| {
-                    let tau = variance_ratios().nth(at).unwrap_or_default();
-                    priors.log_density(node.range_mm, (tau * node.scale).sqrt().recip())
-                });
-                likelihood + expected
+            let expected = |(tau, prior): (f64, &f64)| match priors {
+                Some(priors) => priors.log_density(node.range_mm, (tau * node.scale).sqrt().recip()),
+                None => *prior,
             };
-            let densities: Vec<f64> = likelihoods.iter().enumerate().map(expected).collect();
+            let expected = variance_ratios().zip(&node.prior).map(expected);
+            let densities =
+                likelihoods.iter().zip(expected).map(|(likelihood, expected)| likelihood + expected).collect();
             (likelihoods, densities)
         };
-        let all: Vec<(Vec<f64>, Vec<f64>)> = fields.hypotheses.par_iter().enumerate().map(of).collect();
-        let best = all.iter().flat_map(|(likelihoods, _)| likelihoods).copied().fold(f64::NEG_INFINITY, f64::max);
+        let (likelihoods, densities): (Vec<Vec<f64>>, Vec<Vec<f64>>) =
+            fields.hypotheses.par_iter().enumerate().map(of).unzip();
+        let best = likelihoods.into_iter().flatten().fold(f64::NEG_INFINITY, f64::max);
         let none = if fields.hypotheses.is_empty() { best } else { posterior.noise_likelihood(0, 0.0).log_marginal() };
-        let densities: Vec<Vec<f64>> = all.into_iter().map(|(_, densities)| densities).collect();
         Self { densities, evidence: best - none, ..posterior }
     }
 
@@ -187,9 +186,15 @@ impl<'f> Posterior<'f> {
         NoiseLikelihood::of(&products, logs, self.fields.degrees_of_freedom, self.probe)
     }
 
+    /// Returns the most probable node and variance ratio.
+    fn most_probable(&self) -> Option<(usize, f64)> {
+        let all = self.probabilities(HypothesisSet::All);
+        all.into_iter().max_by(|a, b| a.2.total_cmp(&b.2)).map(|(node, tau, _)| (node, tau))
+    }
+
     /// Returns the most probable node and variance ratio, with the most probable noise for them, in mm.
     pub(super) fn best(&self) -> Option<(&FieldHypothesis, f64, f64)> {
-        let (number, tau, _) = self.probabilities(HypothesisSet::All).into_iter().max_by(|a, b| a.2.total_cmp(&b.2))?;
+        let (number, tau) = self.most_probable()?;
         Some((&self.fields.hypotheses[number], tau, self.noise_likelihood(number, tau).mode_mm()))
     }
 
@@ -250,19 +255,13 @@ impl<'f> Posterior<'f> {
     /// 1.
     pub(super) fn weighted_hyperparameters(&self, is_of: impl Fn(Smoothness) -> bool) -> Vec<(Hyperparameters, f64)> {
         let of = |(node, densities): (usize, &Vec<f64>)| {
-            if !is_of(self.fields.hypotheses[node].smoothness) {
-                return None;
-            }
-            let taus: Vec<f64> = variance_ratios().collect();
-            let best = (0..densities.len()).max_by(|a, b| densities[*a].total_cmp(&densities[*b]))?;
-            let hyperparameters = self.hyperparameters(node, taus[best]);
-            let sum: f64 = densities.iter().map(|of| (of - densities[best]).exp()).sum();
-            Some((
-                hyperparameters,
-                densities[best] + sum.ln() + self.doubt(&hyperparameters).max(f64::MIN_POSITIVE).ln(),
-            ))
+            let (tau, most) = variance_ratios().zip(densities).max_by(|a, b| a.1.total_cmp(b.1))?;
+            let hyperparameters = self.hyperparameters(node, tau);
+            let sum: f64 = densities.iter().map(|of| (of - most).exp()).sum();
+            Some((hyperparameters, most + sum.ln() + self.doubt(&hyperparameters).max(f64::MIN_POSITIVE).ln()))
         };
-        let mut all: Vec<(Hyperparameters, f64)> = self.densities.iter().enumerate().filter_map(of).collect();
+        let chosen = self.densities.iter().enumerate().filter(|of| is_of(self.fields.hypotheses[of.0].smoothness));
+        let mut all: Vec<(Hyperparameters, f64)> = chosen.filter_map(of).collect();
         all.sort_by(|a, b| b.1.total_cmp(&a.1));
         let top = all.first().map_or(0.0, |(_, of)| *of);
         all.into_iter().map(|(hyperparameters, of)| (hyperparameters, (of - top).exp())).collect()
@@ -395,9 +394,10 @@ impl<'f> Posterior<'f> {
     /// Returns the posterior mean for the most probable node and variance ratio: coefficients of the basis functions,
     /// and random effects in standard uncertainties.
     pub(super) fn mean(&self) -> (Vec<f64>, DVector<f64>) {
-        let none = || (vec![0.0; self.fields.basis.len()], DVector::zeros(self.observed.random_effects.ncols()));
-        let best = self.probabilities(HypothesisSet::All).into_iter().max_by(|a, b| a.2.total_cmp(&b.2));
-        let Some((number, tau, _)) = best else { return none() };
+        let mut waves = vec![0.0; self.fields.basis.len()];
+        let Some((number, tau)) = self.most_probable() else {
+            return (waves, DVector::zeros(self.observed.random_effects.ncols()));
+        };
         let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.seen[number]);
         let scale = self.noise_likelihood(number, tau);
         let scatter_mm = scale.mode_mm();
@@ -408,13 +408,8 @@ impl<'f> Posterior<'f> {
             field2 / (field2 * (node.eigenvalues[k] + node.truncated_variance) + 1.0) * found
         });
         let coefficients = self.fields.coefficients_from(node, &(&node.eigenvectors * left));
-        let mut waves = none().0;
-        coefficients
-            .col_as_slice(0)
-            .iter()
-            .zip(&node.standard_deviations)
-            .zip(&mut waves)
-            .for_each(|((of, d), into)| *into = of * d);
+        let strong = coefficients.col_as_slice(0).iter().zip(&node.standard_deviations);
+        waves.iter_mut().zip(strong).for_each(|(into, (of, d))| *into = of * d);
         (waves, stated)
     }
 
@@ -726,9 +721,11 @@ mod tests {
         for (count, near) in [(60, 1e-6), (500, 0.2)] {
             let observed = drawn(PLANTED, places(count), Vec::new(), 3);
             let n = observed.places.len();
-            let fields = FieldHypotheses::of_nodes(&observed, NoiseKind::PLAIN, &[(Smoothness::Once, 30.0)]).unwrap();
+            let fields = FieldHypotheses::over(&observed, NoiseKind::PLAIN).unwrap();
             let posterior = Posterior::of(&fields, &observed, None, None);
-            let node = &fields.hypotheses[0];
+            let is_one = |node: &FieldHypothesis| node.smoothness == Smoothness::Once && node.range_mm > 30.0;
+            let number = fields.hypotheses.iter().position(is_one).unwrap();
+            let node = &fields.hypotheses[number];
             let waves = fields.basis.at(&observed.places);
             let rows =
                 DMatrix::from_fn(n, node.standard_deviations.len(), |r, c| waves[(r, c)] * node.standard_deviations[c]);
@@ -744,7 +741,7 @@ mod tests {
                 -0.5 * (logs + fields.degrees_of_freedom * squares.ln())
             };
             for tau in [0.0, 0.3, 30.0, 1000.0] {
-                let [told, exact] = [posterior.noise_likelihood(0, tau).log_marginal(), by_hand(tau)];
+                let [told, exact] = [posterior.noise_likelihood(number, tau).log_marginal(), by_hand(tau)];
                 assert!((told - exact).abs() < near, "{count} {tau}: {told} {exact}");
             }
         }
