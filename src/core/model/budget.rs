@@ -8,6 +8,7 @@ use faer::linalg::solvers::{Llt, Solve};
 use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector};
 
+use super::form::SampledForms;
 use super::hypotheses::FieldHypotheses;
 use super::machine_uncertainty::UncertaintySource;
 use super::posterior::Posterior;
@@ -26,16 +27,6 @@ pub struct BudgetEntry {
     pub pv_99_8_mm: f64,
 }
 
-/// Forms sampled from the posterior, a column each, with their places and the motions that a best fit removes there.
-pub(super) struct SampledFigures<'a> {
-    pub(super) forms: &'a DMatrix<f64>,
-    pub(super) places: &'a [[f64; 2]],
-    pub(super) effects: &'a DMatrix<f64>,
-    /// Form that each random effect has ground into the part, after its own best fit: a row per place, a column per
-    /// effect. `None` before the first correction.
-    pub(super) ground_in: Option<DMatrix<f64>>,
-}
-
 /// Components of a variance.
 struct Parts {
     /// Noise of the points.
@@ -50,17 +41,20 @@ struct Parts {
 
 /// Decomposes the standard uncertainties of root mean square and PV 99.8 %. Returns one entry per source; empty if the
 /// decomposition fails.
+///
+/// `ground_in` is the form that each random effect has ground into the part, after its own best fit: a row per place, a
+/// column per effect. It is `None` before the first correction.
 pub(super) fn decompose(
     (observed, sources): (&Observed, &[UncertaintySource]),
     (fields, posterior): (&FieldHypotheses, &Posterior),
-    drawn: &SampledFigures,
+    (drawn, ground_in): (&SampledForms, Option<&DMatrix<f64>>),
     uncertainties_mm: [f64; 2],
 ) -> Vec<BudgetEntry> {
-    let (slopes, ground_in) = slopes(drawn);
+    let (slopes, by_ground_in) = slopes(drawn, ground_in);
     let of = |figure: usize| {
-        let mut parts = parts(observed, fields, posterior, (drawn.places, &slopes[figure]))?;
-        if drawn.ground_in.is_some() {
-            parts.stated.clone_from(&ground_in[figure]);
+        let mut parts = parts(observed, fields, posterior, (&drawn.places, &slopes[figure]))?;
+        if ground_in.is_some() {
+            parts.stated.clone_from(&by_ground_in[figure]);
         }
         let whole = parts.scatter + parts.form + parts.pose + parts.stated.iter().sum::<f64>();
         let share = |source: UncertaintySource| match source {
@@ -148,15 +142,14 @@ fn parts(
 ///
 /// An effect that was ground in is itself a form: its derivative is as often positive as negative over the samples, so
 /// the mean is 0, but the mean square is not.
-fn slopes(drawn: &SampledFigures) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
-    let (n, count) = drawn.forms.shape();
+fn slopes(drawn: &SampledForms, ground_in: Option<&DMatrix<f64>>) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
+    let forms = &drawn.forms[0];
+    let (n, count) = forms.shape();
     let mut slopes = [DVector::zeros(n), DVector::zeros(n)];
-    let none = DMatrix::zeros(n, 0);
-    let columns = drawn.ground_in.as_ref().unwrap_or(&none);
-    let mut ground_in = [0, 1].map(|_| vec![0.0; columns.ncols()]);
+    let mut squares = [0, 1].map(|_| vec![0.0; ground_in.map_or(0, DMatrix::ncols)]);
     let mut order: Vec<usize> = (0..n).collect();
     let left_out = n / 1000;
-    for form in drawn.forms.column_iter() {
+    for form in forms.column_iter() {
         let rms = form.norm() / (n as f64).sqrt();
         let of_rms = 1.0 / (n as f64 * rms).max(f64::MIN_POSITIVE);
         slopes[0].axpy(of_rms / count as f64, &form, 1.0);
@@ -165,12 +158,12 @@ fn slopes(drawn: &SampledFigures) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
         let [lowest, highest] = [left_out, n - 1 - left_out].map(|k| nth(&mut order, k));
         slopes[1][highest] += 1.0 / count as f64;
         slopes[1][lowest] -= 1.0 / count as f64;
-        for (k, column) in columns.column_iter().enumerate() {
+        for (k, column) in ground_in.iter().flat_map(|columns| columns.column_iter()).enumerate() {
             let of = [of_rms * form.dot(&column), column[highest] - column[lowest]];
-            ground_in.iter_mut().zip(of).for_each(|(sum, of)| sum[k] += of * of / count as f64);
+            squares.iter_mut().zip(of).for_each(|(sum, of)| sum[k] += of * of / count as f64);
         }
     }
     let base = orthonormal_base(drawn.effects.clone());
     slopes.iter_mut().for_each(|slope| *slope -= &base * base.tr_mul(slope));
-    (slopes, ground_in)
+    (slopes, squares)
 }

@@ -454,9 +454,7 @@ impl FittedModel {
             is_of_few: is_of_few(posterior, inputs),
         }
     }
-}
 
-impl FittedModel {
     fn budget(
         &self,
         inputs: &ModelInputs,
@@ -466,16 +464,10 @@ impl FittedModel {
         figures: &FormFigures,
     ) -> Vec<BudgetEntry> {
         let ground_in = ground_in.map(|columns| best_fitted(columns, &drawn.effects));
-        let of_drawn = budget::SampledFigures {
-            forms: &drawn.forms[0],
-            places: &drawn.places,
-            effects: &drawn.effects,
-            ground_in,
-        };
         let uncertainties_mm = [figures.rms, figures.pv_most_points].map(|of| of.standard_mm());
-        let sources = self.stated.sources();
-        let mut budget =
-            budget::decompose((&self.observed, &sources), (&self.fields, posterior), &of_drawn, uncertainties_mm);
+        let model = (&self.fields, posterior);
+        let points = (&self.observed, &self.stated.sources()[..]);
+        let mut budget = budget::decompose(points, model, (drawn, ground_in.as_ref()), uncertainties_mm);
         budget.retain(|share| share.source != UncertaintySource::Datum || inputs.datum.is_some());
         budget
     }
@@ -614,13 +606,14 @@ fn inverse_of_products(effects: &DMatrix<f64>) -> DMatrix<f64> {
 }
 
 /// Samples of the form at a set of places, one column for each sample.
-struct SampledForms {
+pub(super) struct SampledForms {
     /// Samples by the posterior, and by fields of the second variance. The second bounds the extremes.
-    forms: [DMatrix<f64>; 2],
+    pub(super) forms: [DMatrix<f64>; 2],
     /// Samples that take the deviations entirely as form, apart from the noise; only if there are few points.
     all: Option<DMatrix<f64>>,
-    places: Vec<[f64; 2]>,
-    effects: DMatrix<f64>,
+    pub(super) places: Vec<[f64; 2]>,
+    /// Motions that a best fit removes, at the places.
+    pub(super) effects: DMatrix<f64>,
     /// Indices of the points that are the places; empty if the places are not measured points.
     chosen: Vec<usize>,
     /// Indices of the places that were not touched; empty if the places are measured points.
@@ -775,22 +768,14 @@ impl SampledForms {
     /// Adds form that is too narrow to be resolved to places that were not touched: the excess of the noise over that
     /// of the probe, and short waves.
     fn with_what_is_narrow(mut self, inputs: &ModelInputs) -> Self {
-        let Self { forms, scatter_mm, narrow_mm, .. } = &mut self;
-        forms
-            .iter_mut()
-            .zip(narrow_mm)
-            .for_each(|(forms, narrow_mm)| add_narrow(forms, (scatter_mm, narrow_mm), inputs, 4));
+        add_narrow(&mut self.forms, (&self.scatter_mm, &self.narrow_mm), inputs, 4);
         self.narrow_between(inputs);
         self
     }
 
     fn narrow_between(&mut self, inputs: &ModelInputs) {
-        let Self { between, scatter_mm, narrow_mm, .. } = self;
-        if let Some(IntermediateForms { forms, .. }) = between {
-            forms
-                .iter_mut()
-                .zip(narrow_mm)
-                .for_each(|(forms, narrow_mm)| add_narrow(forms, (scatter_mm, narrow_mm), inputs, 8));
+        if let Some(between) = &mut self.between {
+            add_narrow(&mut between.forms, (&self.scatter_mm, &self.narrow_mm), inputs, 8);
         }
     }
 
@@ -954,16 +939,23 @@ fn ends(of: impl Iterator<Item = f64>) -> [f64; 2] {
 }
 
 /// Adds to every place of each sample form that is too narrow to be resolved.
-fn add_narrow(forms: &mut DMatrix<f64>, (scatter_mm, narrow_mm): (&[f64], &[f64]), inputs: &ModelInputs, stream: u64) {
-    let rows = forms.nrows();
-    let of = |(c, form): (usize, &mut [f64])| {
-        let [_, more_mm] = parted(scatter_mm[c], narrow_mm[c], inputs, &mut Normals::new(2, c as u64));
-        let mut normals = Normals::new(stream, c as u64);
-        if more_mm > 0.0 {
-            form.iter_mut().for_each(|value| *value += more_mm * normals.next());
-        }
-    };
-    forms.as_mut_slice().par_chunks_mut(rows.max(1)).enumerate().for_each(of);
+fn add_narrow(
+    forms: &mut [DMatrix<f64>; 2],
+    (scatter_mm, narrow_mm): (&[f64], &[Vec<f64>; 2]),
+    inputs: &ModelInputs,
+    stream: u64,
+) {
+    for (forms, narrow_mm) in forms.iter_mut().zip(narrow_mm) {
+        let rows = forms.nrows();
+        let of = |(c, form): (usize, &mut [f64])| {
+            let [_, more_mm] = parted(scatter_mm[c], narrow_mm[c], inputs, &mut Normals::new(2, c as u64));
+            let mut normals = Normals::new(stream, c as u64);
+            if more_mm > 0.0 {
+                form.iter_mut().for_each(|value| *value += more_mm * normals.next());
+            }
+        };
+        forms.as_mut_slice().par_chunks_mut(rows.max(1)).enumerate().for_each(of);
+    }
 }
 
 /// Samples the noise of the probe, and returns it with the standard deviation of the form that is too narrow. If the
@@ -1095,7 +1087,7 @@ impl Motions {
             return Err(ModelError::Stated { what, value });
         }
         let model_from_machine = registration.cmm_from_model.rotation.transpose();
-        Ok(MachineEffects::new(inputs.machine, of_others, self.centre, model_from_machine).held(datum))
+        Ok(MachineEffects::new(inputs.machine, of_others, datum, self.centre, model_from_machine))
     }
 
     /// Returns the change of the distance of each point from the surface for a unit of each motion.

@@ -75,27 +75,24 @@ pub(super) struct MachineEffects {
 }
 
 impl MachineEffects {
-    /// Creates the effects of the machine. `radius_mm` is the standard uncertainty of the probe's radius from its
-    /// qualification, `temperature` the relative standard uncertainty of all lengths.
+    /// Creates the effects of machine and fixture. `radius_mm` is the standard uncertainty of the probe's radius from
+    /// its qualification, `temperature` the relative standard uncertainty of all lengths. `datum` has the standard
+    /// uncertainties of the shifts along the axes of the model, in mm, and of the rotations about these axes through
+    /// the centre, in rad.
     pub(super) fn new(
         machine: MachineUncertainty,
         [radius_mm, temperature]: [f64; 2],
+        datum: [f64; 6],
         centre: Point,
         model_from_machine: Matrix3<f64>,
     ) -> Self {
         let radius_mm = radius_mm.hypot(machine.reference_sphere_mm);
-        Self { machine, radius_mm, temperature, datum: [0.0; 6], centre, model_from_machine }
-    }
-
-    /// Adds the effects of the fixture: standard uncertainties of the shifts along the axes of the model, in mm, and of
-    /// the rotations about these axes through the centre, in rad.
-    pub(super) fn held(self, datum: [f64; 6]) -> Self {
-        Self { datum, ..self }
+        Self { machine, radius_mm, temperature, datum, centre, model_from_machine }
     }
 
     /// Returns the source of each column.
     pub(super) fn sources(&self) -> Vec<UncertaintySource> {
-        self.all().into_iter().map(|(source, _)| source).collect()
+        self.all().into_iter().map(|(source, ..)| source).collect()
     }
 
     /// Returns the change of each point's deviation from the surface per standard uncertainty of each effect: a row per
@@ -105,77 +102,62 @@ impl MachineEffects {
         let to_machine = self.model_from_machine.transpose();
         let placed: Vec<(Vector, Vector)> =
             points.map(|(point, normal)| (to_machine * (point - self.centre), to_machine * normal)).collect();
-        DMatrix::from_fn(placed.len(), all.len(), |r, c| all[c].1.on(placed[r].0, placed[r].1))
+        DMatrix::from_fn(placed.len(), all.len(), |r, c| all[c].2 * all[c].1.of_unit(placed[r].0, placed[r].1))
     }
 
-    fn all(&self) -> Vec<(UncertaintySource, Effect)> {
+    /// Returns the effects with their source and standard uncertainty, as far as that is above 0.
+    fn all(&self) -> Vec<(UncertaintySource, Effect, f64)> {
         let MachineUncertainty { scale, squareness_rad, probe_mm, .. } = self.machine;
-        let scales =
-            scale.into_iter().enumerate().map(|(k, share)| (UncertaintySource::Scales, Effect::Stretch([k, k], share)));
+        let radius = (UncertaintySource::Radius, Effect::Radius, self.radius_mm);
+        let temperature = (UncertaintySource::Temperature, Effect::Size, self.temperature);
+        let scales = (0..3).map(|k| (UncertaintySource::Scales, Effect::Stretch([k, k]), scale[k]));
         let angles = [[0, 1], [0, 2], [1, 2]].into_iter().zip(squareness_rad);
-        let angles = angles.map(|(axes, angle)| (UncertaintySource::Squareness, Effect::Stretch(axes, angle)));
-        let probe = (0..5).map(|k| (UncertaintySource::Probe, Effect::Direction(k, probe_mm)));
-        let alike = [
-            (UncertaintySource::Radius, Effect::Radius(self.radius_mm)),
-            (UncertaintySource::Temperature, Effect::Size(self.temperature)),
-        ];
-        let axis = |k: usize| self.model_from_machine.row(k % 3).transpose();
-        let held = self.datum.into_iter().enumerate().map(|(k, size)| {
-            let effect = if k < 3 { Effect::Shift(axis(k), size) } else { Effect::Turn(axis(k), size) };
-            (UncertaintySource::Datum, effect)
-        });
+        let angles = angles.map(|(axes, angle)| (UncertaintySource::Squareness, Effect::Stretch(axes), angle));
+        let probe = (0..5).map(|k| (UncertaintySource::Probe, Effect::Direction(k), probe_mm));
+        let axis = |k: usize| self.model_from_machine.row(k).transpose();
+        let shifts = (0..3).map(|k| (UncertaintySource::Datum, Effect::Shift(axis(k)), self.datum[k]));
+        let turns = (0..3).map(|k| (UncertaintySource::Datum, Effect::Turn(axis(k)), self.datum[3 + k]));
         let machine = scales.chain(angles).chain(probe);
-        alike.into_iter().chain(machine).chain(held).filter(|(_, effect)| effect.size() > 0.0).collect()
+        let all = [radius, temperature].into_iter().chain(machine).chain(shifts).chain(turns);
+        all.filter(|(.., size)| *size > 0.0).collect()
     }
 }
 
-/// One effect, with its standard uncertainty.
+/// Effect of one unit.
 #[derive(Clone, Copy, Debug)]
 enum Effect {
     /// Shift along the normal, the same everywhere.
-    Radius(f64),
+    Radius,
     /// Relative change of all lengths.
-    Size(f64),
+    Size,
     /// Shift along the first axis, in proportion to the position along the second.
-    Stretch([usize; 2], f64),
+    Stretch([usize; 2]),
     /// One of the five spherical harmonics of degree 2 of the normal. Those of degree 1 are shifts of the part. The
     /// scale makes the sum of their squares 1 in every direction.
-    Direction(usize, f64),
+    Direction(usize),
     /// Shift of the whole part along an axis.
-    Shift(Vector, f64),
+    Shift(Vector),
     /// Rotation of the whole part about an axis through the centre.
-    Turn(Vector, f64),
+    Turn(Vector),
 }
 
 impl Effect {
-    fn size(&self) -> f64 {
-        match *self {
-            Self::Radius(size)
-            | Self::Size(size)
-            | Self::Stretch(_, size)
-            | Self::Direction(_, size)
-            | Self::Shift(_, size)
-            | Self::Turn(_, size) => size,
-        }
-    }
-
-    /// Returns the deviation per standard uncertainty at a point, in mm. `arm` is its position from the centre, `n` its
-    /// normal; both are in the machine frame.
-    fn on(&self, arm: Vector, n: Vector) -> f64 {
+    /// Returns the deviation per unit at a point, in mm. `arm` is its position from the centre, `n` its normal; both
+    /// are in the machine frame.
+    fn of_unit(&self, arm: Vector, n: Vector) -> f64 {
         let root = 3.0_f64.sqrt();
-        let of_unit = match *self {
-            Self::Radius(_) => 1.0,
-            Self::Size(_) => arm.dot(&n),
-            Self::Stretch([along, by], _) => arm[by] * n[along],
-            Self::Direction(0, _) => root * n.x * n.y,
-            Self::Direction(1, _) => root * n.y * n.z,
-            Self::Direction(2, _) => root * n.x * n.z,
-            Self::Direction(3, _) => 0.5 * (3.0 * n.z * n.z - 1.0),
-            Self::Direction(..) => 0.5 * root * (n.x * n.x - n.y * n.y),
-            Self::Shift(along, _) => along.dot(&n),
-            Self::Turn(about, _) => about.cross(&arm).dot(&n),
-        };
-        self.size() * of_unit
+        match *self {
+            Self::Radius => 1.0,
+            Self::Size => arm.dot(&n),
+            Self::Stretch([along, by]) => arm[by] * n[along],
+            Self::Direction(0) => root * n.x * n.y,
+            Self::Direction(1) => root * n.y * n.z,
+            Self::Direction(2) => root * n.x * n.z,
+            Self::Direction(3) => 0.5 * (3.0 * n.z * n.z - 1.0),
+            Self::Direction(_) => 0.5 * root * (n.x * n.x - n.y * n.y),
+            Self::Shift(along) => along.dot(&n),
+            Self::Turn(about) => about.cross(&arm).dot(&n),
+        }
     }
 }
 
@@ -210,7 +192,7 @@ mod tests {
     use super::*;
 
     fn effects(machine: MachineUncertainty, of_others: [f64; 2]) -> MachineEffects {
-        MachineEffects::new(machine, of_others, Point::new(1.0, 2.0, 3.0), Matrix3::identity())
+        MachineEffects::new(machine, of_others, [0.0; 6], Point::new(1.0, 2.0, 3.0), Matrix3::identity())
     }
 
     #[test]
@@ -269,7 +251,7 @@ mod tests {
         // The machine's x axis is the model's y axis.
         let turned = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
         let machine = MachineUncertainty { scale: [1e-6, 0.0, 0.0], ..MachineUncertainty::default() };
-        let of = MachineEffects::new(machine, [0.0; 2], Point::origin(), turned);
+        let of = MachineEffects::new(machine, [0.0; 2], [0.0; 6], Point::origin(), turned);
         let on = |normal| of.columns(std::iter::once((Point::new(10.0, 20.0, 0.0), normal)))[0];
         assert!((on(Vector::y()) - 2e-5).abs() < 1e-18 && on(Vector::x()).abs() < 1e-18);
     }
@@ -279,8 +261,8 @@ mod tests {
         // The machine's x axis is the model's y axis, its y axis the model's -x axis.
         let turned = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
         let centre = Point::new(1.0, 2.0, 3.0);
-        let of = MachineEffects::new(MachineUncertainty::default(), [0.0; 2], centre, turned)
-            .held([2e-3, 0.0, 0.0, 0.0, 3e-5, 4e-5]);
+        let datum = [2e-3, 0.0, 0.0, 0.0, 3e-5, 4e-5];
+        let of = MachineEffects::new(MachineUncertainty::default(), [0.0; 2], datum, centre, turned);
         let row = of.columns(std::iter::once((Point::new(11.0, 22.0, 33.0), Vector::new(0.6, 0.0, 0.8))));
         // e_y x (10, 20, 30) = (30, 0, -10), e_z x (10, 20, 30) = (-20, 10, 0).
         let by_hand = [2e-3 * 0.6, 3e-5 * (30.0 * 0.6 - 10.0 * 0.8), 4e-5 * (-20.0 * 0.6)];
