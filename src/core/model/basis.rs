@@ -194,35 +194,38 @@ pub(super) struct BasisGrid {
     pub(super) counts: [usize; 2],
 }
 
+impl BasisGrid {
+    /// Returns the indices of a node along u and v; u is the fastest.
+    pub(super) fn indices(&self, node: usize) -> [usize; 2] {
+        [node % self.counts[0], node / self.counts[0]]
+    }
+
+    /// Returns the coordinates u and v of a node, in mm.
+    pub(super) fn place(&self, node: usize) -> [f64; 2] {
+        let indices = self.indices(node);
+        [0, 1].map(|axis: usize| self.corner_mm[axis] + self.spacing_mm * indices[axis] as f64)
+    }
+}
+
 /// Returns the spectral density of a field of variance 1, in mm^2.
 ///
 /// The covariance is exp(-2 (r / range)^2), or Matern's with kappa^2 = 8 nu / range^2. The density of the latter is 4
 /// pi nu kappa^(2 nu) / (kappa^2 + w^2)^(nu + 1) (Rasmussen and Williams 2006, 4.15).
 fn spectral_density_mm2(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
-    let matern = |nu: f64| {
-        let kappa2 = 8.0 * nu / (range_mm * range_mm);
-        2.0 * std::f64::consts::TAU * nu * kappa2.powf(nu) / (kappa2 + number2).powf(nu + 1.0)
+    let Some(nu) = smoothness.nu() else {
+        return 0.25 * std::f64::consts::TAU * range_mm.powi(2) * (-number2 * range_mm.powi(2) / 8.0).exp();
     };
-    match smoothness {
-        Smoothness::Never => matern(0.5),
-        Smoothness::Once => matern(2.0),
-        Smoothness::Endless => {
-            0.25 * std::f64::consts::TAU * range_mm.powi(2) * (-number2 * range_mm.powi(2) / 8.0).exp()
-        }
-    }
+    let kappa2 = 8.0 * nu / (range_mm * range_mm);
+    2.0 * std::f64::consts::TAU * nu * kappa2.powf(nu) / (kappa2 + number2).powf(nu + 1.0)
 }
 
 /// Returns the share of the variance in waves of a larger wavenumber: the integral of the density outside a circle.
 fn truncated_share(smoothness: Smoothness, range_mm: f64, number2: f64) -> f64 {
-    let matern = |nu: f64| {
-        let kappa2 = 8.0 * nu / (range_mm * range_mm);
-        (kappa2 / (kappa2 + number2)).powf(nu)
+    let Some(nu) = smoothness.nu() else {
+        return (-number2 * range_mm.powi(2) / 8.0).exp();
     };
-    match smoothness {
-        Smoothness::Never => matern(0.5),
-        Smoothness::Once => matern(2.0),
-        Smoothness::Endless => (-number2 * range_mm.powi(2) / 8.0).exp(),
-    }
+    let kappa2 = 8.0 * nu / (range_mm * range_mm);
+    (kappa2 / (kappa2 + number2)).powf(nu)
 }
 
 #[cfg(test)]

@@ -40,6 +40,15 @@ pub struct Anisotropy {
 }
 
 impl Smoothness {
+    /// Returns nu; `None` if it is infinite.
+    pub(super) fn nu(self) -> Option<f64> {
+        match self {
+            Self::Never => Some(0.5),
+            Self::Once => Some(2.0),
+            Self::Endless => None,
+        }
+    }
+
     /// Returns the name.
     pub fn name(self) -> &'static str {
         match self {

@@ -388,12 +388,12 @@ impl FittedModel {
         let columns = stated.columns(used.iter().map(|d| (d.point, d.normal)));
         let (shown, ground_in) =
             if inputs.is_corrected { (DMatrix::zeros(used.len(), 0), Some(columns)) } else { (columns, None) };
-        let observed = Observed { random_effects: shown, ..motions.observed(&used) };
-        let path = if at_points && is_path(&observed.places) { path } else { Vec::new() };
-        let observed = Observed { path, ..observed };
+        let mut all = Observed { random_effects: shown, ..motions.observed(&used) };
+        if at_points && is_path(&all.places) {
+            all.path = path;
+        }
         let (kept, apart): (Vec<usize>, Vec<usize>) = (0..used.len()).partition(|&k| used[k].in_fit);
-        let (all, observed) =
-            if apart.is_empty() { (observed.clone(), observed) } else { (observed.clone(), observed.subset(&kept)) };
+        let observed = all.subset(&kept);
         let fields = select_hypotheses(&observed)?;
         Ok(Self {
             motions,
@@ -663,8 +663,8 @@ impl SampledForms {
             let on = waves.each_ref().map(|waves| {
                 let one = |c: usize| {
                     let field = fields.basis.on_grid(&axes, waves.col_as_slice(c));
-                    let along = between.grid.counts[0];
-                    between.nodes.iter().map(|node| field[(node % along, node / along)]).collect::<Vec<f64>>()
+                    let at = |&node: &usize| field[between.grid.indices(node).into()];
+                    between.nodes.iter().map(at).collect::<Vec<f64>>()
                 };
                 let all = (0..count).into_par_iter().flat_map_iter(one).collect();
                 DMatrix::from_vec(between.nodes.len(), count, all)
@@ -1063,13 +1063,10 @@ impl Motions {
 
     /// Returns the observations of the used points, with the motions as fixed effects.
     pub(super) fn observed(&self, used: &[&Deviation]) -> Observed {
-        Observed {
-            places: used.iter().map(|d| [d.point.x, d.point.y]).collect(),
-            deviations_mm: used.iter().map(|d| d.deviation_mm).collect(),
-            fixed_effects: self.rows(used.iter().map(|d| (d.point, d.normal))),
-            random_effects: DMatrix::zeros(used.len(), 0),
-            path: Vec::new(),
-        }
+        let places = used.iter().map(|d| [d.point.x, d.point.y]).collect();
+        let deviations_mm = used.iter().map(|d| d.deviation_mm).collect();
+        let fixed_effects = self.rows(used.iter().map(|d| (d.point, d.normal)));
+        Observed { fixed_effects, ..Observed::without_effects(places, deviations_mm) }
     }
 
     /// Returns the effects of machine and datum on all points together, about their centroid.

@@ -20,7 +20,7 @@ const FARTHEST: f64 = 2.5;
 /// Nodes of a grid, each between touched places.
 pub(super) struct IntermediateNodes {
     pub(super) grid: BasisGrid,
-    /// Index of each node on the grid, with x as the fastest.
+    /// Index of each node on the grid.
     pub(super) nodes: Vec<usize>,
     /// Indices of three touched places near each node, and their weights.
     corners: Vec<([usize; 3], [f64; 3])>,
@@ -44,18 +44,14 @@ impl IntermediateNodes {
         let corner_mm =
             [0, 1].map(|axis: usize| 0.5 * (low[axis] + high[axis] - spacing_mm * (counts[axis] - 1) as f64));
         let grid = BasisGrid { corner_mm, spacing_mm, counts };
-        let at = |node: &usize| {
-            let [i, j] = [node % counts[0], node / counts[0]];
-            [(i, 0), (j, 1)].map(|(k, axis): (usize, usize)| corner_mm[axis] + spacing_mm * k as f64)
-        };
         let tree = Nearest::of(places.iter().map(|&[x, y]| Point::new(x, y, 0.0)));
-        let beside = |node: usize| Some((node, beside(at(&node), &places, &tree, FARTHEST * distance_mm)?));
+        let beside = |node: usize| Some((node, beside(grid.place(node), &places, &tree, FARTHEST * distance_mm)?));
         let (nodes, corners): (Vec<usize>, Vec<_>) = (0..counts[0] * counts[1]).filter_map(beside).unzip();
         if nodes.is_empty() {
             return None;
         }
         let degree = (0..MOST_DEGREE).take_while(|degree| 3 * (degree + 2) * (degree + 3) / 2 <= places.len()).count();
-        let at_nodes: Vec<[f64; 2]> = nodes.iter().map(at).collect();
+        let at_nodes: Vec<[f64; 2]> = nodes.iter().map(|&node| grid.place(node)).collect();
         let terms = [&places, &at_nodes].map(|places| polynomials(places, [low, high], degree));
         Some(Self { grid, nodes, corners, terms })
     }
@@ -134,9 +130,7 @@ mod tests {
         let tilted = DMatrix::from_fn(96, 2, |r, c| [1.0, 0.3 * places[r][0] - 0.7 * places[r][1]][c]);
         let rows = between.rows(&tilted);
         for (r, node) in between.nodes.iter().enumerate() {
-            let [i, j] = [node % between.grid.counts[0], node / between.grid.counts[0]];
-            let [x, y] =
-                [(i, 0), (j, 1)].map(|(k, axis)| between.grid.corner_mm[axis] + between.grid.spacing_mm * k as f64);
+            let [x, y] = between.grid.place(*node);
             assert!((rows[(r, 0)] - 1.0).abs() < 1e-12 && (rows[(r, 1)] - 0.3 * x + 0.7 * y).abs() < 1e-9);
         }
     }
@@ -148,9 +142,8 @@ mod tests {
         let bent = |x: f64, y: f64| (0.03 * x).sin() + 1e-3 * x * y + (0.02 * y).cos();
         let rows = between.rows(&DMatrix::from_fn(400, 1, |r, _| bent(places[r][0], places[r][1])));
         let off = between.nodes.iter().enumerate().map(|(r, node)| {
-            let [i, j] = [node % between.grid.counts[0], node / between.grid.counts[0]];
-            let at = |k: usize, axis: usize| between.grid.corner_mm[axis] + between.grid.spacing_mm * k as f64;
-            (rows[(r, 0)] - bent(at(i, 0), at(j, 1))).abs()
+            let [x, y] = between.grid.place(*node);
+            (rows[(r, 0)] - bent(x, y)).abs()
         });
         // Linear interpolation between two places would be wrong by 4^2 / 8 * 0.03^2, about 2e-3.
         let most = off.fold(0.0, f64::max);
@@ -162,12 +155,7 @@ mod tests {
         let all = (0..900).map(|k| [2.0 * f64::from(k % 30), 2.0 * f64::from(k / 30)]);
         let places: Vec<[f64; 2]> = all.filter(|[x, y]| *x < 30.0 || *y < 30.0).collect();
         let between = over(&places).unwrap();
-        let inside = between.nodes.iter().filter(|node| {
-            let [i, j] = [*node % between.grid.counts[0], *node / between.grid.counts[0]];
-            let [x, y] =
-                [(i, 0), (j, 1)].map(|(k, axis)| between.grid.corner_mm[axis] + between.grid.spacing_mm * k as f64);
-            x > 36.0 && y > 36.0
-        });
+        let inside = between.nodes.iter().map(|&node| between.grid.place(node)).filter(|[x, y]| *x > 36.0 && *y > 36.0);
         assert_eq!(inside.count(), 0);
         assert!(over(&[[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [1.0, 0.0]]).is_none());
     }

@@ -640,24 +640,23 @@ mod tests {
         assert!((off[0] - 1.0).abs() < 0.3 && (off[1] - 1.0).abs() < 0.25 && (off[2] - 1.0).abs() < 0.12, "{off:?}");
     }
 
-    #[test]
-    fn a_drift_along_the_path_is_found_again_and_none_is_seen_where_there_is_none() {
+    /// Returns observations of points that are measured row by row, back and forth.
+    fn in_rows(hyperparameters: Hyperparameters, seed: u64) -> Observed {
         let at = |k: usize| {
             [if (k / 30).is_multiple_of(2) { k % 30 } else { 29 - k % 30 }, k / 30].map(|at| 3.5 * at as f64)
         };
+        drawn(hyperparameters, (0..540).map(at).collect(), (0..540).map(f64::from).collect(), seed)
+    }
+
+    #[test]
+    fn a_drift_along_the_path_is_found_again_and_none_is_seen_where_there_is_none() {
         for drift in [0.0, 0.7, 0.9] {
             let planted = Hyperparameters { noise_autocorrelation: drift, ..PLANTED };
             // A strong drift leaves few independent touches, so the evidence for it varies by chance: the test uses the
             // median.
             const PARTS: u64 = 5;
-            let path: Vec<f64> = (0..540).map(f64::from).collect();
-            let told = |seed| {
-                Hyperparameters::estimate(
-                    &drawn(planted, (0..540).map(at).collect(), path.clone(), seed),
-                    Some(&Prior::for_size(102.0)),
-                )
-                .unwrap()
-            };
+            let told =
+                |seed| Hyperparameters::estimate(&in_rows(planted, seed), Some(&Prior::for_size(102.0))).unwrap();
             let all: Vec<Hyperparameters> = (1..=PARTS).map(told).collect();
             let median = |of: &dyn Fn(&Hyperparameters) -> f64| {
                 let mut values: Vec<f64> = all.iter().map(of).collect();
@@ -683,15 +682,7 @@ mod tests {
     fn a_strong_drift_is_told_or_is_form() {
         let planted = Hyperparameters { noise_autocorrelation: 0.9, ..PLANTED };
         for seed in 1..=5 {
-            let path: Vec<f64> = (0..540).map(f64::from).collect();
-            let at = |k: usize| {
-                [if (k / 30).is_multiple_of(2) { k % 30 } else { 29 - k % 30 }, k / 30].map(|at| 3.5 * at as f64)
-            };
-            let told = Hyperparameters::estimate(
-                &drawn(planted, (0..540).map(at).collect(), path, seed),
-                Some(&Prior::for_size(102.0)),
-            );
-            let told = told.unwrap();
+            let told = Hyperparameters::estimate(&in_rows(planted, seed), Some(&Prior::for_size(102.0))).unwrap();
             println!("seed {seed}: drift {:.2}, scatter {:.2e} mm", told.noise_autocorrelation, told.noise_sigma_mm);
             assert!(
                 (told.noise_autocorrelation - 0.9).abs() < 0.2 || told.noise_sigma_mm < 0.7 * planted.noise_sigma_mm,
