@@ -49,11 +49,11 @@ GUARDS = {
     "an answer of an older connection is turned away": (
         "src/device/modbus/link.rs", "        if stale {\n", "        if stale && false {\n"),
     "nothing may wait when a request begins": (
-        "src/device/modbus/link.rs", "if self.inner.waiting(cx)? > 0 {", "if self.inner.waiting(cx)? > usize::MAX - 1 {"),
+        "src/device/modbus/link.rs", "if self.inner.waiting_bytes(cx)? > 0 {", "if self.inner.waiting_bytes(cx)? > usize::MAX - 1 {"),
     "an answer has as many registers as were asked": (
         "src/device/modbus/link.rs", "if words.len() == usize::from(*count) =>", "if !words.is_empty() =>"),
     "a connection is given up after an error": (
-        "src/device/modbus/link.rs", "        if !matches!(fault, LinkFault::Exception(_)) {\n            self.give_up();", "        if false {\n            self.give_up();"),
+        "src/device/modbus/link.rs", "        if !matches!(fault, LinkFault::Exception(_)) {\n            self.drop_connection();", "        if false {\n            self.drop_connection();"),
     "payloads in force are compared before a job": (
         "src/device/modbus/mod.rs", "            self.compare_slot(kind).await?;\n", "            let _ = kind;\n"),
     "what was seen to begin has begun, whatever the machine says": (
@@ -69,10 +69,10 @@ GUARDS = {
         "src/device/ippdme/session.rs", "if response.tag == pending.tag {", "if response.tag == pending.tag || matches!(response.tag, Tag::Command(_)) {",
         "device", "data_of_a_command_that_was_never_given"),
     "an I++ job is held between two targets": (
-        "src/device/ippdme/work.rs", "if self.wished() != Wish::GoOn {\n                    break 'job;", "if false && self.wished() != Wish::GoOn {\n                    break 'job;",
+        "src/device/ippdme/work.rs", "if self.current_request() != JobRequest::Continue {\n                    break 'job;", "if false && self.current_request() != JobRequest::Continue {\n                    break 'job;",
         "device", "a_hold_retracts_and_a_resume"),
     "an I++ job is held between two rows": (
-        "src/device/ippdme/work.rs", "if self.wished() != Wish::GoOn {\n                    break;", "if false && self.wished() != Wish::GoOn {\n                    break;",
+        "src/device/ippdme/work.rs", "if self.current_request() != JobRequest::Continue {\n                    break;", "if false && self.current_request() != JobRequest::Continue {\n                    break;",
         "device", "a_hold_in_a_scan"),
     "the probe travels at the clearance": (
         "src/device/ippdme/work.rs", "        self.rise(work).await?;\n        let [x, y, z]", "        let [x, y, z]"),
@@ -83,11 +83,11 @@ GUARDS = {
         "src/device/linuxcnc/controller.rs", "|seen| seen.program.as_deref() == Some(path) && seen.line == 0)", "|_| true)",
         "linuxcnc", "an_open_that_is_acknowledged_and_not_done"),
     "a lost linuxcncrsh is told as lost": (
-        "src/device/linuxcnc/controller.rs", "self.lost.clone().unwrap_or_else(never)", "self.lost.clone().filter(|_| false).unwrap_or_else(never)"),
+        "src/device/linuxcnc/controller.rs", "self.link_error.clone().unwrap_or_else(never)", "self.link_error.clone().filter(|_| false).unwrap_or_else(never)"),
     "a program writes its end behind its motion": (
         "src/device/linuxcnc/program.rs", "{again}M66 P0 L0\\n{}M2", "{again}M67\\n{}M2"),
     "a START of LinuxCNC that was not seen is fenced off": (
-        "src/device/linuxcnc/machine/reconciling.rs", "        self.claim_again().await?;\n        let fenced", "        let fenced",
+        "src/device/linuxcnc/machine/reconciling.rs", "        self.take_control().await?;\n        let fenced", "        let fenced",
         "linuxcnc", "a_start_that_is_acknowledged_and_does_not_show"),
     "what is prepared is looked at before a START": (
         "src/device/linuxcnc/machine.rs", "if !is_prepared || status.state != State::Prepared || seen.mode", "if seen.mode",

@@ -64,6 +64,8 @@ const NOTHING: f64 = 1e-4;
 const NOT_APART: f64 = 1e-5;
 /// Number of rows that are processed at a time.
 const ROWS: usize = 1024;
+/// Number of blocks of rows whose sums are in memory at a time.
+const BLOCKS_AT_ONCE: usize = 32;
 
 /// Correlation of the noise from one point to the next, and anisotropy of the field.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -214,6 +216,8 @@ impl FieldHypotheses {
     }
 
     /// Sums matrices of the given shapes over blocks of points, in parallel.
+    ///
+    /// The blocks are added in their order, so that the sum has the same bits on any number of threads.
     fn sum_over_blocks<const N: usize>(
         &self,
         shapes: [(usize, usize); N],
@@ -221,12 +225,12 @@ impl FieldHypotheses {
     ) -> [Mat<f64>; N] {
         let n = self.places.len();
         let firsts: Vec<usize> = (0..n).step_by(ROWS).collect();
-        let zero = || shapes.map(|(rows, columns)| Mat::zeros(rows, columns));
-        let add = |mut a: [Mat<f64>; N], b: [Mat<f64>; N]| {
-            a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
-            a
-        };
-        firsts.par_iter().map(|&first| of(first..(first + ROWS).min(n))).reduce(zero, add)
+        let mut sums = shapes.map(|(rows, columns)| Mat::zeros(rows, columns));
+        for some in firsts.chunks(BLOCKS_AT_ONCE) {
+            let blocks: Vec<_> = some.par_iter().map(|&first| of(first..(first + ROWS).min(n))).collect();
+            blocks.into_iter().for_each(|block| sums.iter_mut().zip(block).for_each(|(sum, block)| *sum += block));
+        }
+        sums
     }
 
     /// Computes W phi for the given points.

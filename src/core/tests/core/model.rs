@@ -537,3 +537,23 @@ fn too_few_points_have_the_upper_ends_of_a_form_that_is_all_of_what_was_found() 
     }
     assert!(held + missed(2) >= parts, "{held} of {parts}");
 }
+
+#[test]
+fn figures_are_the_same_on_any_number_of_threads() {
+    let form = FormError::with_rms(&mut regrind_sim::rng(7), 30.0, 1e-3);
+    let placement = Placement::new([1.0, -2.0, 0.5], [0.3, -0.2, 0.5]);
+    // Enough points that the sums are made of several blocks.
+    let centres = centres(&FreeForm::default(), &form, [[-48.0, -28.0], [48.0, 28.0]], [80, 65]);
+    let options = Options { start: Start::Pose(pose(&placement)), ..Options::new(RADIUS_MM) };
+    let found = register(&free_form(409, 249), &points(&placed(&placement, &centres)), &options).unwrap();
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| Form::estimate(&found, &ModelInputs::default()).unwrap())
+    };
+    let bits = |form: &Form| {
+        let FormFigures { rms, pv, pv_most_points } = form.figures;
+        [rms, pv, pv_most_points].map(|of| [of.low_mm, of.median_mm, of.high_mm].map(f64::to_bits))
+    };
+    let [one, three] = [1, 3].map(|threads| bits(&on(threads)));
+    assert_eq!(one, three);
+}
