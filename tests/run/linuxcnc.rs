@@ -60,7 +60,7 @@ fn recipe(home: &Path, [pv_um, rms_um]: [f64; 2]) -> String {
         ("rows = 30", "rows = 15"),
         ("accuracy_nm = 0.5", "spacing_mm = 0.5"),
         ("cutoff_mm = 5.0", "cutoff_mm = 6.0"),
-        ("start = \"search\"", "start = \"fixture\"\nhold = [\"x\", \"y\", \"rz\"]"),
+        ("start = \"search\"", "start = \"fixture\"\nlock = [\"x\", \"y\", \"rz\"]"),
         ("pv_um = 7.0", &limits.0),
         ("rms_um = 1.0\n", &format!("{}\n", limits.1)),
         ("feed_mm_min = 1000.0", "feed_mm_min = 20000.0\nchord_error_um = 0.5"),

@@ -46,7 +46,7 @@ impl Shop {
         let points = format!("points = {POINTS}");
         let recipe = changed(
             "recipes/telescope-panel.toml",
-            &[("hold = [\"x\", \"y\", \"rz\"]", hold), ("points = 1100", &points)],
+            &[("lock = [\"x\", \"y\", \"rz\"]", hold), ("points = 1100", &points)],
         );
         let (recipe_path, cell_path) = (home.path().join("mirror.toml"), home.path().join("config/cell.toml"));
         fs::write(&recipe_path, recipe).unwrap();
@@ -156,7 +156,7 @@ fn a_real_mirror_is_measured_and_judged_and_its_correction_refused_in_words() {
 #[ignore = "needs real measurements: REGRIND_DATA"]
 fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confirmed() {
     let data = data("lat-freeform-mirror");
-    let shop = Shop::new(&data, "hold = [\"x\", \"y\", \"rz\"]");
+    let shop = Shop::new(&data, "lock = [\"x\", \"y\", \"rz\"]");
     let mut program = shop.run();
     program.until("the plan", |_| shop.handed_over("cmm/out", ""));
     shop.deliver(&data);

@@ -55,7 +55,7 @@ pub fn setting(wanted: Wanted) -> &'static Setting {
                 ("half_y_mm = 31.0", "half_y_mm = 11.0"),
                 ("spacing_mm = 1.0", "spacing_mm = 2.0"),
                 ("track_mm = 0.24", "track_mm = 6.0\nchord_error_um = 10.0"),
-                ("start = \"search\"", "start = \"fixture\"\nhold = [\"x\", \"y\", \"rz\"]"),
+                ("start = \"search\"", "start = \"fixture\"\nlock = [\"x\", \"y\", \"rz\"]"),
                 ("pv_um = 7.0", pv_um),
                 ("rms_um = 1.0", rms_um),
                 ("on_stall = \"stop\"", "on_stall = \"hold\""),
