@@ -428,7 +428,7 @@ const BAD_RECIPES: &[BadText] = &[
     (
         RECIPE,
         "start = \"search\"",
-        "start = \"fixture\"\nhold = [\"x\", \"u\"]",
+        "start = \"fixture\"\nlock = [\"x\", \"u\"]",
         "registration.lock[1]",
         "\"u\"",
         "\"rz\"",
