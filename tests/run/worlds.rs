@@ -33,7 +33,7 @@ use tokio::sync::mpsc;
 /// Job number of the part's run.
 pub const JOB: u32 = 7;
 /// Upper bound of the duration of a run, even on a loaded computer.
-const PATIENCE: Duration = Duration::from_secs(300);
+const PATIENCE: Duration = Duration::from_secs(3600);
 /// Seconds of machine time per second.
 const SPEED: f64 = 50_000.0;
 
