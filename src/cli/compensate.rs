@@ -47,7 +47,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "UM", default_value_t = 0.1, value_parser = finite_above_zero)]
     tolerance_um: f64,
     /// The largest correction that is applied, in um: a map in another unit is refused by it
-    #[arg(long, value_name = "UM", default_value_t = 500.0, value_parser = finite_above_zero)]
+    #[arg(long, alias = "largest-correction-um", value_name = "UM", default_value_t = 500.0, value_parser = finite_above_zero)]
     max_correction_um: f64,
     /// Print JSON instead of a summary
     #[arg(long)]

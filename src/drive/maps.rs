@@ -30,8 +30,8 @@ pub(super) fn save_figures(
     let options = FormOptions { aperture: task.nominal.outline().cloned(), ..FormOptions::default() };
     let made = figures(&readings(found), &options);
     // Slopes of the form and of the map are compared, so both use the same length. The places of the form determine it.
-    let reported_mm = form.and_then(|form| form.slope).map(|slope| slope.integration_mm);
-    let integration_mm = reported_mm.unwrap_or(INTEGRATION * task.map.cutoff_mm);
+    let slope_length_mm = form.and_then(|form| form.slope).map(|slope| slope.integration_mm);
+    let integration_mm = slope_length_mm.unwrap_or(INTEGRATION * task.map.cutoff_mm);
     let slopes = map.map(|map| slope(&map.grid, &map.values_mm, &map.valid, integration_mm));
     let slopes = slopes.as_ref().map(Result::as_ref);
     write_figures(&files.place("figures.json"), (made.as_ref(), slopes, form), &taken_out(task), task.simulation)

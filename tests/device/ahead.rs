@@ -70,9 +70,9 @@ async fn half_done(serving: &Serving, settings: ModbusSettings, plan: &Plan) -> 
 }
 
 /// Polls this number of times, and takes one step of reading ahead after each.
-async fn poll(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16, reads_since_select: usize) -> Vec<PreliminaryPoints> {
+async fn poll(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16, polls: usize) -> Vec<PreliminaryPoints> {
     let mut told = Vec::new();
-    for _ in 0..reads_since_select {
+    for _ in 0..polls {
         cmm.status().await.unwrap();
         told.extend(cmm.read_ahead(job_of(plan, cycle), &Interrupt::new()).await);
     }

@@ -332,6 +332,8 @@ fn a_foreign_map_is_used_where_it_is_valid_and_within_reason() {
     let said = bench.compensate(&[]).unwrap_err();
     assert!(said.contains("5000") && said.contains("--max-correction-um"), "{said}");
     bench.compensate(&["--max-correction-um", "6000"]).unwrap();
+    // The name of earlier versions.
+    bench.compensate(&["--largest-correction-um", "6000"]).unwrap();
     map(&|_| "0.004,0".into());
     assert!(bench.compensate(&[]).unwrap_err().contains("valid"));
     map(&|_| "0.004,x".into());
