@@ -90,7 +90,7 @@ impl Cell {
         let seconds = self.now.saturating_sub(since).as_secs();
         self.raise(
             AlarmId::FailsAgain,
-            &format!("{device}, {phase}, {failures} times in {seconds} s, the last time: {why}"),
+            &format!("{device}, {phase}, {failures} times in {seconds} s, last reason: {why}"),
         );
     }
 
@@ -219,7 +219,7 @@ impl Cell {
             Mismatch::Unreachable(message) => (AlarmId::Unreachable, message.as_str()),
             Mismatch::WrongDevice(message) => (AlarmId::WrongDevice, message.as_str()),
             Mismatch::WordOrder(message) => (AlarmId::WordOrder, message.as_str()),
-            Mismatch::Inches => (AlarmId::Inches, "the machine says so of itself"),
+            Mismatch::Inches => (AlarmId::Inches, "the machine reports this unit"),
             Mismatch::Owned(message) => (AlarmId::Owned, message.as_str()),
             Mismatch::AtAnotherJob(message) => {
                 let known = self.know(device);
@@ -346,7 +346,7 @@ impl Cell {
     fn start_machine(&mut self, device: Device) {
         let other = device.other();
         if !self.knows(other).clear {
-            self.raise(AlarmId::NotClear, &format!("{other}, no longer, before the {device} was started"));
+            self.raise(AlarmId::NotClear, &format!("{other}, no longer clear before the START of the {device}"));
             return self.go(Held(Phase::of(device, JobStep::Send)));
         }
         let known = self.know(device);
@@ -440,7 +440,7 @@ impl Cell {
                 let least = 100.0 * self.plan.gates.least_found;
                 Some((
                     AlarmId::Coverage,
-                    format!("{found} of {targets} points were found, and {least:.0} % are needed"),
+                    format!("{found} of {targets} points were found, at least {least:.0} % are required"),
                 ))
             }
             Gate::Passed => None,
@@ -460,7 +460,7 @@ impl Cell {
         if radius_error_mm.abs() <= most {
             return self.advance(Measure(JobStep::Acknowledge));
         }
-        let case = format!("it is off by {}, and {} are allowed", um(radius_error_mm), um(most));
+        let case = format!("the difference is {}, limit {}", um(radius_error_mm), um(most));
         self.raise(AlarmId::ProbeRadius, &case);
         self.advance(Measure(JobStep::Discard));
     }
@@ -475,16 +475,16 @@ impl Cell {
         let gates = self.plan.gates;
         let (shift, turn) = (figures.shift_mm, figures.turn_rad.to_degrees());
         if !figures.are_sound() {
-            self.useless(AlarmId::RegistrationFailed, "a figure is not a number, or negative");
+            self.useless(AlarmId::RegistrationFailed, "a figure is negative or not a number");
         } else if figures.touch_on.is_none() && figures.coverage < gates.min_coverage {
             let (found, least) = (100.0 * figures.coverage, 100.0 * gates.min_coverage);
             self.useless(
                 AlarmId::Coverage,
-                &format!("{found:.0} % of the aperture are covered, and {least:.0} % are needed"),
+                &format!("{found:.0} % of the aperture is covered, at least {least:.0} % is required"),
             );
         } else if shift > gates.most_shift_mm || figures.turn_rad > gates.most_turn_rad {
             let (most, most_turn) = (gates.most_shift_mm, gates.most_turn_rad.to_degrees());
-            let case = format!("{shift:.3} mm of at most {most:.3} mm, {turn:.2} of at most {most_turn:.2} degrees");
+            let case = format!("shift {shift:.3} mm, limit {most:.3} mm; turn {turn:.2}°, limit {most_turn:.2}°");
             self.useless(AlarmId::PartMisplaced, &case);
         } else if figures.touch_on.is_some() {
             // More points of the same measurement follow. A partial measurement is not judged.
@@ -577,7 +577,7 @@ impl Cell {
             CompensationRefusal::WeakDirections(directions) => {
                 let case = directions.join(", ");
                 self.raise(AlarmId::WeakDirections, &case);
-                self.dispose(self.plan.on_refusal, &format!("no correction is made: {case}"));
+                self.dispose(self.plan.on_refusal, &format!("no correction is computed: {case}"));
             }
             CompensationRefusal::Failed(message) => {
                 self.raise(AlarmId::CompensationFailed, message);
@@ -632,7 +632,7 @@ impl Cell {
         if std::mem::replace(&mut known.astray, true) {
             return;
         }
-        let what = phase.moving().map_or(String::new(), |moves| format!(", while the {moves} is at its job"));
+        let what = phase.moving().map_or(String::new(), |moves| format!(", while the {moves} runs its job"));
         self.raise(AlarmId::MovesUnasked, &format!("{device}{what}"));
         self.push(Command::HoldMachine { device });
         match self.state {
@@ -660,7 +660,7 @@ impl Cell {
         if matches!(self.state, Held(_)) {
             return;
         }
-        let beside = if moving == device { String::new() } else { format!(", while the {moving} is at its job") };
+        let beside = if moving == device { String::new() } else { format!(", while the {moving} runs its job") };
         self.raise(AlarmId::NotAutomatic, &format!("{device}, {message}{beside}"));
         match self.state {
             Execute(_) | Unholding(_) | Unsuspending(_) => self.hold(phase),
@@ -720,7 +720,7 @@ impl Cell {
         if let Some((_, JobStep::Run)) = phase.job()
             && let Some(device) = Device::BOTH.into_iter().find(|device| self.knows(*device).manual)
         {
-            return Err(format!("the {device} is in manual mode; turn its key to automatic, resume then"));
+            return Err(format!("the {device} is in manual mode; turn its key to automatic, then resume"));
         }
         let absent: Vec<_> = Device::BOTH.into_iter().filter(|device| !self.knows(*device).ready).collect();
         if !absent.is_empty() && self.cycle == 0 {
@@ -734,10 +734,10 @@ impl Cell {
             Some(_) if self.state == Starting => {}
             Some(device) => {
                 let what = match self.knows(*device).boot_id {
-                    Some(_) => "is not idle: bring it there at its panel",
+                    Some(_) => "is not idle: end or clear its job at its panel",
                     None => "is not connected",
                 };
-                return Err(format!("the {device} {what}; it is being connected again, resume then"));
+                return Err(format!("the {device} {what}; the cell connects it again, then resume"));
             }
         }
         Ok(())
@@ -756,7 +756,7 @@ impl Cell {
         if !self.raised.contains_key(&AlarmId::LinkLost)
             && let Some(Cause::Link(device)) = self.causes.iter().find(|cause| matches!(cause, Cause::Link(_))).copied()
         {
-            self.raise(AlarmId::LinkLost, &format!("{device}, it is not back"));
+            self.raise(AlarmId::LinkLost, &format!("{device}, it is still lost"));
         }
         match phase.job() {
             Some((_, JobStep::Run)) if !self.causes.is_empty() => self.go(Suspended(phase)),
@@ -947,7 +947,7 @@ impl Cell {
             Held(_) | Suspended(_) if at_job => {}
             // It had no job, moved, and was ordered to hold.
             _ if !at_job && self.raised.contains_key(&AlarmId::MovesUnasked) => {}
-            state => return Err(format!("the {device} has no job that could be held in the state {state}")),
+            state => return Err(format!("the {device} has no job to hold in the state {state}")),
         }
         Ok(())
     }
@@ -964,7 +964,7 @@ impl Cell {
             }
             Suspended(_) if at_run => self.suspend(run),
             Execute(_) | Holding(_) | Suspending(_) if at_run => {}
-            state => return Err(format!("the {device} has no job that could be resumed in the state {state}")),
+            state => return Err(format!("the {device} has no job to resume in the state {state}")),
         }
         Ok(())
     }
@@ -1006,7 +1006,7 @@ impl Cell {
             // A machine that has forgotten its job gives this answer too. A second start would grind again what the
             // first one ground.
             (Reconciliation::NotStarted, _) if self.begun[device as usize] => {
-                self.unknown(device, "it says that this job never began, and it was seen at it");
+                self.unknown(device, "it reports that this job never began, but the cell saw it begin");
             }
             (Reconciliation::NotStarted, _) => {
                 self.not_started(device);
@@ -1015,7 +1015,7 @@ impl Cell {
                     self.raise_fails_again(
                         device,
                         Phase::of(device, JobStep::Start),
-                        "it says that it was not started",
+                        "it reports that it was not started",
                     );
                     return self.go(Held(next));
                 }
@@ -1039,7 +1039,7 @@ impl Cell {
     /// Handles a restart of this program. The cell then knows only that the machines may still run the job of this run.
     pub(super) fn restarted(&mut self, actor: &str) {
         if self.state == Completing {
-            self.raise(AlarmId::NotClear, "not both were seen clear before the program ended");
+            self.raise(AlarmId::NotClear, "the program ended before both machines were confirmed clear");
             return self.complete();
         }
         for known in &mut self.known {
@@ -1158,12 +1158,12 @@ impl Cell {
         }
         match self.state {
             Starting => {
-                self.raise(AlarmId::Unreachable, "not both were connected in time");
-                self.stop("the machines were not connected in time", false);
+                self.raise(AlarmId::Unreachable, "not both machines connected in time");
+                self.stop("not both machines connected in time", false);
             }
             Held(_) | Execute(Load) => {
                 self.raise(AlarmId::WaitedTooLong, "");
-                self.stop("nobody answered in time", false);
+                self.stop("no person answered in time", false);
             }
             Execute(phase) | Holding(phase) | Suspending(phase) | Unholding(phase) | Unsuspending(phase) => {
                 self.phase_is_due(phase);
@@ -1174,12 +1174,12 @@ impl Cell {
             }
             Stopping => {
                 let names = self.stopping.map_or("no machine".to_owned(), |device| device.to_string());
-                self.raise(AlarmId::StopNotConfirmed, &format!("{names}, in the time that it has for a stop"));
+                self.raise(AlarmId::StopNotConfirmed, &format!("{names}, within its time limit for a stop"));
                 self.abort("the orderly stop was not confirmed in time");
             }
             Aborting => self.abort_is_due(),
             Completing => {
-                self.raise(AlarmId::NotClear, "not both were seen clear in time");
+                self.raise(AlarmId::NotClear, "not both machines were confirmed clear in time");
                 self.complete();
             }
             Idle | Stopped | Aborted | Complete => {}
@@ -1196,11 +1196,11 @@ impl Cell {
             }
             (Some((device, JobStep::Run)), Execute(_)) if self.is_to_be_told(device) => self.makes_no_progress(device),
             (Some((device, JobStep::Run)), _) => {
-                self.raise(AlarmId::NoAnswer, &format!("{device}, no sign of its job"));
+                self.raise(AlarmId::NoAnswer, &format!("{device}, no report of its job"));
                 self.hold(phase);
             }
             (Some((device, JobStep::Start)), _) => self.reconcile(device),
-            (Some((device, JobStep::Reconcile)), _) => self.unknown(device, "it was not found out in time"),
+            (Some((device, JobStep::Reconcile)), _) => self.unknown(device, "it gave no answer in time"),
             _ if matches!(phase, Register | Compensate) => {
                 self.raise(AlarmId::ComputationLate, phase.name());
                 self.go(Held(phase));
@@ -1223,7 +1223,7 @@ impl Cell {
         let left = self.progress_limit(device);
         self.raise(
             AlarmId::ProgressStands,
-            &format!("{device}, for {} s; after {} s more it is held", told.as_secs(), left.as_secs()),
+            &format!("{device}, for {} s; the cell holds it after {} s more", told.as_secs(), left.as_secs()),
         );
         self.deadline = Some(self.now.saturating_add(left));
     }
@@ -1231,7 +1231,7 @@ impl Cell {
     fn abort_is_due(&mut self) {
         let unconfirmed = self.met_and_not_standing();
         if unconfirmed.is_empty() {
-            self.raise(AlarmId::NotClear, "not both were seen clear in time");
+            self.raise(AlarmId::NotClear, "not both machines were confirmed clear in time");
             return self.aborted(true);
         }
         if self.repeated {

@@ -489,11 +489,13 @@ impl ParameterTold {
     /// Formats the estimate for people.
     pub fn in_words(&self) -> String {
         let Self { name, unit, off, expanded, taken, told, removes_rms_um } = self;
-        let found = format!("{name}: off by {off:.2} \u{b1} {expanded:.2} {unit}");
+        let found = format!("{name}: error {off:.2} \u{b1} {expanded:.2} {unit}");
         if *taken == 0.0 && *told == 0.0 {
-            return format!("{found}, no clear error: left to the map");
+            return format!("{found}, not significant: the map corrects it");
         }
-        format!("{found}, {taken:.2} {unit} taken back ({told:.2} in all), which removes {removes_rms_um:.2} um rms")
+        format!(
+            "{found}, {taken:.2} {unit} compensated ({told:.2} in total), which removes {removes_rms_um:.2} \u{b5}m RMS"
+        )
     }
 }
 
@@ -556,8 +558,8 @@ impl fmt::Display for Asked {
             Self::Abort => "to abort",
             Self::Clear => "to be cleared",
             Self::Collect => "to give its result",
-            Self::Acknowledge => "to forget its result",
-            Self::Discard => "to forget a job at which it still is",
+            Self::Acknowledge => "to discard its result",
+            Self::Discard => "to discard the result of its unfinished job",
         })
     }
 }
@@ -647,12 +649,12 @@ impl Event {
     /// Describes the event for a person when it does not fit the state.
     pub(super) fn in_words(&self) -> String {
         match self {
-            Self::LoadConfirmed { .. } => "the word that the part is loaded".to_owned(),
-            Self::ClearConfirmed { device, .. } => format!("the word that the {device} is clear of the part"),
-            Self::DeclaredOver { device, .. } => format!("the word that the job of the {device} is over"),
+            Self::LoadConfirmed { .. } => "the confirmation that the part is loaded".to_owned(),
+            Self::ClearConfirmed { device, .. } => format!("the confirmation that the {device} is clear of the part"),
+            Self::DeclaredOver { device, .. } => format!("the confirmation that the job of the {device} is over"),
             event if event.is_order() => format!("the order to {}", event.name()),
             event => match event.device() {
-                Some(device) => format!("what the {device} tells"),
+                Some(device) => format!("a report of the {device}"),
                 None => "a result".to_owned(),
             },
         }

@@ -103,9 +103,9 @@ impl Compared {
     pub fn within_in_words(&self) -> Option<String> {
         let [least, most] = [Interval::PROBABILITIES[0], Interval::PROBABILITIES[Interval::COUNT - 1]];
         self.within.map(|within| match within {
-            _ if within <= least => format!("within it with less than {}", percent(least)),
-            _ if within >= most => format!("within it with more than {}", percent(most)),
-            _ => format!("within it with {}", percent(within)),
+            _ if within <= least => format!("P(in tolerance) < {}", percent(least)),
+            _ if within >= most => format!("P(in tolerance) > {}", percent(most)),
+            _ => format!("P(in tolerance) = {}", percent(within)),
         })
     }
 }
@@ -153,9 +153,9 @@ impl Tolerance {
         let beyond: Vec<String> = beyond
             .into_iter()
             .filter(|(_, with_mm, limit_mm)| with_mm > limit_mm)
-            .map(|(name, with_mm, limit_mm)| format!("{name} {} of {}", um(with_mm), um(limit_mm)))
+            .map(|(name, with_mm, limit_mm)| format!("{name} {}, limit {}", um(with_mm), um(limit_mm)))
             .collect();
-        (!beyond.is_empty()).then(|| format!("{}; with what was left out: {}", left_out.places, beyond.join(", ")))
+        (!beyond.is_empty()).then(|| format!("{}; with the outliers: {}", left_out.places, beyond.join("; ")))
     }
 }
 
@@ -166,7 +166,7 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
     let conformity = conformity(plan, now);
     if conformity == Conformity::Within {
         if let Some(beyond) = plan.tolerance.beyond_with_left_out(now) {
-            return tell(Verdict::LeftOut, format!("{beyond}; without what was left out: {figures}"));
+            return tell(Verdict::LeftOut, format!("{beyond}; without the outliers: {figures}"));
         }
         return tell(Verdict::Accept, format!("in tolerance: {figures}"));
     }
@@ -175,7 +175,7 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
         let (removed, budget) = (um(removed), um(plan.removal_budget_mm));
         return tell(
             Verdict::BudgetSpent,
-            format!("{removed} of {budget} have been taken off, no pass is left; {figures}"),
+            format!("removed {removed}, limit {budget}: no further pass is possible; {figures}"),
         );
     }
     if passes >= plan.max_cycles {
@@ -190,18 +190,18 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
     }
     if let Some(before) = before {
         let [[pv, rms], [pv_before, rms_before]] = [now, before].map(|of| judged(plan, of));
-        let was = format!("before: PV {}, RMS {}", um(pv_before), um(rms_before));
+        let was = format!("previous cycle: PV {}, RMS {}", um(pv_before), um(rms_before));
         if pv > WORSE * pv_before || rms > WORSE * rms_before {
-            return tell(Verdict::Diverging, format!("worse than the cycle before: {figures}; {was}"));
+            return tell(Verdict::Diverging, format!("worse than the previous cycle: {figures}; {was}"));
         }
         if has_stalled(plan, before, now) {
             let least = match plan.stall_mm {
-                0.0 => format!("less than the measuring uncertainty or {:.0} %", 100.0 * plan.stall_share),
+                0.0 => format!("the measuring uncertainty or {:.0} %", 100.0 * plan.stall_share),
                 least => {
-                    format!("less than the measuring uncertainty, {:.0} % or {}", 100.0 * plan.stall_share, um(least))
+                    format!("the measuring uncertainty, {:.0} % or {}", 100.0 * plan.stall_share, um(least))
                 }
             };
-            return tell(Verdict::Stalled, format!("improved by {least}: {figures}; {was}"));
+            return tell(Verdict::Stalled, format!("improvement below {least}: {figures}; {was}"));
         }
     }
     go_on(plan, before, now, conformity)
@@ -211,13 +211,13 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
 fn go_on(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: Conformity) -> Judged {
     let (tell, figures) = (|verdict, reason| Judged { verdict, reason }, told(plan, now));
     let undecided = conformity == Conformity::Undecided;
-    let so_far = if undecided { "neither in tolerance nor out of it for certain" } else { "not yet in tolerance" };
+    let so_far = if undecided { "not proven in or out of tolerance" } else { "not yet in tolerance" };
     // Before the first correction nothing is known about the effect of a correction.
     let forecast = now.forecast.filter(|_| before.is_some());
     let Some(forecast) = forecast else { return tell(Verdict::Continue, format!("{so_far}: {figures}")) };
     let (expected, sigma) = (um(forecast.rms_mm), um(forecast.sigma_mm));
-    let floor = forecast.floor_mm.map_or(String::new(), |floor| format!(", no pass can go below {}", um(floor)));
-    let expected = format!("RMS {expected} ± {sigma} is expected of another pass{floor}");
+    let floor = forecast.floor_mm.map_or(String::new(), |floor| format!(", lower bound {}", um(floor)));
+    let expected = format!("expected after another pass: RMS {expected} ± {sigma}{floor}");
     let [_, rms] = plan.tolerance.compare(now);
     // If the found rms exceeds the floor by no more than its uncertainty, another pass cannot improve it.
     let at_floor = forecast.floor_mm.is_some_and(|floor| rms.found_mm <= floor + rms.expanded_mm);
@@ -225,7 +225,7 @@ fn go_on(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: C
         return tell(Verdict::Continue, format!("{so_far}: {figures}; {expected}"));
     }
     let verdict = if undecided { Verdict::Undecided } else { Verdict::Stalled };
-    tell(verdict, format!("no gain is to be expected, and {so_far}: {figures}; {expected}"))
+    tell(verdict, format!("no improvement expected, {so_far}: {figures}; {expected}"))
 }
 
 /// Returns the worse conformity of the two figures.
@@ -257,30 +257,28 @@ pub(super) fn distance(plan: &CellPlan, figures: &Figures) -> f64 {
 /// Describes a cycle that was better than the last one.
 pub(super) fn best_in_words(plan: &CellPlan, cycle: u32, figures: &Figures) -> String {
     let [pv, rms] = judged(plan, figures);
-    format!(
-        "; the best was cycle {cycle} with PV {} and RMS {}: its correction and its map are in cycle-{cycle}",
-        um(pv),
-        um(rms)
-    )
+    format!("; best cycle {cycle}: PV {}, RMS {}; its correction and map are in cycle-{cycle}", um(pv), um(rms))
 }
 
 /// Describes a wrong response. Returns `None` if the response is not wrong.
 fn wrong(response: Response) -> Option<&'static str> {
     match response {
         Response::Expected | Response::Unclear => None,
-        Response::SignFlipped => Some("the part answered to the map the other way round: its sign is wrong"),
-        Response::Mirrored => Some("the part answered as to a mirrored or turned map: an axis points another way"),
-        Response::NoEffect => Some("the part did not answer to the map"),
-        Response::Doubled => Some("the part answered to the map twice: it was applied two times"),
+        Response::SignFlipped => Some("the part responded with the opposite sign: the sign of the map is wrong"),
+        Response::Mirrored => {
+            Some("the part responded as to a mirrored or rotated map: the direction of an axis is wrong")
+        }
+        Response::NoEffect => Some("the part did not respond to the map"),
+        Response::Doubled => Some("the part responded twice as much as expected: the map was applied twice"),
     }
 }
 
 fn told(plan: &CellPlan, now: &Figures) -> String {
     let of = |compared: Compared| {
-        let within = compared.within_in_words().map_or(String::new(), |words| format!(" ({words})"));
+        let within = compared.within_in_words().map_or(String::new(), |words| format!(", {words}"));
         let Compared { name, found_mm, expanded_mm, limit_mm, .. } = compared;
-        let limit = if limit_mm.is_finite() { format!(" of {}", um(limit_mm)) } else { String::new() };
-        format!("{name} {} ± {}{limit}{within}", um(found_mm), um(expanded_mm))
+        let limit = if limit_mm.is_finite() { format!(", limit {}", um(limit_mm)) } else { String::new() };
+        format!("{name}: {} ± {}{limit}{within}", um(found_mm), um(expanded_mm))
     };
     let [pv, rms] = plan.tolerance.compare(now).map(of);
     let Tolerance { with_uncertainty, probability, .. } = plan.tolerance;
@@ -291,14 +289,14 @@ fn told(plan: &CellPlan, now: &Figures) -> String {
             }
             _ => String::new(),
         };
-        format!("{} is asked for{unstated}", percent(probability))
+        format!("{} required{unstated}", percent(probability))
     } else {
-        "without the uncertainty".into()
+        "uncertainty not counted".into()
     };
-    format!("{pv}, {rms}; {counts}")
+    format!("{pv}; {rms}; {counts}")
 }
 
 /// Formats a length in micrometres, for people.
 pub(super) fn um(mm: f64) -> String {
-    format!("{:.2} um", 1e3 * mm)
+    format!("{:.2} µm", 1e3 * mm)
 }

@@ -58,7 +58,7 @@ impl Cell {
             return None;
         }
         let cycle = event.cycle().filter(|cycle| *cycle != self.cycle);
-        cycle.map(|cycle| format!("it belongs to cycle {cycle}, and this is cycle {}", self.cycle))
+        cycle.map(|cycle| format!("it belongs to cycle {cycle}, the current cycle is {}", self.cycle))
     }
 
     /// Applies the transition table. Abort and fault come first, then orders, then interruptions, then the sequence of
@@ -67,7 +67,7 @@ impl Cell {
         match (self.state, event) {
             // The safe sequence.
             (Aborting, Event::Abort { .. } | Event::Fault { .. }) => {}
-            (_, Event::Abort { actor, reason }) => self.abort(&format!("{actor} ordered it{}", because(reason))),
+            (_, Event::Abort { actor, reason }) => self.abort(&format!("{actor} ordered the abort{}", because(reason))),
             (_, Event::Fault { device, code, message }) => {
                 let case = format!("{device}, fault {code}, {message}");
                 self.raise(AlarmId::MachineFault, &case);
@@ -79,7 +79,7 @@ impl Cell {
                 self.seen(*device, false, message);
             }
             (Aborting, Event::ClearUnknown { device }) if self.knows(*device).stands => {
-                self.seen(*device, self.knows(*device).said_clear, "nothing tells whether it is");
+                self.seen(*device, self.knows(*device).said_clear, "no signal shows whether it is clear");
             }
             (Aborting, Event::LinkLost { device, .. } | Event::LinkBack { device, .. }) => {
                 let lost = matches!(event, Event::LinkLost { .. });
@@ -124,7 +124,7 @@ impl Cell {
             }
             (Idle, Event::Restarted { .. }) => {}
             (Stopping, Event::Restarted { .. }) => {
-                self.reason = "the program was started again while the run was being stopped".to_owned();
+                self.reason = "the program was restarted while the run was being stopped".to_owned();
                 self.abort_again();
             }
             (_, Event::Restarted { actor }) => self.restarted(&actor.to_string()),

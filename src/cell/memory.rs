@@ -145,8 +145,8 @@ impl Cell {
     /// confirmed it.
     pub fn in_words(&self) -> String {
         match (self.state, &self.unconfirmed()[..]) {
-            (State::Aborted, [device]) => format!("{}: the {device} has not confirmed that it stands", self.state),
-            (State::Aborted, [_, _]) => format!("{}: neither machine has confirmed that it stands", self.state),
+            (State::Aborted, [device]) => format!("{}: the {device} has not confirmed that it is at rest", self.state),
+            (State::Aborted, [_, _]) => format!("{}: neither machine has confirmed that it is at rest", self.state),
             (state, _) => state.to_string(),
         }
     }

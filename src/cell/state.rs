@@ -286,7 +286,7 @@ impl fmt::Display for State {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match (self.phase(), self.unconfirmed()) {
             (Some(phase), Some(device)) => {
-                write!(f, "{} ({phase}): the {device} has not confirmed that it stands", self.name())
+                write!(f, "{} ({phase}): the {device} has not confirmed that it is at rest", self.name())
             }
             (Some(phase), None) => write!(f, "{} ({phase})", self.name()),
             (None, _) => self.name().fmt(f),

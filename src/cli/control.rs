@@ -220,7 +220,7 @@ fn told(status: &Snapshot, folder: &Path) -> String {
         let _ = writeln!(text, "limits   {}", limits(&tolerance));
         for row in &status.cycles {
             let (CycleRow { cycle, .. }, pv, [pv_um, rms_um]) = (row, pv_name(&tolerance), row.judged_um());
-            let _ = writeln!(text, "cycle {cycle:<2} {pv} {pv_um:.2} um, RMS {rms_um:.3} um");
+            let _ = writeln!(text, "cycle {cycle:<2} {pv} {pv_um:.2} µm, RMS {rms_um:.3} µm");
         }
     }
     text

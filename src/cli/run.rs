@@ -169,7 +169,7 @@ async fn carry_out(
     }
     if key.is_none() && !arguments.json {
         super::print(
-            "not signed: nothing proves who wrote this record; `regrind audit key` makes the key that signs it\n",
+            "not signed: the origin of this record cannot be proven; create a signing key with `regrind audit key`\n",
         )?;
     }
     let mut header = header(arguments, &live, (&task, &plan), earlier.as_ref());
@@ -228,7 +228,7 @@ impl Earlier {
             match task.begin_with(learned.clone()) {
                 Ok(()) => self.learned = Some((learned, text)),
                 Err(source) => {
-                    self.told.push(format!("what {} learned cannot be begun with: {source}", learned.run));
+                    self.told.push(format!("the knowledge from {} cannot be used: {source}", learned.run));
                 }
             }
         }
@@ -253,13 +253,13 @@ impl Earlier {
     }
 
     fn in_words(&self, runs: &Path) -> String {
-        let mut text: String = self.left_alone.iter().map(|error| format!("left alone: {error}\n")).collect();
+        let mut text: String = self.left_alone.iter().map(|error| format!("ignored: {error}\n")).collect();
         text.extend(self.told.iter().map(|words| format!("{words}\n")));
         text += &match &self.learned {
             Some((Learned { taught_by: Some(others), .. }, _)) => others_in_words(others),
-            Some((learned, _)) => format!("begins with what {} found to come back in every pass\n", learned.run),
+            Some((learned, _)) => format!("begins with the error that {} found in every pass\n", learned.run),
             None => format!(
-                "begins from nothing: no finished run in {} has this part, cell, wheel, gain and way of measuring\n",
+                "begins without knowledge: no finished run in {} has this part, cell, wheel, gain and way of measuring\n",
                 runs.display()
             ),
         };
@@ -276,14 +276,14 @@ fn others_in_words(others: &TaughtBy) -> String {
     let [least, most] = [percent(f64::min), percent(f64::max)];
     match others.differ.is_empty() {
         false => format!(
-            "begins with what {runs} taught: machines are taken to differ by {least:.0} to {most:.0} %, by {} comparison(s)\n",
+            "begins with the knowledge from {runs}: assumed difference of machines {least:.0} to {most:.0} %, from {} comparison(s)\n",
             others.comparisons
         ),
         true => format!(
-            "begins with what {runs} taught of the form, and without a correction: {}\n",
+            "begins with the form knowledge from {runs}, and without a correction: {}\n",
             match others.comparisons {
                 0 =>
-                    "how alike the machines are nobody knows until two of them have ground the same recipe, or machines_differ of [plant] states it",
+                    "machine similarity is unknown: grind one recipe on two machines, or set `[plant] machines_differ`",
                 _ => "the machines have nothing in common",
             }
         ),

@@ -105,17 +105,17 @@ impl Show {
             }
             Notice::Transferred { .. } if self.is_chosen => Ok(()),
             Notice::Transferred { cycle, points, seconds, ms_per_point } => self.line(&format!(
-                "cycle {cycle}: {points} points fetched in {seconds:.2} s, {} ms a point",
+                "cycle {cycle}: {points} points fetched in {seconds:.2} s, {} ms per point",
                 three_digits(*ms_per_point)
             )),
             Notice::LoadPart => {
                 let by_key = if reads_keys() { "press Enter here, or: " } else { "" };
                 self.line(&format!(
-                    "load the part, clamp it, see that wheel and probe are clear of it,\nthen: {by_key}regrind confirm loaded"
+                    "load and clamp the part, check that wheel and probe are clear of it,\nthen: {by_key}regrind confirm loaded"
                 ))
             }
             Notice::AskWhetherClear { device } => self.line(&format!(
-                "{device}: nothing tells whether it is clear of the part; see that it is,\nthen: regrind confirm clear --machine {}",
+                "{device}: no signal shows whether it is clear of the part; check that it is,\nthen: regrind confirm clear --machine {}",
                 device.to_string().to_lowercase()
             )),
             Notice::Note { device, messages } => {
@@ -125,7 +125,7 @@ impl Show {
             Notice::Judged(Judgement { cycle, reason, .. }) => self.line(&format!("cycle {cycle}: {reason}")),
             Notice::Compensated { cycle, summary } => {
                 self.line(&format!(
-                    "cycle {cycle}: next pass corrects up to {} um, {} um deep, {}, gain {}; PV {}, RMS {} um expected",
+                    "cycle {cycle}: next pass corrects up to {} µm, depth {} µm, {}, gain {}; expected PV {} µm, RMS {} µm",
                     three_digits(1e3 * summary.largest_mm),
                     three_digits(1e3 * summary.depth_mm),
                     in_air(summary.air_share),
@@ -137,7 +137,7 @@ impl Show {
                     self.line(&format!("cycle {cycle}: {}", told.in_words()))?;
                 }
                 if let Some(mm) = summary.map_rms_mm {
-                    self.line(&format!("cycle {cycle}: left for the map: {} um rms", three_digits(1e3 * mm)))?;
+                    self.line(&format!("cycle {cycle}: left for the map: {} µm RMS", three_digits(1e3 * mm)))?;
                 }
                 summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
             }
@@ -151,7 +151,7 @@ impl Show {
                 self.alarms.remove(alarm);
                 Ok(())
             }
-            Notice::Refused { why } => self.line(&format!("not done: {why}")),
+            Notice::Refused { why } => self.line(&format!("refused: {why}")),
             Notice::RecordFailed { message } => self.line(&format!("RECORD: {message}")),
             Notice::Finished { ending, cycles, touches } => self.finished(ending, cycles, *touches),
         }
@@ -161,12 +161,12 @@ impl Show {
     fn order(&mut self, event: &str) -> Result<(), Failure> {
         match event {
             "hold" => self.line(&format!(
-                "HOLD     the cell holds at the next safe place; to go on: regrind resume {0}; Ctrl-C, or regrind abort {0}, ends the run",
+                "HOLD     the cell holds at the next safe place; to continue: regrind resume {0}; to abort: Ctrl-C, or regrind abort {0}",
                 self.folder
             )),
-            "resume" => self.line("RESUME   the cell goes on"),
+            "resume" => self.line("RESUME   the cell continues"),
             "stop" => self.line("STOP     the cell ends in order"),
-            "abort" => self.line("ABORT    both machines run their safe sequence, and nothing else"),
+            "abort" => self.line("ABORT    both machines run only their safe sequence"),
             _ => Ok(()),
         }
     }
@@ -196,11 +196,11 @@ impl Show {
             let known = figures
                 .form
                 .filter(|_| points as usize > FIRST_BATCH)
-                .map_or(String::new(), |_| format!("{pv}, {rms}; "));
-            self.line(&format!("cycle {cycle}: {known}{points} points; {targets} more, for {why}"))?;
+                .map_or(String::new(), |_| format!("{pv}; {rms}; "));
+            self.line(&format!("cycle {cycle}: {known}{points} points; {targets} more: {why}"))?;
             return self.picture(cycle);
         }
-        let mut text = format!("cycle {cycle}: {pv}, {rms}; {points} points, {outliers} outliers");
+        let mut text = format!("cycle {cycle}: {pv}; {rms}; {points} points, {outliers} outliers");
         for words in figures.weak_directions.iter().chain(&figures.warnings) {
             let _ = write!(text, "\n         {words}");
         }
@@ -219,7 +219,7 @@ impl Show {
             [] => String::new(),
             rms_mm => format!("RMS {}\n", sparkline(rms_mm.iter().copied())),
         };
-        let error = |blocks: &Blocks| format!("error, filtered: +- {} um", three_digits(blocks.limit_um));
+        let error = |blocks: &Blocks| format!("filtered error: \u{b1} {} µm", three_digits(blocks.limit_um));
         let (blocks, below) = if self.is_chosen {
             // For chosen touches, the map of the error and the map of its standard deviation are shown side by side.
             const APART: usize = 2;
@@ -227,7 +227,7 @@ impl Show {
             let both = Blocks::of(&nodes, room).zip(Blocks::of_sigma(&nodes, room));
             let Some((blocks, sigma)) = both else { return Ok(()) };
             let wide = blocks.rows.first().map_or(0, Vec::len) + APART;
-            let known = format!("known to: {} um at worst", three_digits(sigma.limit_um));
+            let known = format!("standard deviation: up to {} µm", three_digits(sigma.limit_um));
             let below = format!("{:wide$}{known}\n{falls}", error(&blocks));
             (blocks.beside(sigma, APART), below)
         } else {
@@ -255,8 +255,8 @@ impl Show {
         };
         let mut text = String::new();
         if !cycles.is_empty() {
-            let pv = format!("{} um", pv_name(&self.tolerance));
-            let _ = writeln!(text, "\ncycle {pv:>13}   RMS um   points  outliers  level um");
+            let pv = format!("{} µm", pv_name(&self.tolerance));
+            let _ = writeln!(text, "\ncycle {pv:>13}   RMS µm   points  outliers  level µm");
         }
         for row in cycles {
             let CycleRow { cycle, points, outliers, level_um, .. } = row;
@@ -264,7 +264,7 @@ impl Show {
             let _ = writeln!(text, "{cycle:>5} {pv_um:>13.2} {rms_um:>8.3} {points:>8} {outliers:>9} {level_um:>9.1}");
         }
         if let Some([taken, whole]) = touches {
-            let _ = writeln!(text, "\n{taken} touches of the part; the whole pattern would have taken {whole}");
+            let _ = writeln!(text, "\n{taken} touches of the part, instead of {whole} with the whole pattern");
         }
         let marked = if self.simulated { "SIMULATION  " } else { "" };
         let _ = write!(text, "\n{marked}{word}: {reason}");
@@ -342,7 +342,7 @@ pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
 /// Returns the text about the touches of a measurement that is still running.
 pub(super) fn so_far(SoFar { touched, rms_um, least_um, most_um }: &SoFar) -> String {
     format!(
-        "preliminary, from where the plan has the part: {touched} touched, RMS {rms_um:.2} um, {least_um:+.2} to {most_um:+.2} um"
+        "preliminary, relative to the planned position: {touched} touched, RMS {rms_um:.2} µm, {least_um:+.2} to {most_um:+.2} µm"
     )
 }
 
@@ -358,7 +358,7 @@ pub(super) fn pv_name(tolerance: &Tolerance) -> &'static str {
 pub(super) fn limits(tolerance: &Tolerance) -> String {
     let limits =
         [(pv_name(tolerance), tolerance.pv_mm), ("RMS", tolerance.rms_mm)].into_iter().filter(|(_, mm)| mm.is_finite());
-    limits.map(|(name, mm)| format!("{name} {} um", three_digits(1e3 * mm))).collect::<Vec<_>>().join(", ")
+    limits.map(|(name, mm)| format!("{name} {} µm", three_digits(1e3 * mm))).collect::<Vec<_>>().join(", ")
 }
 
 /// Returns the gains as text: one value, or from the shortest to the longest wavelength.

@@ -37,9 +37,9 @@ pub(super) fn three_digits(value: f64) -> String {
 pub(super) fn judged(compared: &Compared) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let Compared { name, found_mm, limit_mm, .. } = compared;
-    let of = if limit_mm.is_finite() { format!(" of {}", um(*limit_mm)) } else { String::new() };
-    let within = compared.within_in_words().map_or(String::new(), |words| format!(" ({words})"));
-    format!("{name} {}{of} um{within}", um(*found_mm))
+    let of = if limit_mm.is_finite() { format!(", limit {} µm", um(*limit_mm)) } else { String::new() };
+    let within = compared.within_in_words().map_or(String::new(), |words| format!(", {words}"));
+    format!("{name}: {} µm{of}{within}", um(*found_mm))
 }
 
 /// Returns the minimum and the maximum remaining time, as text.

@@ -127,30 +127,30 @@ impl fmt::Display for Next {
         f.write_str(match self {
             Self::Nothing => "no action needed",
             Self::Load => {
-                "load the part, clamp it, see that wheel and probe are clear of it; then: regrind confirm loaded"
+                "load and clamp the part, check that wheel and probe are clear of it; then: regrind confirm loaded"
             }
             Self::SeeClear { device } => {
                 let name = device.to_string().to_lowercase();
                 return write!(
                     f,
-                    "see that the {device} is clear of the part; then: regrind confirm clear --machine {name}"
+                    "check that the {device} is clear of the part; then: regrind confirm clear --machine {name}"
                 );
             }
             Self::Bring { what } => what,
-            Self::SeeToAlarm => "see to what the alarm says; the cell goes on by itself when that is gone",
-            Self::ClearAlarm => "do what the alarm says; then: regrind resume, or regrind stop",
-            Self::ResumeOrStop => "regrind resume goes on, regrind stop ends the run",
+            Self::SeeToAlarm => "remove the cause of the alarm; the cell then continues by itself",
+            Self::ClearAlarm => "follow the steps of the alarm; then: regrind resume, or regrind stop",
+            Self::ResumeOrStop => "to continue: regrind resume; to end the run: regrind stop",
             Self::SeeWhetherItStands { device } => {
                 let name = device.to_string().to_lowercase();
                 return write!(
                     f,
-                    "see whether the {device} stands; then: regrind resume, which asks it what became of its job; where it cannot \
-                     tell: regrind confirm over --machine {name} --evidence \"what you saw\""
+                    "check whether the {device} is at rest; then: regrind resume, which asks it for the state of its job; if it \
+                     cannot answer: regrind confirm over --machine {name} --evidence \"what you saw\""
                 );
             }
             Self::KeepAway => "keep away from both machines: they run their safe sequence",
-            Self::EmergencyCircuit => "use the emergency circuit of each machine that has not confirmed that it stands",
-            Self::ReadReport => "the run is over: see its report.html",
+            Self::EmergencyCircuit => "use the emergency circuit of each machine that has not confirmed that it is at rest",
+            Self::ReadReport => "the run is over: read its report.html",
         })
     }
 }

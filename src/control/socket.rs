@@ -204,11 +204,15 @@ async fn serve(caller: Caller, desk: Desk) -> io::Result<()> {
     let reply = match serde_json::from_str(&text) {
         Ok(Line { request: Request::Watch, .. }) => match places.try_acquire() {
             Ok(_place) => return told_on(&mut write, &mut status).await,
-            Err(_) => refusal(format!("{WATCHERS} others watch already; close one of them"), &status),
+            Err(_) => refusal(
+                format!("{WATCHERS} clients already watch this cell, which is the limit; close one of them"),
+                &status,
+            ),
         },
-        Ok(line) if line.misleads() => {
-            refusal("not an order: it has characters that are not seen or turn what is read".into(), &status)
-        }
+        Ok(line) if line.misleads() => refusal(
+            "not an order: it contains characters that are invisible or change the reading direction".into(),
+            &status,
+        ),
         Ok(Line { request, by }) => answer(request, on_behalf(peer, by), &orders, &status).await,
         Err(error) => refusal(format!("not an order: {error}"), &status),
     };
@@ -233,7 +237,10 @@ async fn answer(
     };
     match tokio::time::timeout(ANSWERS_WITHIN, handed_over).await {
         Ok(reply) => reply.unwrap_or_else(over),
-        Err(_) => refusal("the cell has not answered; whether it took the order is not known".into(), status),
+        Err(_) => refusal(
+            "the cell did not answer in time; it is unknown whether it took the order: check its status".into(),
+            status,
+        ),
     }
 }
 

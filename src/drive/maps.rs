@@ -53,8 +53,8 @@ fn taken_out(task: &Task) -> TakenOut {
     let held: Vec<&str> = names.filter(|(_, held)| *held).map(|(name, _)| name).collect();
     let motion = match held.len() {
         0 => "rigid motion (registration)".to_owned(),
-        6 => "nothing (every direction is held)".to_owned(),
-        _ => format!("rigid motion but {} (registration)", held.join(", ")),
+        6 => "nothing (every direction is locked)".to_owned(),
+        _ => format!("rigid motion except {} (registration)", held.join(", ")),
     };
     let smoothing = match task.map.smoothing {
         Smoothing::Gaussian => "Gaussian, ISO 16610-61",

@@ -417,8 +417,7 @@ impl Drive {
     /// Reports a computation that panicked for what it is: a fault of this program, and no fact about the part.
     async fn panicked(&mut self, error: JoinError) {
         let Some((cycle, kind)) = self.computing.remove(&error.id()) else { return };
-        let why =
-            format!("the computation failed by a fault of the program itself, please report it: {}", words_of(error));
+        let why = format!("the computation failed by a fault of the program; report it: {}", words_of(error));
         let event = match kind {
             Computation::Gate => {
                 let gate = Gate::Failed(GateFailure::Broken(why));
@@ -440,10 +439,10 @@ impl Drive {
                 match then {
                     Then::Execute(command) => self.not_on_record(*command).await,
                     Then::Answer { answer, message, .. } => {
-                        let message = format!("{message}; it is not on record, {reason}");
+                        let message = format!("{message}; not recorded: {reason}");
                         drop(answer.send(Reply { taken: false, message, status: self.snapshot() }));
                     }
-                    Then::Confirm { answer, .. } => drop(answer.send(Err(format!("it is not on record: {reason}")))),
+                    Then::Confirm { answer, .. } => drop(answer.send(Err(format!("not recorded: {reason}")))),
                     Then::Nothing => {}
                 }
                 return self.record_failed(why).await;
@@ -464,7 +463,7 @@ impl Drive {
     /// Reports that a START was not sent: the state of the cell changed while the START waited to be recorded.
     async fn not_carried_out(&mut self, command: Command) {
         if let Command::StartMachine { device, .. } = command {
-            let why = "it was not given: it was not on record, or the cell was held before it was".to_owned();
+            let why = "not sent: it was not recorded, or the cell was held first".to_owned();
             self.take(Event::Refused { device, what: Asked::Start, why }, None).await;
         }
     }
@@ -520,9 +519,8 @@ impl Drive {
         for waiting in &mut self.backlog {
             match std::mem::replace(&mut waiting.then, Then::Nothing) {
                 Then::Answer { answer, message, .. } => {
-                    let message = format!(
-                        "{message}; what makes safe was carried out, and nothing else is: it is not on record, {why}"
-                    );
+                    let message =
+                        format!("{message}; only steps that make the cell safe were carried out; not recorded: {why}");
                     // The person who asked may be gone.
                     drop(answer.send(Reply { taken: false, message, status: status.clone() }));
                 }
@@ -568,7 +566,8 @@ impl Drive {
         if let Request::Resume { seen: Some(seen), .. } = request
             && seen != self.states
         {
-            let message = format!("the cell has changed since you saw it; now it is {}", self.cell.in_words());
+            let message =
+                format!("the state of the cell has changed since you saw it; it is now {}", self.cell.in_words());
             // The person who asked may be gone.
             if let Some(answer) = answer {
                 drop(answer.send(Reply { taken: false, message, status: self.snapshot() }));
@@ -604,7 +603,7 @@ impl Drive {
         let payload = json!({ "remark": what });
         let ticket = self.recorder.append(entry(Kind::Note, self.now(), self.cell.cycle(), origin, payload));
         if let Some(answer) = answer {
-            let then = Then::Answer { answer, accepted: true, message: "on record".into() };
+            let then = Then::Answer { answer, accepted: true, message: "recorded".into() };
             self.backlog.push_back(Waiting { ticket, then });
             self.answer_without_record();
         }
@@ -642,7 +641,7 @@ impl Drive {
     /// Returns the machine that a person's confirmation is about, its name in the record, and the confirmation.
     fn word(&self, request: &Request) -> Result<(Device, &'static str, OperatorConfirmation), String> {
         let at_work = self.cell.state().phase().and_then(Phase::moving);
-        let job = || at_work.ok_or("no job of a machine is under way");
+        let job = || at_work.ok_or("no job of a machine is in progress");
         let identity = |map: &Option<String>| map.as_ref().map(|digits| self.named_map(digits)).transpose();
         Ok(match request {
             Request::Started { map } => {
@@ -652,10 +651,11 @@ impl Drive {
                 (job()?, "done", OperatorConfirmation::Done { map_identity: identity(map)?, file: file.clone() })
             }
             Request::Still { device } => {
-                let device = device.or(at_work).ok_or("say which machine stands: --machine cmm, or grinder")?;
+                let device =
+                    device.or(at_work).ok_or("name the machine that is at rest: --machine cmm or --machine grinder")?;
                 (device, "still", OperatorConfirmation::Still)
             }
-            _ => return Err("that is no word about a machine".into()),
+            _ => return Err("this is not a confirmation about a machine".into()),
         })
     }
 
@@ -664,16 +664,16 @@ impl Drive {
         let digits = digits.trim().to_lowercase();
         let grinds = self.cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
         let cycle = self.cycles.get(self.cell.cycle()).filter(|_| grinds);
-        let Some(cycle) = cycle else { return Err("no pass is under way".into()) };
+        let Some(cycle) = cycle else { return Err("no pass is in progress".into()) };
         let identity = self.task.payloads(&cycle.correction).0.identity();
         let whole = hex(&identity);
         if digits.len() < 8 {
-            return Err("give the first 8 digits of the map, or more; they stand in correction.json".into());
+            return Err("give at least the first 8 digits of the map; they are in correction.json".into());
         }
         if !whole.starts_with(&digits) {
             let (given, handed) = (digits.get(..8).unwrap_or(&digits), &whole[..8]);
             return Err(format!(
-                "map {handed} was handed over, and {given} is another one: is the grinder set up with it?"
+                "map {handed} was sent, but the confirmation names {given}; check the setup of the grinder"
             ));
         }
         Ok(identity)
@@ -728,7 +728,7 @@ impl Drive {
     /// Returns why a pass record is implausible, compared with the commanded pass.
     fn flaw_of(&self, record: &PassRecord) -> Option<String> {
         let number = self.cell.cycle();
-        let Some(cycle) = self.cycles.get(number) else { return Some(format!("there is no pass of cycle {number}")) };
+        let Some(cycle) = self.cycles.get(number) else { return Some(format!("cycle {number} has no pass")) };
         let (map, pass) = self.task.payloads(&cycle.correction);
         let job = Job { job: self.job, cycle: number as u16, digest: 0 };
         let max_depth_mm = self.task.limits.max_depth_mm;
@@ -1154,14 +1154,14 @@ fn short_of_space(folder: &Path, needed: u64) -> Result<(), RecordFailure> {
     }
     let [free, needed] = [free, needed].map(|bytes| bytes.div_ceil(1 << 20));
     let disk = folder.display();
-    Err(RecordFailure::DiskFull(format!("the disk of {disk} has {free} MB left, and a cycle may take {needed} MB")))
+    Err(RecordFailure::DiskFull(format!("the disk of {disk} has {free} MB free, a cycle needs up to {needed} MB")))
 }
 
 /// Returns the message of a task that panicked.
 fn words_of(error: JoinError) -> String {
-    let Ok(panic) = error.try_into_panic() else { return "it was ended".into() };
+    let Ok(panic) = error.try_into_panic() else { return "the task was cancelled".into() };
     let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
-    text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "it says no more".into())
+    text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "no further information".into())
 }
 
 /// Waits until the first entry in the queue is recorded.

@@ -38,12 +38,15 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
     let Told { job, pass, map_identity, max_depth_mm, outline } = told;
     if (record.job, record.cycle) != (job.job, job.cycle) {
         let (is_job, is_cycle) = (record.job, record.cycle);
-        return Some(format!("it is of job {is_job}, cycle {is_cycle}; {}, {} was ground", job.job, job.cycle));
+        return Some(format!(
+            "it is of job {is_job}, cycle {is_cycle}; the pass is of job {}, cycle {}",
+            job.job, job.cycle
+        ));
     }
     if record.map_identity != *map_identity {
         let short = |identity: &[u8; 32]| identity[..4].iter().map(|b| format!("{b:02x}")).collect::<String>();
         let (is, told) = (short(&record.map_identity), short(map_identity));
-        return Some(format!("map {is} was ground, and {told} was handed over"));
+        return Some(format!("map {is} was ground, but map {told} was sent"));
     }
     if record.outcome != Outcome::Complete {
         return None; // A pass that did not come to its end is judged by that alone.
@@ -54,11 +57,11 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
     let range = |value: Option<f64>, what: &str, least: f64, most: f64, unit: &str| {
         let value = value.filter(|value| !(least..=most).contains(value))?;
         let limits = match (least.is_finite(), most.is_finite()) {
-            (true, true) => format!("{} to {} {unit} are possible", figure(least), figure(most)),
-            (true, false) => format!("at least {} {unit} are needed", figure(least)),
-            _ => format!("at most {} {unit} are allowed", figure(most)),
+            (true, true) => format!("limits {} to {} {unit}", figure(least), figure(most)),
+            (true, false) => format!("minimum {} {unit}", figure(least)),
+            _ => format!("maximum {} {unit}", figure(most)),
         };
-        Some(format!("{what} is {} {unit}, and {limits}", figure(value)))
+        Some(format!("{what} is {} {unit}, {limits}", figure(value)))
     };
     let [width, height] = [pass.x_mm, pass.y_mm].map(|[low, high]| high - low);
     let tracks_mm = width * height / pass.track_spacing_mm;
@@ -80,9 +83,9 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
     range(record.path_mm, "the path travelled", least_path_mm, any, "mm")
         .or_else(|| range(record.path_mm, "the path travelled", -any, most_path_mm, "mm"))
         .or_else(|| range(measured_s, "its duration", least_s, any, "s"))
-        .or_else(|| range(record.max_depth_mm, "the largest depth taken off", -any, most_mm, "mm"))
+        .or_else(|| range(record.max_depth_mm, "the largest removed depth", -any, most_mm, "mm"))
         .or_else(|| range(record.wheel_radius_mm, "the radius of the wheel", wheel[0], wheel[1], "mm"))
-        .or_else(|| range(record.removed_mm3, "the volume removed", 0.0, most_mm3, "mm3"))
+        .or_else(|| range(record.removed_mm3, "the removed volume", 0.0, most_mm3, "mm³"))
         .or_else(|| contradiction(record))
 }
 
@@ -90,7 +93,7 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
 fn contradiction(record: &PassRecord) -> Option<String> {
     let (removed_mm3, max_depth_mm) = (record.removed_mm3?, record.max_depth_mm?);
     (removed_mm3 == 0.0 && max_depth_mm > 0.0)
-        .then(|| format!("the volume removed is 0 mm3, and the largest depth taken off is {max_depth_mm:.4} mm"))
+        .then(|| format!("the removed volume is 0 mm³, but the largest removed depth is {max_depth_mm:.4} mm"))
 }
 
 /// Formats a figure for a message. An absurd value is not written with hundreds of digits.
@@ -163,42 +166,33 @@ mod tests {
         let of_path = |path_mm| PassRecord { path_mm: Some(path_mm), duration_s: None, ..record() };
         // 728.8 mm2 with tracks every 0.5 mm.
         assert_eq!(judged_of(Some(&ring), &of_path(740.0)), None);
-        assert!(judged_of(Some(&ring), &of_path(700.0)).is_some_and(|flaw| flaw.contains("at least 728.849 mm")));
+        assert!(judged_of(Some(&ring), &of_path(700.0)).is_some_and(|flaw| flaw.contains("minimum 728.849 mm")));
         assert_eq!(judged_of(None, &of_path(3200.0)), None);
-        assert!(judged_of(None, &of_path(3100.0)).is_some_and(|flaw| flaw.contains("at least 3162.000 mm")));
+        assert!(judged_of(None, &of_path(3100.0)).is_some_and(|flaw| flaw.contains("minimum 3162.000 mm")));
     }
 
     #[test]
     fn a_figure_that_cannot_be_is_named_with_its_limit() {
         assert_eq!(judged(&record()), None);
         let cases = [
-            (PassRecord { map_identity: [4; 32], ..record() }, "map 04040404 was ground, and 03030303 was handed over"),
-            (PassRecord { job: 40, ..record() }, "it is of job 40, cycle 2; 41, 2 was ground"),
-            (PassRecord { cycle: 1, ..record() }, "it is of job 41, cycle 1; 41, 2 was ground"),
-            (PassRecord { max_depth_mm: Some(3.0), ..record() }, "3.000 mm, and at most 0.535 mm are allowed"),
-            (
-                PassRecord { path_mm: Some(-1.0), ..record() },
-                "the path travelled is -1.000 mm, and at least 6324.000 mm",
-            ),
+            (PassRecord { map_identity: [4; 32], ..record() }, "map 04040404 was ground, but map 03030303 was sent"),
+            (PassRecord { job: 40, ..record() }, "it is of job 40, cycle 2; the pass is of job 41, cycle 2"),
+            (PassRecord { cycle: 1, ..record() }, "it is of job 41, cycle 1; the pass is of job 41, cycle 2"),
+            (PassRecord { max_depth_mm: Some(3.0), ..record() }, "3.000 mm, maximum 0.535 mm"),
+            (PassRecord { path_mm: Some(-1.0), ..record() }, "the path travelled is -1.000 mm, minimum 6324.000 mm"),
             (
                 PassRecord { path_mm: Some(6000.0), ..record() },
-                "the path travelled is 6000.000 mm, and at least 6324.000 mm",
+                "the path travelled is 6000.000 mm, minimum 6324.000 mm",
             ),
             (PassRecord { path_mm: Some(1e300), ..record() }, "the path travelled is 1e300 mm"),
-            (PassRecord { removed_mm3: Some(1e30), ..record() }, "the volume removed is 1e30 mm3"),
-            (
-                PassRecord { removed_mm3: Some(0.0), ..record() },
-                "is 0 mm3, and the largest depth taken off is 0.2000 mm",
-            ),
+            (PassRecord { removed_mm3: Some(1e30), ..record() }, "the removed volume is 1e30 mm³"),
+            (PassRecord { removed_mm3: Some(0.0), ..record() }, "is 0 mm³, but the largest removed depth is 0.2000 mm"),
             (PassRecord { spindle_load: Some(-1.0), ..record() }, "the spindle load is -1, and 0 to 10"),
             (PassRecord { temperature_c: Some(-327.0), ..record() }, "the temperature is -327 degrees Celsius"),
-            (
-                PassRecord { wheel_radius_mm: Some(11.0), ..record() },
-                "is 11.000 mm, and 12.375 to 12.625 mm are possible",
-            ),
-            (PassRecord { duration_s: Some(0.0), ..record() }, "its duration is 0.000 s, and at least 379.440 s"),
+            (PassRecord { wheel_radius_mm: Some(11.0), ..record() }, "is 11.000 mm, limits 12.375 to 12.625 mm"),
+            (PassRecord { duration_s: Some(0.0), ..record() }, "its duration is 0.000 s, minimum 379.440 s"),
             (PassRecord { idle_share: Some(1.5), ..record() }, "cut nothing is 1.5, and 0 to 1 are"),
-            (PassRecord { removed_mm3: Some(-2.0), ..record() }, "the volume removed is -2.000 mm3"),
+            (PassRecord { removed_mm3: Some(-2.0), ..record() }, "the removed volume is -2.000 mm³"),
         ];
         for (record, words) in cases {
             let flaw = judged(&record).unwrap_or_else(|| panic!("nothing is found wrong, expected {words}"));

@@ -68,13 +68,11 @@ pub enum ProgramError {
     #[error(transparent)]
     File(#[from] GcodeError),
     #[error(
-        "the program of the next pass would have {points} points, more than the {MOST_POINTS} that a run keeps; allow a larger chord error, or \
-         write it by `regrind plan --program`"
+        "the program of the next pass would have {points} points, limit {MOST_POINTS}; allow a larger chord error, or write \
+         the program with `regrind plan --program`"
     )]
     TooLong { points: u64 },
-    #[error(
-        "{path} does not hold what was written into it; look after the folder of programs (grinder.program.folder)"
-    )]
+    #[error("{path} differs from the program that was written; check the program folder (grinder.program.folder)")]
     NotThere { path: PathBuf },
 }
 
@@ -181,14 +179,14 @@ impl Programs {
             if self.folder.is_some() {
                 return Err(error);
             }
-            return Ok(Some(format!("there is no {}: {error}", self.file_name())));
+            return Ok(Some(format!("{} was not written: {error}", self.file_name())));
         }
         let file = files.place(&self.file_name());
         self.write_program(&file, correction, map_identity, &path, &summary)?;
         self.hand_over(&file, correction.cycle)?;
         match self.keep_table(&files.place(TABLE_FILE), correction, map_identity, &path) {
             Ok(()) => Ok(None),
-            Err(ProgramError::Path(error)) => Ok(Some(format!("there is no {TABLE_FILE}: {error}"))),
+            Err(ProgramError::Path(error)) => Ok(Some(format!("{TABLE_FILE} was not written: {error}"))),
             Err(error) => Err(error),
         }
     }
@@ -280,7 +278,7 @@ pub(super) fn set_in_words(correction: &Correction, wheel_radius_mm: f64) -> Vec
                     "{said}, {true_mm:.6} mm in place of {wheel_radius_mm} mm, since pass {since}; it is not in the map"
                 )
             }
-            _ => format!("{said}, since pass {since}; what takes it back is in the map that is ground with"),
+            _ => format!("{said}, since pass {since}; its compensation is in the map that is ground"),
         }
     };
     taken.map(line).collect()

@@ -161,7 +161,7 @@ impl Recorder {
         // The thread may hang in the operating system, so do not wait for it.
         self.thread = None;
         let (folder, limit) = (self.folder.display(), PATIENCE.as_secs());
-        Err(RecordFailure::Unwritable(format!("{folder}: the record could not be brought to its end within {limit} s")))
+        Err(RecordFailure::Unwritable(format!("{folder}: the record could not be closed within {limit} s")))
     }
 
     fn give(&self, job: Job) -> Ticket {

@@ -40,9 +40,9 @@ pub enum RecoverError {
     Device(#[from] DeviceError),
     #[error(transparent)]
     Journal(#[from] JournalError),
-    #[error("the {device} was {seen} when it was shown, and is {found} now: nothing was commanded; look again")]
+    #[error("the {device} was {seen} and is now {found}; no command was sent; check the machine again")]
     Changed { device: Device, seen: String, found: String },
-    #[error("the {device} is still {found} after {} s; look at the machine, and begin again", .limit.as_secs())]
+    #[error("the {device} is still {found} after {} s; check the machine, then run the command again", .limit.as_secs())]
     Late { device: Device, found: State, limit: Duration },
 }
 
@@ -69,15 +69,13 @@ impl Step {
     /// Returns the effect of the step, and the loss that it causes.
     pub fn meaning(self, device: Device) -> &'static str {
         match (self, device) {
-            (Self::Stop, _) => "ends its job in order, clear of the part, or takes its preparation back",
-            (Self::Acknowledge, Device::Cmm) => {
-                "lets it forget its result: a measurement that no run has collected is lost"
-            }
+            (Self::Stop, _) => "ends its job in order, clear of the part, or withdraws its preparation",
+            (Self::Acknowledge, Device::Cmm) => "discards its result: a measurement that no run has collected is lost",
             (Self::Acknowledge, Device::Grinder) => {
-                "lets it forget its result: the part has had this pass, and no run will know it"
+                "discards its result: the part has had this pass, but no run will know it"
             }
             (Self::Clear, _) => {
-                "lets it go to idle again: first see that it stands, clear of the part, and why it was stopped"
+                "returns it to idle: first check that it is at rest, clear of the part, and why it was stopped"
             }
         }
     }

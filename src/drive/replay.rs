@@ -66,15 +66,15 @@ pub enum ReplayError {
     Journal(#[from] JournalError),
     #[error(transparent)]
     File(#[from] FormatError),
-    #[error("{}: {source}; nothing was commanded: see to the disk and try again", .path.display())]
+    #[error("{}: {source}; no command was sent; check the disk and retry", .path.display())]
     Scratch { path: PathBuf, source: io::Error },
-    #[error("{}: what is computed again cannot be written ({what}); nothing was commanded: see to the disk and try again", .run.display())]
+    #[error("{}: the repeated computation cannot be written ({what}); no command was sent; check the disk and retry", .run.display())]
     NotSaved { run: PathBuf, what: String },
-    #[error("{}: record {seq} cannot be read back ({what}); this run cannot be gone on with, bring its machines home by `regrind recover`", .run.display())]
+    #[error("{}: record {seq} cannot be read ({what}); this run cannot continue; bring its machines home with `regrind recover`", .run.display())]
     Unreadable { run: PathBuf, seq: u64, what: String },
     #[error(
-        "{}: at record {seq} this program comes to something else than the one that began the run: {what}; nothing was commanded. Go on with \
-         the program that began it, or bring its machines home by `regrind recover` and begin a new run",
+        "{}: at record {seq} the result of this program differs from the record: {what}; no command was sent. Continue with \
+         the program that began the run, or bring its machines home with `regrind recover` and start a new run",
         .run.display()
     )]
     Differs { run: PathBuf, seq: u64, what: String },
@@ -195,7 +195,7 @@ impl<'t> Replay<'t> {
 
     fn event(&mut self, now: Duration, payload: Value) -> Result<(), ReplayError> {
         if let Some(missing) = self.due.front() {
-            return Err(self.differs(format!("it commands {}, and the record has another event", missing.name())));
+            return Err(self.differs(format!("it commands {}, but the record has another event", missing.name())));
         }
         let event: Event = serde_json::from_value(payload.clone()).map_err(|error| self.unreadable(&error))?;
         if let Event::Prepared { device, .. } = &event {
@@ -229,14 +229,14 @@ impl<'t> Replay<'t> {
     fn command(&mut self, id: Option<u32>, mut recorded: Value) -> Result<(), ReplayError> {
         let name = recorded["command"].as_str().unwrap_or_default().to_owned();
         let Some(command) = self.due.pop_front() else {
-            return Err(self.differs(format!("nothing is to be commanded, and the record has {name}")));
+            return Err(self.differs(format!("no command is due, but the record has {name}")));
         };
         if let (Command::StartMachine { .. }, Some(recorded)) = (&command, recorded.as_object_mut()) {
             recorded.remove("intent");
         }
         let due = serde_json::to_value(&command).unwrap_or_default();
         if due != recorded {
-            return Err(self.differs(format!("it commands {due}, and the record has {recorded}")));
+            return Err(self.differs(format!("it commands {due}, but the record has {recorded}")));
         }
         if let Some(id) = id.filter(|_| outcome::is_answered(&command)) {
             self.found.open.insert(id, command);
@@ -273,9 +273,9 @@ impl<'t> Replay<'t> {
         }
         let [recorded, again] = [event, &again].map(|event| serde_json::to_value(event).unwrap_or_default());
         if recorded != again {
-            return Err(
-                self.differs(format!("computed again, cycle {number} gives {again}, and the record has {recorded}"))
-            );
+            return Err(self.differs(format!(
+                "the repeated computation of cycle {number} gives {again}, but the record has {recorded}"
+            )));
         }
         self.compare(number, scratch.path(), &files)?;
         self.found.cycles.take(number, product);
@@ -299,9 +299,8 @@ impl<'t> Replay<'t> {
         let rounds =
             self.read_json::<work::TouchedAgain>(number, work::TOUCHED_AGAIN_FILE)?.map_or(0, |told| told.rounds);
         let touches = (touches, rounds);
-        work::recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches).map_err(|why| {
-            self.differs(format!("the points of cycle {number} are not what a gate lets through: {why:?}"))
-        })
+        work::recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches)
+            .map_err(|why| self.differs(format!("the points of cycle {number} do not pass the gate: {why:?}")))
     }
 
     /// Returns the newest recorded document of a name in a cycle.
@@ -320,11 +319,13 @@ impl<'t> Replay<'t> {
             let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
             let Some(recorded) = self.files.get(&(number, name.to_owned())) else { continue };
             if !path.is_file() {
-                return Err(self.differs(format!("computed again, there is no {}", recorded.name)));
+                return Err(self.differs(format!("the repeated computation does not give {}", recorded.name)));
             }
             let bytes = fs::read(&path).map_err(|source| ReplayError::Scratch { path, source })?;
             if sha256_hex(&bytes) != recorded.sha256 {
-                return Err(self.differs(format!("computed again, {} is not the one on record", recorded.name)));
+                return Err(
+                    self.differs(format!("the repeated computation of {} differs from the record", recorded.name))
+                );
             }
         }
         Ok(())
@@ -400,7 +401,7 @@ impl<'t> Replay<'t> {
         }
         let told = intent.digest;
         Err(self.differs(format!(
-            "the {device} was prepared in cycle {number} for {told:08x}, and what is known of that cycle gives {due:08x}"
+            "the {device} was prepared in cycle {number} for {told:08x}, but the data of this cycle give {due:08x}"
         )))
     }
 

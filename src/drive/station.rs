@@ -295,7 +295,7 @@ impl<B: StationDriver> MachineTask<B> {
     pub(super) async fn attend(self, asks: mpsc::Receiver<Ask>, poll: Duration, aborts: Aborts, pulse: Pulse) {
         let (reports, name) = (self.reports.clone(), B::DEVICE);
         let Err(error) = tokio::spawn(self.attends(asks, poll, aborts, pulse)).await else { return };
-        let why = format!("by a fault of the program itself, please report it: {}", words_of(error));
+        let why = format!("a fault of the program; report it: {}", words_of(error));
         let event = Some(Event::StationFailed { device: name, why });
         let _ = reports.send(StationReport { event, ..StationReport::default() }).await;
     }
@@ -465,7 +465,7 @@ impl<B: StationDriver> MachineTask<B> {
         let cycle = number.cycle;
         self.armed = None;
         let Some(digest) = self.loaded else {
-            let why = "nothing was loaded for it".to_owned();
+            let why = "no payload was loaded".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Prepare, why }).await;
         };
         let job = Job { job: self.job, cycle: number.encode(), digest };
@@ -528,7 +528,7 @@ impl<B: StationDriver> MachineTask<B> {
     /// Refuses a command if the link was lost after the cell had requested it: nothing moves by this order until the
     /// machine is connected again.
     async fn not_sent(&mut self, what: Asked) {
-        let why = "the link to it is lost, and the command was not sent".to_owned();
+        let why = "the link is lost, and the command was not sent".to_owned();
         self.tell(Event::Refused { device: B::DEVICE, what, why }).await;
     }
 
@@ -597,7 +597,7 @@ impl<B: StationDriver> MachineTask<B> {
         };
         match met.await {
             Ok(status) if self.is_at_another_job(&status) => {
-                Err(format!("it is at another run's job: {}", at_work(&status)))
+                Err(format!("it has a job of another run: {}", at_work(&status)))
             }
             Ok(_) => {
                 self.seen.connected = true;
@@ -619,7 +619,7 @@ impl<B: StationDriver> MachineTask<B> {
     async fn reconcile(&mut self, cycle: u32) {
         let Some(armed) = self.armed.clone().filter(|armed| armed.job.batch_id().cycle == cycle) else {
             // The machine cannot be asked about a job that this program has not prepared, and nothing is concluded.
-            let why = "this program has no preparation of this cycle to ask it for".to_owned();
+            let why = "this program has no preparation of this cycle".to_owned();
             let outcome = Reconciliation::Unknown(why);
             return self.tell(Event::Reconciled { device: B::DEVICE, cycle, outcome }).await;
         };
@@ -639,7 +639,7 @@ impl<B: StationDriver> MachineTask<B> {
                 Reconciliation::NotStarted
             }
             Ok(Reconciled::Unknown { reason: why }) => Reconciliation::Unknown(why),
-            Ok(answer) => Reconciliation::Unknown(format!("an answer that nobody here knows: {answer:?}")),
+            Ok(answer) => Reconciliation::Unknown(format!("unknown answer: {answer:?}")),
             Err(error) if error.is_link() => return self.lost(&error).await,
             Err(error) => Reconciliation::Unknown(error.to_string()),
         };
@@ -654,7 +654,7 @@ impl<B: StationDriver> MachineTask<B> {
     async fn collect(&mut self, cycle: u32) {
         let armed = self.armed.as_ref().filter(|armed| armed.job.batch_id().cycle == cycle);
         let Some(job) = armed.map(|armed| armed.job) else {
-            let why = "no job of this run is known to it".to_owned();
+            let why = "this program has no job of this cycle for it".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Collect, why }).await;
         };
         match self.driver.fetch(job, &self.interrupt).await {
@@ -723,7 +723,7 @@ impl<B: StationDriver> MachineTask<B> {
             let answers = if error.is_link() {
                 ""
             } else {
-                "the machine answers, but not as the cell file and docs/modbus.md have it: "
+                "the machine answers, but not as the cell file and docs/modbus.md define it: "
             };
             self.tell(Event::LinkLost { device: B::DEVICE, why: format!("{answers}{error}") }).await;
         }
@@ -862,7 +862,7 @@ impl<B: StationDriver> MachineTask<B> {
                 let (last, _) = self.seen.progress.replace((done, total)).unwrap_or((done, total));
                 self.seen.rises += u32::from(done > last);
                 if done > last && self.seen.running && self.seen.rises.is_multiple_of(RISES_AFTER) {
-                    let why = format!("it says HELD, and its progress has risen to {done} of {total} meanwhile");
+                    let why = format!("it reports HELD, but its progress has risen to {done} of {total}");
                     self.tell(Event::Refused { device, what: Asked::Hold, why }).await;
                 }
             }
@@ -871,7 +871,7 @@ impl<B: StationDriver> MachineTask<B> {
         let is_late = self.seen.stop_taken.is_some_and(|taken| taken.elapsed() > STOPS_WITHIN);
         if self.seen.stopping && is_late && status.state == State::Execute {
             self.seen.stop_taken = None;
-            let why = format!("it took the STOP, and is EXECUTE {} s later", STOPS_WITHIN.as_secs());
+            let why = format!("it took the STOP, but is still EXECUTE {} s later", STOPS_WITHIN.as_secs());
             self.tell(Event::Refused { device, what: Asked::Stop, why }).await;
         }
     }
@@ -883,7 +883,7 @@ impl<B: StationDriver> MachineTask<B> {
             return;
         };
         if f64::from(done) < COMPLETE_FROM * f64::from(total) {
-            let why = format!("the grinder calls it complete, with a progress of {done} of {total}");
+            let why = format!("the grinder reports the pass as complete at a progress of {done} of {total}");
             self.tell(Event::RecordDoubted { cycle: self.cycle, why }).await;
         }
     }
@@ -896,7 +896,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
         let device = B::DEVICE;
         let event = if manual {
-            let message = format!("{} says that it is in manual mode", self.driver.machine().name());
+            let message = format!("{} reports manual mode", self.driver.machine().name());
             Event::NotAutomatic { device, message }
         } else {
             Event::AutomaticAgain { device }
@@ -922,7 +922,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
         let (device, condition) = (B::DEVICE, Condition::Supplies);
         let event = if missing {
-            let message = format!("{} says that air or coolant is missing", self.driver.machine().name());
+            let message = format!("{} reports that air or coolant is missing", self.driver.machine().name());
             Event::ConditionLost { device, condition, message }
         } else {
             Event::ConditionBack { device, condition }
@@ -1037,8 +1037,8 @@ fn fault_words(device: Device, fault: Fault) -> String {
     match (device, fault) {
         // A probe that meets material where only air should be is not at fault: the part is in another place.
         (Device::Cmm, Fault::Collision) => {
-            "the probe met material where only air should be: see how the part lies (turned round, in another seat, another \
-             part) and whether the probe is whole, before clearing"
+            "the probe touched material where only air is expected: before clearing, check the position of the part (turned, \
+             in another seat, another part) and the probe"
                 .to_owned()
         }
         (_, fault) => fault.to_string(),

@@ -576,7 +576,7 @@ impl Task {
     ) -> Result<Option<String>, ProgramError> {
         match &self.programs {
             Ok(programs) => programs.keep(files, correction, self.map_identity(correction)),
-            Err(error) if error.is_ours() => Ok(Some(format!("there is no program: {error}"))),
+            Err(error) if error.is_ours() => Ok(Some(format!("no program was written: {error}"))),
             Err(error) => Err(error.clone().into()),
         }
     }

@@ -39,7 +39,7 @@ pub(super) fn look(
     let open = |chosen: Vec<usize>| chosen.into_iter().filter(|&k| tried[k].is_none()).collect();
     let first: Vec<usize> = open(farthest_points(&places, MIN_TOUCHES));
     if points.tried.len() == 1 && !first.is_empty() {
-        let why = "the part is where it should be";
+        let why = "the part is at its expected place";
         return Looked { form: Err(why.to_owned()), next: Some((short_tour(&places, first), why)) };
     }
     let so_far = PartialMeasurement { targets: &places, tried: &tried, touched: &points.of };
@@ -53,7 +53,7 @@ pub(super) fn look(
         // If no model can be fitted, touch every target.
         Err(error) => {
             let rest: Vec<usize> = open((0..places.len()).collect());
-            let next = (!rest.is_empty()).then_some((rest, "no model can be made of what was found"));
+            let next = (!rest.is_empty()).then_some((rest, "no model fits these points"));
             Looked { form: Err(error.to_string()), next }
         }
     }
@@ -127,18 +127,18 @@ fn on_nominal(task: &Task, near: &Target) -> Target {
 
 fn in_words(why: Reason) -> &'static str {
     match why {
-        Reason::Within => "it is in tolerance",
-        Reason::Known => "its form is known well enough for a correction",
-        Reason::Enough => "another pass mends more than more touches would",
+        Reason::Within => "the part is in tolerance",
+        Reason::Known => "the form is known well enough for a correction",
+        Reason::Enough => "another pass improves more than further touches",
         Reason::All => "every target was touched",
-        Reason::Few => "these are too few to say anything",
-        Reason::Surprised => "the last touches are not where they were expected",
-        Reason::Around => "a touch stands out, and around it nothing is known",
-        Reason::Feature => "something narrow stands on the part, so every target is touched",
-        Reason::Undecided => "it may be in tolerance and may not be",
-        Reason::Unknown => "its form is not known well enough for a correction",
-        Reason::Beyond => "it is out of tolerance, and no pass is left",
-        Reason::Late => "so many batches were touched that the rest is touched at once",
+        Reason::Few => "too few touches for a decision",
+        Reason::Surprised => "the last touches deviate from the prediction",
+        Reason::Around => "a touch is an outlier, and its surroundings are unknown",
+        Reason::Feature => "the part has a narrow feature, so every target is touched",
+        Reason::Undecided => "it is undecided whether the part is in tolerance",
+        Reason::Unknown => "the form is not known well enough for a correction",
+        Reason::Beyond => "the part is out of tolerance, and no pass is left",
+        Reason::Late => "the limit of batches is reached, so all other targets are touched",
     }
 }
 

@@ -94,13 +94,15 @@ pub(super) fn gate_cycle(
 /// not of one measurement.
 fn touched_again(again: &Again, points: &Points, measurement: &Measurement) -> Result<(Points, u32), GateFailure> {
     if measurement.coordinates != points.coordinates {
-        let message = "probe centres and contact points cannot be parts of one measurement; measure again";
+        let message = "one measurement cannot mix probe centres and contact points; measure again";
         return Err(GateFailure::Broken(message.to_owned()));
     }
     let (outliers, planned) = (again.points.len(), again.points.len() + again.controls.len());
     if measurement.points.len() < planned {
         let found = measurement.points.len();
-        return Err(GateFailure::Broken(format!("{found} points came for {planned} targets and more")));
+        return Err(GateFailure::Broken(format!(
+            "the machine returned {found} points, at least {planned} are required"
+        )));
     }
     let found = measurement.points.iter().filter(|point| point.status == PointStatus::Touched).count();
     let (repeated, rest) = measurement.points.split_at(outliers);
@@ -176,7 +178,7 @@ fn gate(
     if planned > 0 && share + spared < task.least_found {
         let limit = 100.0 * task.least_found;
         return Err(GateFailure::Coverage(format!(
-            "{found} of {planned} points were found, {:.1} %, and the recipe asks for {limit:.1} % (min_coverage)",
+            "{found} of {planned} points were found ({:.1} %), at least {limit:.1} % are required (min_coverage)",
             100.0 * share
         )));
     }
@@ -246,12 +248,12 @@ const PROBE_SHARE: f64 = 0.01;
 /// Returns why a result is foreign or broken: another plan, or values that are impossible.
 fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFailure> {
     if measurement.plan_identity != plan.identity() {
-        return Some(GateFailure::Foreign("the machine names another plan than the one it was given".into()));
+        return Some(GateFailure::Foreign("the machine reports another plan than the one it received".into()));
     }
     match (measurement.coordinates, task.coordinates) {
         (Coordinates::Contacts, Some(Coordinates::Centres)) => return Some(GateFailure::Contacts),
         (Coordinates::Centres, Some(Coordinates::Contacts)) => {
-            let message = "the machine gives probe centres where the cell file expects contact points";
+            let message = "the machine returns probe centres, the cell file expects contact points";
             return Some(GateFailure::Broken(message.into()));
         }
         _ => {}
@@ -260,12 +262,12 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
     let told = measurement.probe_radius_mm.filter(|told| *told > 0.0);
     if let Some(told_mm) = told.filter(|told| (told - stated_mm).abs() > PROBE_SHARE * stated_mm) {
         let message =
-            format!("it was touched with a probe of {told_mm:.4} mm radius, and the recipe says {stated_mm:.4} mm");
+            format!("the probe radius of the measurement is {told_mm:.4} mm, that of the recipe is {stated_mm:.4} mm");
         return Some(GateFailure::Broken(message));
     }
     if !plan.targets.is_empty() && measurement.points.len() != plan.targets.len() {
         let (found, planned) = (measurement.points.len(), plan.targets.len());
-        return Some(GateFailure::Broken(format!("{found} points came for {planned} targets")));
+        return Some(GateFailure::Broken(format!("the machine returned {found} points for {planned} targets")));
     }
     if let Some(flaw) = measurement.range_violation() {
         return Some(GateFailure::Broken(flaw));
@@ -273,7 +275,7 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
     let order = measurement.points.iter().zip(&plan.targets).position(|(p, t)| p.index != t.index);
     if let Some(k) = order {
         let (found, planned) = (measurement.points[k].index, plan.targets[k].index);
-        return Some(GateFailure::Broken(format!("point {} is of target {found}, and target {planned} is due", k + 1)));
+        return Some(GateFailure::Broken(format!("point {} is of target {found}, expected target {planned}", k + 1)));
     }
     match plan.check(measurement).err()? {
         PlanMismatch::EqualsPlan if task.rehearsal => None,
@@ -294,9 +296,8 @@ fn given_again(task: &Task, earlier: Option<&(u32, Arc<Points>)>, measurement: &
     let old: HashSet<_> = points.part.iter().map(|point| bits([point.x, point.y, point.z])).collect();
     let is_same = touched().filter(|point| old.contains(&bits(point.position_mm))).count() >= old.len();
     (is_same && old.len() >= ALIKE_BY_CHANCE).then(|| {
-        let message = format!(
-            "the points are those of cycle {number} to the last bit: the machine has given its old result again"
-        );
+        let message =
+            format!("the points equal those of cycle {number} to the last bit: the machine returned its old result");
         GateFailure::Foreign(message)
     })
 }
@@ -304,15 +305,15 @@ fn given_again(task: &Task, earlier: Option<&(u32, Arc<Points>)>, measurement: &
 /// Returns a failure if the temperature is outside the window of the recipe, or is missing when there is a window.
 fn out_of_window(task: &Task, measurement: &Measurement) -> Option<GateFailure> {
     if task.expansion.is_some() && measurement.temperature_c.is_none() {
-        let message = "the measurement does not say its temperature, by which the expansion of the part is taken off (part.expansion_um_m_k)";
+        let message = "the measurement has no temperature, which the compensation of the expansion requires (part.expansion_um_m_k)";
         return Some(GateFailure::Temperature(message.to_owned()));
     }
     let [least, most] = task.temperature_c?;
-    let wanted = format!("and {least:.2} to {most:.2} degrees Celsius are wanted (measure.temperature_c)");
+    let wanted = format!("limits {least:.2} to {most:.2} °C (measure.temperature_c)");
     match measurement.temperature_c {
         Some(told) if (least..=most).contains(&told) => None,
-        Some(told) => Some(GateFailure::Temperature(format!("it was {told:.2} degrees Celsius, {wanted}"))),
-        None => Some(GateFailure::Temperature(format!("the measurement does not say its temperature, {wanted}"))),
+        Some(told) => Some(GateFailure::Temperature(format!("it was {told:.2} °C, {wanted}"))),
+        None => Some(GateFailure::Temperature(format!("the measurement has no temperature, {wanted}"))),
     }
 }
 
@@ -357,7 +358,7 @@ fn registered(
     cycle: &Cycle,
     before: Option<&Cycle>,
 ) -> Result<Registered, Unfinished<String>> {
-    let none = || Unfinished::For("there are no points of this cycle".to_owned());
+    let none = || Unfinished::For("this cycle has no points".to_owned());
     let points = cycle.points.as_ref().ok_or_else(none)?;
     // The target surface of this pass is above the nominal one by its level, and the ball rolls on it.
     let radius_mm = points.radius_mm.unwrap_or(task.probing.probe_radius_mm);
@@ -432,12 +433,12 @@ fn registered(
     let mut figures = figures(task, cycle, &found, form.as_ref().ok(), error.as_ref(), answer, forecast);
     figures.warnings.extend(error.iter().flat_map(|map| map.advice.iter().cloned()).chain(offered));
     if task.expansion.is_some() && grown.is_none() {
-        let message = "the measurement does not tell its temperature: the growth of the part is not taken off (part.expansion_um_m_k)";
+        let message =
+            "the measurement has no temperature: the expansion of the part is not compensated (part.expansion_um_m_k)";
         figures.warnings.push(message.to_owned());
     }
-    let untold = |error: &String| {
-        format!("form and scatter of the probe could not be told apart, so U is less than it should be: {error}")
-    };
+    let untold =
+        |error: &String| format!("form and noise of the probe could not be separated, so U is too small: {error}");
     if next.is_none() {
         figures.warnings.extend(form.as_ref().err().map(untold));
     }
@@ -459,7 +460,7 @@ fn registered(
     let again = again.filter(|_| task.tolerance.left_out_decides(&figures));
     if let Some(again) = again.as_ref().filter(|_| points.rounds == 0) {
         let targets = again.targets.len() as u32;
-        let why = "a touch stands alone: it is made again, and a few around it".to_owned();
+        let why = "a touch is an outlier: it is repeated, with a few touches around it".to_owned();
         figures.touch_on = Some(Box::new(TouchOn { targets, why }));
     }
     let field = next.is_none().then(|| form.as_ref().ok()?.hyperparameters_without_prior).flatten();
@@ -737,7 +738,7 @@ fn asks(cycle: &Cycle) -> Vec<String> {
         let (units, unit) = (p.kind.units(), p.kind.unit());
         let key = p.kind.key().unwrap_or_default();
         format!(
-            "{} is off by {:.2} \u{b1} {:.2} {unit}, and {:.2} {unit} of it would be taken back, more than compensation.parameters.{key}",
+            "{}: error {:.2} \u{b1} {:.2} {unit}; its compensation of {:.2} {unit} exceeds compensation.parameters.{key}",
             p.kind.name(),
             units * p.value,
             2.0 * units * p.sigma,

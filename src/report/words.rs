@@ -27,7 +27,7 @@ pub fn words(record: &Record) -> String {
 fn told_words(told: &Told) -> Option<String> {
     match told {
         Told::Begun(value) => begin_words(value),
-        Told::OpenedAgain => Some("opened again".to_owned()),
+        Told::OpenedAgain => Some("reopened".to_owned()),
         Told::Command(command) => Some(command_words(command)),
         Told::Event(event) => Some(event_words(event)),
         Told::Answer(answer) => Some(format!("answered: {answer}")),
@@ -79,8 +79,8 @@ fn person_words(device: Device, value: &Value) -> Option<String> {
 }
 
 fn step_words(device: Device, value: &Value) -> Option<String> {
-    let (step, seen) = (value["recover"].as_str()?, value["seen"].as_str().unwrap_or("not told"));
-    Some(format!("{device}: to be brought home by {step}, it was seen {seen}"))
+    let (step, seen) = (value["recover"].as_str()?, value["seen"].as_str().unwrap_or("unknown"));
+    Some(format!("{device}: to be brought home by {step}, its state is {seen}"))
 }
 
 /// Returns in words, for CMM and grinder, if each is home.
@@ -103,27 +103,23 @@ fn pass_words(value: &Value) -> Option<String> {
     let number = |key: &str| value[key].as_f64();
     let told = [
         number("path_mm").map(|mm| format!("path {mm:.0$} mm", usize::from(mm < 100.0))),
-        number("removed_mm3").map(|mm3| format!("{mm3:.1} mm3 taken off")),
-        number("deepest_mm").map(|mm| format!("{:.1} um at the deepest", 1e3 * mm)),
+        number("removed_mm3").map(|mm3| format!("{mm3:.1} mm³ removed")),
+        number("deepest_mm").map(|mm| format!("largest depth {:.1} µm", 1e3 * mm)),
         number("idle_share").map(|share| format!("{:.0} % of the path in air", 1e2 * share)),
         number("spindle_load").map(|share| format!("spindle load {:.0} %", 1e2 * share)),
         number("wheel_radius_mm").map(|mm| format!("wheel radius {mm:.4} mm")),
-        number("temperature_c").map(|c| format!("{c:.1} C")),
+        number("temperature_c").map(|c| format!("{c:.1} °C")),
         number("duration_s").map(|s| format!("{s:.0} s")),
     ];
     let told: Vec<String> = told.into_iter().flatten().collect();
-    if told.is_empty() {
-        Some("pass: nothing is told of it".into())
-    } else {
-        Some(format!("pass: {}", told.join(", ")))
-    }
+    if told.is_empty() { Some("pass: no details reported".into()) } else { Some(format!("pass: {}", told.join(", "))) }
 }
 
 fn transfer_words(value: &Value) -> Option<String> {
     let (points, seconds) = (value["points"].as_u64()?, value["seconds"].as_f64()?);
     let mut line = format!("{points} points fetched in {seconds:.2} s");
     if let Some(ms) = value["ms_per_point"].as_f64() {
-        let _ = write!(line, ", {ms:.3} ms a point");
+        let _ = write!(line, ", {ms:.3} ms per point");
     }
     match value["coordinates"].as_str() {
         Some("centres") => line += ", probe centres",
@@ -142,7 +138,7 @@ pub fn ending_words(ending: &Ending) -> String {
         Ending::Stopped { reason, .. } => format!("STOPPED: {reason}"),
         Ending::Aborted { reason, confirmed: true, .. } => format!("ABORTED: {reason}"),
         Ending::Aborted { reason, confirmed: false, .. } => {
-            format!("ABORTED, and not every machine has confirmed that it stands: {reason}")
+            format!("ABORTED, and not every machine has confirmed that it is at rest: {reason}")
         }
     }
 }
@@ -227,11 +223,11 @@ fn event_words(event: &Event) -> String {
         Event::Reconciled { outcome, .. } => reconciliation_words(outcome),
         Event::Collected { targets, found, gate, .. } => format!("{found} of {targets} points, {}", gate_words(gate)),
         Event::Qualified { radius_error_mm, .. } => {
-            format!("radius of the probe off by {:.2} um", 1e3 * radius_error_mm)
+            format!("radius error of the probe {:.2} µm", 1e3 * radius_error_mm)
         }
         Event::Registered { figures, .. } => figures_words(figures),
         Event::Compensated { summary, .. } => format!(
-            "up to {:.2} um, {:.2} um deep, {}, PV {:.2} um expected{}",
+            "correction up to {:.2} µm, depth {:.2} µm, {}, expected PV {:.2} µm{}",
             1e3 * summary.largest_mm,
             1e3 * summary.depth_mm,
             in_air(summary.air_share),
@@ -274,11 +270,11 @@ fn mismatch_words(why: &Mismatch) -> String {
 
 fn reconciliation_words(outcome: &Reconciliation) -> String {
     match outcome {
-        Reconciliation::Running => "it runs".to_owned(),
-        Reconciliation::Held => "it is held".to_owned(),
-        Reconciliation::Ended(result) => format!("it is over, {result}"),
-        Reconciliation::NotStarted => "it was not started".to_owned(),
-        Reconciliation::Unknown(words) => format!("nobody knows: {words}"),
+        Reconciliation::Running => "running".to_owned(),
+        Reconciliation::Held => "held".to_owned(),
+        Reconciliation::Ended(result) => format!("ended, {result}"),
+        Reconciliation::NotStarted => "not started".to_owned(),
+        Reconciliation::Unknown(words) => format!("unknown: {words}"),
     }
 }
 
@@ -301,7 +297,7 @@ pub(super) fn gate_words(gate: &Gate) -> String {
 
 fn figures_words(figures: &Figures) -> String {
     let mut line = format!(
-        "PV {:.2} um, rms {:.3} um, {} points, {} outliers",
+        "PV {:.2} µm, RMS {:.3} µm, {} points, {} outliers",
         1e3 * figures.pv_mm,
         1e3 * figures.rms_mm,
         figures.points,
@@ -309,9 +305,9 @@ fn figures_words(figures: &Figures) -> String {
     );
     if let Some(form) = &figures.form {
         let um =
-            |of: &Interval| format!("{:.2} ({:.2} to {:.2}) um", 1e3 * of.median_mm, 1e3 * of.low_mm, 1e3 * of.high_mm);
+            |of: &Interval| format!("{:.2} ({:.2} to {:.2}) µm", 1e3 * of.median_mm, 1e3 * of.low_mm, 1e3 * of.high_mm);
         let (pv, rms, scatter_um) = (um(&form.pv_robust), um(&form.rms), 1e3 * form.scatter_mm);
-        let _ = write!(line, "; the form without the scatter of {scatter_um:.2} um: PV 99.8 % {pv}, rms {rms}");
+        let _ = write!(line, "; form without the noise of {scatter_um:.2} µm: PV 99.8 % {pv}, RMS {rms}");
     }
     for words in figures.weak_directions.iter().chain(&figures.warnings) {
         let _ = write!(line, "; {words}");
@@ -324,7 +320,7 @@ fn figures_words(figures: &Figures) -> String {
 pub(super) fn parameters_words(summary: &regrind_cell::CompensationSummary) -> Vec<String> {
     let told = summary.parameters.iter().map(regrind_cell::ParameterTold::in_words);
     let left = summary.map_rms_mm.filter(|_| !summary.parameters.is_empty());
-    told.chain(left.map(|mm| format!("left for the map: {:.2} um rms", 1e3 * mm))).collect()
+    told.chain(left.map(|mm| format!("left for the map: {:.2} µm RMS", 1e3 * mm))).collect()
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ use serde_json::Value;
 fn run_against(home: &Path, recipe: &str, cell: &str, serving: &mut Running) -> f64 {
     let mut running = Running::new(regrind(&["run", recipe, "--cell", cell, "--runs", "runs", "--part", "SN-2"], home));
     let folder = running.folder(home);
-    let line = running.line("time per point", |line| line.contains("ms a point"));
+    let line = running.line("time per point", |line| line.contains("ms per point"));
     println!("{line}");
     let (code, errors) = running.end();
     let said = running.said.join("\n");

@@ -224,7 +224,7 @@ fn the_table_says_what_happened_and_is_marked() {
         "event         1  start",
         "grinder: connected, a simulation, idle",
         "grinder: fault, 5, drive [2J too warm",
-        "registered, PV 4.20 um, rms 0.812 um, 812 points, 3 outliers; the part is warm",
+        "registered, PV 4.20 µm, RMS 0.812 µm, 812 points, 3 outliers; the part is warm",
         "intent        2  grinder: start",
         "ALARM A machine is in fault: grinder. The run is aborted.",
         "judged, accept: in tolerance",

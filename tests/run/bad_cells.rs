@@ -101,7 +101,7 @@ fn fills_up(command: Command, home: &Path, named: &str, fill: impl FnOnce()) {
     // An abort needs no disk. The program reports that the abort is not on record, unless there was just enough room
     // for it.
     let (code, _, errors) = run(&["abort", folder.to_str().unwrap()], home);
-    let is_said = errors.contains("carried out") && errors.contains("not on record");
+    let is_said = errors.contains("carried out") && errors.contains("not recorded");
     assert!(code == 0 || code == 3 && is_said, "{code} {errors}");
     let (code, words) = running.end();
     println!("{}\n{words}", running.said.join("\n"));
@@ -176,7 +176,7 @@ fn a_disk_that_fills_up_without_room_for_a_cycle_begins_none() {
     let folder = running.folder(home.path());
     disk.fill_to(4 << 20);
     let alarm = running.line("alarm", |line| line.starts_with("ALARM"));
-    assert!(alarm.contains("disk") && alarm.contains("MB left"), "{alarm}");
+    assert!(alarm.contains("disk") && alarm.contains("MB free"), "{alarm}");
     fs::remove_file(home.path().join("other/filler")).unwrap();
     running.until("held", |_| {
         let (_, said, _) = run(&["status", folder.to_str().unwrap()], home.path());
@@ -417,7 +417,7 @@ fn ctrl_c_holds_once_and_aborts_twice() {
     for part in [
         "SIMULATION  Held (Grind, Run), cycle 1 of at most ",
         "grinding, ",
-        "next     regrind resume goes on",
+        "next     to continue: regrind resume",
         ", run ",
     ] {
         assert!(said.contains(part), "{part:?}: {said}");

@@ -106,7 +106,7 @@ async fn a_result_of_another_probe_than_the_recipes_is_not_used() {
     };
     let alarm = tokio::time::timeout(PATIENCE, told).await.expect("an alarm");
     assert_eq!(alarm.id, AlarmId::BrokenResult, "{alarm:?}");
-    assert!(alarm.what.contains("mm radius, and the recipe says"), "{}", alarm.what);
+    assert!(alarm.what.contains("mm, that of the recipe is"), "{}", alarm.what);
     until(&folder, |words| words.starts_with("Held (Measure, Send)")).await;
     order(&folder, Request::Abort { reason: "seen enough".into() }).await;
     running.await.unwrap();

@@ -55,14 +55,14 @@ fn each_is_caught<const N: usize>(cases: [Case; N], passes: usize) {
 #[test]
 fn machines_that_answer_wrongly_are_told_before_anything_is_written() {
     let (other_order, exchanged) = (Setup { other_word_order: true, ..usual() }, Setup { exchanged: true, ..usual() });
-    let order_words = &["word order", "nothing was written", "word_order in the cell file"];
+    let order_words = &["word order", "Nothing was written", "word_order in the cell file"];
     let older = &["version 1 of the register map", "lacks a beat that names its owner", "bring it up to version 2"];
     let newer = &["version 3 of the register map", "this program is the older one"];
     let cases: [(&str, Setup, AlarmId, &[&str]); 4] = [
         ("an older map", Setup { version: 1, ..usual() }, AlarmId::WrongDevice, older),
         ("a newer map", Setup { version: 3, ..usual() }, AlarmId::WrongDevice, newer),
         ("word order", other_order, AlarmId::WordOrder, order_words),
-        ("exchanged", exchanged, AlarmId::WrongDevice, &["Another device answers", "address in the cell file"]),
+        ("exchanged", exchanged, AlarmId::WrongDevice, &["A device other than", "address in the cell file"]),
     ];
     for (what, setup, alarm, words) in cases {
         let ran = caught(what, setup, alarm, words, 0);
@@ -81,11 +81,11 @@ fn a_map_of_another_part_is_not_ground() {
 fn what_is_done_to_a_map_is_told_at_the_first_pass_with_one() {
     let none = WorldFaults::default;
     let mirrored = |map_mirrored| WorldFaults { map_mirrored, ..none() };
-    let turned = &["turned map", "how the part is turned"];
+    let turned = &["rotated map", "how the part is turned"];
     let flipped = WorldFaults { map_sign_flipped: true, ..none() };
     each_is_caught(
         [
-            ("sign flipped", flipped, AlarmId::SignFlipped, &["the other way round", "sign"]),
+            ("sign flipped", flipped, AlarmId::SignFlipped, &["opposite sign", "sign of the map"]),
             ("x mirrored", mirrored(Mirrored::X), AlarmId::Mirrored, &["mirrored", "direction of x and y"]),
             ("y mirrored", mirrored(Mirrored::Y), AlarmId::Mirrored, &["mirrored", "direction of x and y"]),
             ("half a turn", mirrored(Mirrored::HalfTurn), AlarmId::Mirrored, turned),
@@ -94,9 +94,14 @@ fn what_is_done_to_a_map_is_told_at_the_first_pass_with_one() {
                 "twice",
                 WorldFaults { map_doubled: true, ..none() },
                 AlarmId::Doubled,
-                &["two times", "in one place only"],
+                &["applied twice", "in one place only"],
             ),
-            ("ignored", WorldFaults { map_ignored: true, ..none() }, AlarmId::NoEffect, &["did not answer to the map"]),
+            (
+                "ignored",
+                WorldFaults { map_ignored: true, ..none() },
+                AlarmId::NoEffect,
+                &["did not respond to the map"],
+            ),
         ],
         2,
     );
@@ -110,10 +115,10 @@ fn what_a_grinder_says_of_its_pass_is_held_against_what_it_was_told() {
         [
             ("another job", says(Misreported::Job), alarm, &["the job in the pass record"]),
             ("failed", says(Misreported::Result), alarm, &["the result in the pass record"]),
-            ("too deep", says(Misreported::Depth), alarm, &["largest depth taken off is 3.000 mm", "at most 0.535 mm"]),
-            ("no path", says(Misreported::Path), alarm, &["the path travelled is -1.000 mm", "are needed"]),
-            ("another wheel", says(Misreported::Wheel), alarm, &["the radius of the wheel is", "are possible"]),
-            ("no time", says(Misreported::Duration), alarm, &["its duration is 0.000 s", "are needed"]),
+            ("too deep", says(Misreported::Depth), alarm, &["largest removed depth is 3.000 mm", "maximum 0.535 mm"]),
+            ("no path", says(Misreported::Path), alarm, &["the path travelled is -1.000 mm", "minimum"]),
+            ("another wheel", says(Misreported::Wheel), alarm, &["the radius of the wheel is", "limits"]),
+            ("no time", says(Misreported::Duration), alarm, &["its duration is 0.000 s", "minimum"]),
         ],
         1,
     );
@@ -136,8 +141,8 @@ fn what_is_wrong_with_a_measurement_is_told_from_it() {
                 &["inches", "millimetres"],
             ),
             ("no part", WorldFaults { no_part: true, ..none() }, AlarmId::NoPart, nothing_there),
-            ("no number", WorldFaults { non_finite_point: true, ..none() }, AlarmId::BrokenResult, &["broken", "not"]),
-            ("missing records", WorldFaults { missing_records: 3, ..none() }, AlarmId::BrokenResult, &["broken"]),
+            ("no number", WorldFaults { non_finite_point: true, ..none() }, AlarmId::BrokenResult, &["invalid", "not"]),
+            ("missing records", WorldFaults { missing_records: 3, ..none() }, AlarmId::BrokenResult, &["invalid"]),
         ],
         1,
     );
@@ -147,9 +152,9 @@ fn what_is_wrong_with_a_measurement_is_told_from_it() {
 fn a_measurement_outside_its_window_of_temperature_is_not_used() {
     let window = |least: f64, most: f64| Setup { temperature_c: Some([least, most]), ..usual() };
     let warm = window(19.5, 20.5).with(|world| world.cmm.part_temperature_c = 23.25);
-    let words = &["it was 23.25 degrees Celsius, and 19.50 to 20.50 degrees Celsius are wanted", "Let the part"];
+    let words = &["it was 23.25 °C, limits 19.50 to 20.50 °C", "temperature of part and room"];
     caught("a warm part", warm, AlarmId::Temperature, words, 1);
-    let words = &["it was 20.00 degrees Celsius, and 20.50 to 21.00 degrees"];
+    let words = &["it was 20.00 °C, limits 20.50 to 21.00 °C"];
     caught("a window above the part", window(20.5, 21.0), AlarmId::Temperature, words, 1);
 }
 
@@ -186,7 +191,7 @@ fn a_warm_part_is_judged_by_what_it_is_at_20_degrees() {
 fn a_probe_that_is_10_um_off_is_told_from_the_reference_sphere() {
     for error_um in [10.0, -10.0] {
         let setup = usual().with(move |world| world.cmm.probe_radius_error_um = error_um);
-        let words = ["radius of the probe", "off by", "Qualify the probe"];
+        let words = ["radius of the probe", "the difference is", "Qualify the probe"];
         caught(&format!("{error_um} um"), setup, AlarmId::ProbeRadius, &words, 1);
     }
 }
@@ -196,9 +201,9 @@ fn a_part_that_lies_turned_round_is_told() {
     let faults = WorldFaults { part_turned_180: true, ..WorldFaults::default() };
     // The probe meets the steep part during a free move, and the machine stops by itself. The alarm must still send a
     // person to the part.
-    let words = ["see how the part lies", "turned round"];
+    let words = ["check the position of the part", "turned"];
     let ran = caught("a steep part", broken(faults.clone()), AlarmId::MachineFault, &words, 1);
     assert!(matches!(ran.ending, Ending::Aborted { cycle: 1, confirmed: true, .. }), "{}", ran.told());
     let setup = Setup::new("shallow-wave", 1).with(move |world| world.faults = faults.clone());
-    caught("a shallow part", setup, AlarmId::PartMisplaced, &["turned round", "degrees"], 1);
+    caught("a shallow part", setup, AlarmId::PartMisplaced, &["turned", "°, limit"], 1);
 }

@@ -60,7 +60,7 @@ fn a_record_that_is_deleted_ends_with_the_run_and_no_further_pass_is_started() {
     running.until("a held cell", |_| run(&["status", &path], home.path()).1.contains("Held").then_some(()));
     // The safety order is carried out, and the person learns that it is not on record.
     let (code, _, told) = run(&["abort", &path], home.path());
-    assert!(code == 3 && told.contains("not on record"), "{told}");
+    assert!(code == 3 && told.contains("not recorded"), "{told}");
     let (code, errors) = running.end();
     assert!(code != 0, "{errors}");
     let said = running.said.join("\n");
@@ -77,13 +77,13 @@ fn a_control_socket_that_is_deleted_is_told_and_made_again_and_orders_come_in_me
     // While the folder has no socket, the order goes through the socket next to the lock of the machines.
     let (code, told, errors) = run(&["hold", &path, "--reason", "the socket is gone"], home.path());
     assert_eq!(code, 0, "{told}{errors}");
-    running.line("the alarm", |line| line.contains("The way by which orders reach the cell was taken away"));
+    running.line("the alarm", |line| line.contains("The channel for orders to the cell is lost"));
     running.until("a socket that is made again", |_| socket.exists().then_some(()));
     // Another file in place of the socket is not a socket, and is left alone.
     fs::remove_file(&socket).unwrap();
     fs::write(&socket, "mine").unwrap();
     running.until("another alarm", |said| {
-        let alarms = said.iter().filter(|line| line.contains("The way by which orders reach the cell was taken away"));
+        let alarms = said.iter().filter(|line| line.contains("The channel for orders to the cell is lost"));
         (alarms.count() == 2).then_some(())
     });
     assert_eq!(fs::read_to_string(&socket).unwrap(), "mine");
@@ -104,7 +104,7 @@ fn a_cell_whose_runs_folder_is_deleted_takes_orders_all_the_same() {
     // The run is found by its machines, without its name. The abort is carried out, and the person learns that it is
     // not on record.
     let (code, told, errors) = run(&["abort"], home.path());
-    assert!(code == 3 && errors.contains("not on record"), "{code} {told}{errors}");
+    assert!(code == 3 && errors.contains("not recorded"), "{code} {told}{errors}");
     let (code, errors) = running.end();
     assert!(code != 0 && !running.said.join("\n").contains("ACCEPTED"), "{errors}");
     let (code, told, errors) = run(&["status", &folder.display().to_string()], home.path());

@@ -56,11 +56,11 @@ fn first_rms_mm(run: &Path) -> f64 {
 fn a_part_begins_with_what_the_one_before_it_told() {
     let shop = Shop::new();
     let (first, said) = shop.ran(&shop.recipe);
-    assert!(said.contains("begins from nothing"), "{said}");
+    assert!(said.contains("begins without knowledge"), "{said}");
     let name = first.file_name().unwrap().to_str().unwrap().to_owned();
 
     let (second, said) = shop.ran(&shop.recipe);
-    assert!(said.contains(&format!("begins with what {name} found")), "{said}");
+    assert!(said.contains(&format!("begins with the error that {name} found")), "{said}");
     let [before, after] = [&first, &second].map(|run| first_rms_mm(run));
     assert!(after < 0.5 * before, "the first pass left {before} mm, and that of the next part {after} mm");
     // The record contains the initial state, and the correction of the first pass.
@@ -83,7 +83,7 @@ fn a_part_begins_with_what_the_one_before_it_told() {
 
     // Another rule for the gain makes the learned state incompatible.
     let (_, said) = shop.ran(&replaced(&shop.recipe, "learn = true", "learn = true\ngain = 0.8"));
-    assert!(said.contains("begins from nothing"), "{said}");
+    assert!(said.contains("begins without knowledge"), "{said}");
 }
 
 #[test]
@@ -105,7 +105,7 @@ fn what_cannot_be_begun_with_is_refused() {
     fs::write(first.join("learned.json"), "{").unwrap();
     let (_, said) = shop.ran(&shop.recipe);
     assert!(
-        said.contains("left alone:") && said.contains("learned.json") && said.contains("begins from nothing"),
+        said.contains("ignored:") && said.contains("learned.json") && said.contains("begins without knowledge"),
         "{said}"
     );
 }

@@ -193,7 +193,7 @@ async fn a_machine_that_says_held_and_gets_further_is_aborted() {
     assert_eq!(alarm(&mut notices).await.0, AlarmId::MachineHeldItself);
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::HoldNotConfirmed, "{what}");
-    assert!(what.contains("it says HELD, and its progress has risen"), "{what}");
+    assert!(what.contains("it reports HELD, but its progress has risen"), "{what}");
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { .. }), "{ending:?}");
 }
@@ -213,7 +213,7 @@ async fn a_stop_that_is_taken_and_not_done_is_told_and_aborted() {
     assert!(order(&folder, Request::Stop { reason: "enough".into() }).await.0.taken);
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::StopNotConfirmed, "{what}");
-    assert!(what.contains("it took the STOP, and is EXECUTE"), "{what}");
+    assert!(what.contains("it took the STOP, but is still EXECUTE"), "{what}");
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { .. }), "{ending:?}");
 }
@@ -270,7 +270,7 @@ async fn figures_of_a_measurement_that_cannot_be_make_nothing_of_it() {
     }
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::ForeignResult, "{what}");
-    assert!(what.contains("the points are those of cycle 6 to the last bit"), "{what}");
+    assert!(what.contains("the points equal those of cycle 6 to the last bit"), "{what}");
     order(&folder, Request::Abort { reason: "seen enough".into() }).await;
     running.await.unwrap();
 }

@@ -203,7 +203,7 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
                 let (code, told) = person.types("confirm done");
                 assert!(code == 3 && told.contains("confirm first that it has begun"), "{told}");
                 let (code, told) = person.types("confirm started --map 0123456789abcdef");
-                assert!(code == 3 && told.contains("is another one"), "{told}");
+                assert!(code == 3 && told.contains("the confirmation names"), "{told}");
                 let ngc = file(": by ", " (map");
                 let correction = ngc.with_file_name("correction.csv");
                 let map = stated(&correction, "# map: sha256");

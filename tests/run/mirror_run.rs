@@ -181,8 +181,8 @@ fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confir
     assert!(folder.join("cycle-1/error_map.csv").is_file());
     // The confirmation of a person who works by another map is refused.
     program.until("a pass that is under way", |_| match shop.confirm("started", "00000000") {
-        (false, text) if text.contains("is another one") => Some(()),
-        (false, text) if text.contains("no pass is under way") => None,
+        (false, text) if text.contains("the confirmation names") => Some(()),
+        (false, text) if text.contains("no pass is in progress") => None,
         told => panic!("{told:?}"),
     });
     program.until("the start to be confirmed", |_| shop.confirm("started", &map[..8]).0.then_some(()));

@@ -182,7 +182,7 @@ async fn an_abort_is_given_while_another_process_has_the_journal_and_answered_wh
     // A person who had to wait too long learns that the order is not on record. No person learns that it is on record
     // before it is.
     let reply = ordered.await.unwrap();
-    assert!(if reply.taken { on_record(&folder) } else { reply.message.contains("not on record") }, "{reply:?}");
+    assert!(if reply.taken { on_record(&folder) } else { reply.message.contains("not recorded") }, "{reply:?}");
     let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
     assert!(on_record(&folder) && verify(&folder).unwrap().closed);

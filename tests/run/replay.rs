@@ -100,7 +100,7 @@ async fn what_would_be_decided_or_computed_otherwise_is_named_and_nothing_is_gon
     let decided = said(|_, plan| plan.max_cycles = 2);
     assert!(decided.contains("max_cycles") && decided.contains("the record has"), "{decided}");
     let computed = said(|task, _| task.map.cutoff_mm *= 1.01);
-    assert!(computed.contains("computed again"), "{computed}");
+    assert!(computed.contains("repeated computation"), "{computed}");
     // No figure depends on this value. Only the plan that the machine received contains it.
     let planned = said(|task, _| task.probing.safe_height_mm += 1.0);
     assert!(planned.contains("the CMM was prepared"), "{planned}");

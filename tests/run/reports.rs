@@ -211,7 +211,7 @@ fn the_judged_figure_stands_beside_its_limit_and_every_other_says_what_it_is() {
         assert!(row[0].starts_with(name), "{row:?}");
         let (expanded, between) = (format!("\u{b1} {:.2}", 0.5 * (high - low)), format!("{low:.2} to {high:.2}"));
         assert_eq!(row[1..5], [format!("{found:.2}"), expanded, between, format!("{limit:.2}")], "{row:?}");
-        assert!(row[5].starts_with("within it with"), "{row:?}");
+        assert!(row[5].starts_with("P(in tolerance)"), "{row:?}");
         assert!(row[6].contains("within the limit") && row[6].contains(&format!("at most {high:.2}")), "{row:?}");
     }
     let bold = page.texts(|node| node.has_tag_name("strong"));
@@ -283,7 +283,7 @@ fn the_report_of_an_aborted_run_says_so_and_which_order_was_refused() {
     assert_eq!(running.end().0, 3);
     // The terminal of the run shows the refusal, and does not show that the cell went on.
     let said = running.said.join("\n");
-    assert!(said.contains("not done: ") && said.contains("ABORT ") && !said.contains("RESUME "), "{said}");
+    assert!(said.contains("refused: ") && said.contains("ABORT ") && !said.contains("RESUME "), "{said}");
     let page = Page::of(&folder);
     let ending = json_in(&folder, "result.json")["ending"].clone();
     assert_eq!((&ending["ending"], &ending["confirmed"]), (&json!("aborted"), &json!(true)));
@@ -385,7 +385,7 @@ fn alarms_stand_in_words_with_when_they_were_raised_and_when_withdrawn() {
     assert!(grinder[0].contains(&times[2]) && grinder[1].contains(&times[3]), "{grinder:?} {times:?}");
     assert!(cmm[1].contains(&times[6]), "{cmm:?} {times:?}");
     assert_eq!(fault[1], "not withdrawn");
-    assert!(page.verdict().0.starts_with("ABORTED, and not every machine has confirmed that it stands: smoke"));
+    assert!(page.verdict().0.starts_with("ABORTED, and not every machine has confirmed that it is at rest: smoke"));
     let shown = shown(&folder);
     let said = |words: &str| shown.iter().any(|(_, row)| row.contains(words));
     assert!(said("ALARM A machine is in fault: grinder. The cell is held."), "{shown:#?}");
@@ -454,12 +454,12 @@ fn no_record_of_a_run_is_shown_raw_whatever_kind_it_stands_as() {
     }
     let said = |words: &str| assert!(shown.iter().any(|(_, row)| row.contains(words)), "{words}: {shown:#?}");
     said(
-        "pass: path 1250 mm, 12.5 mm3 taken off, 20.0 um at the deepest, 25 % of the path in air, wheel radius 12.5000 mm, 21.0 C, 75 s",
+        "pass: path 1250 mm, 12.5 mm³ removed, largest depth 20.0 µm, 25 % of the path in air, wheel radius 12.5000 mm, 21.0 °C, 75 s",
     );
-    said("812 points fetched in 0.50 s, 0.616 ms a point, probe centres");
+    said("812 points fetched in 0.50 s, 0.616 ms per point, probe centres");
     said("CMM: waits for a file; left alone: old.csv");
     said("grinder: done, map 3fa9c210");
-    said("grinder: to be brought home by CLEAR, it was seen FAULTED");
+    said("grinder: to be brought home by CLEAR, its state is FAULTED");
     said("answered: IDLE");
     // A person's confirmation about a machine is an order like any other. The report shows why an order was refused.
     let orders: Vec<String> = Page::of(&folder).rows("orders").iter().map(|row| row.join("|")).collect();

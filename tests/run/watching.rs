@@ -77,7 +77,7 @@ async fn the_key_of_the_idle_machine_holds_the_one_that_moves() {
     turn(&rig, CMM, Mode::Manual);
     let alarm = run.alarm().await;
     assert_eq!(alarm.id, AlarmId::NotAutomatic);
-    assert!(alarm.what.contains("says that it is in manual mode, while the grinder is at its job"), "{}", alarm.what);
+    assert!(alarm.what.contains("reports manual mode, while the grinder runs its job"), "{}", alarm.what);
     until(&run.folder, |words| words.starts_with("Held (Grind, Run)")).await;
     assert!(rig.command_at(GRINDER, HOLD, turned).is_some());
     let (reply, ..) = order(&run.folder, Request::Resume { reason: String::new(), seen: None }).await;

@@ -131,7 +131,7 @@ pub async fn give(
     let reply = orders.ask(request(reason.clone()), actor()).await;
     let Some(reply) = reply.filter(|_| !life.is_dead()) else { return };
     let accepted = reply.taken;
-    let done = accepted || reply.message.contains("what makes safe was carried out");
+    let done = accepted || reply.message.contains("make the cell safe were carried out");
     given.lock().unwrap().push(Given { at, answered: Instant::now(), what, reason, accepted, done, moved });
 }
 

@@ -364,8 +364,8 @@ fn a_part_is_accepted_with_the_probability_that_the_recipe_asks_for() {
     }
     let [pv, rms] = plan().tolerance.compare(&below(1.0));
     assert!((rms.within.unwrap() - 0.841_345).abs() < 1e-5, "{rms:?}");
-    assert_eq!(rms.within_in_words().unwrap(), "within it with 84.1 %");
-    assert_eq!(pv.within_in_words().unwrap(), "within it with more than 99.9 %");
+    assert_eq!(rms.within_in_words().unwrap(), "P(in tolerance) = 84.1 %");
+    assert_eq!(pv.within_in_words().unwrap(), "P(in tolerance) > 99.9 %");
     let open = Tolerance { pv_mm: f64::INFINITY, ..plan().tolerance };
     assert_eq!(open.compare(&below(1.0))[0].within, None);
     // Whoever has no number accepts nothing.
@@ -417,7 +417,10 @@ fn a_figure_without_a_limit_is_told_without_one() {
     let mut run = Run::new(open, |_| with_form([6.0, 6.4, 7.0], [0.4, 0.5, 0.6]));
     run.start().go_on();
     let told = run.judgements().last().unwrap().reason.clone();
-    assert!(told.contains("PV 6.40 um ± ") && told.contains(" um, RMS 0.50 um ± ") && !told.contains("inf"), "{told}");
+    assert!(
+        told.contains("PV: 6.40 µm ± ") && told.contains(" µm; RMS: 0.50 µm ± ") && !told.contains("inf"),
+        "{told}"
+    );
 }
 
 #[test]
@@ -445,10 +448,7 @@ fn a_run_that_ends_above_its_best_pass_names_it() {
     });
     run.start().go_on();
     let Some(Ending::NotAccepted { reason, .. }) = run.ending() else { panic!("{:?}", run.ending()) };
-    assert!(
-        reason.contains("the best was cycle 2 with PV 9.00 um and RMS 1.50 um") && reason.contains("cycle-2"),
-        "{reason}"
-    );
+    assert!(reason.contains("best cycle 2: PV 9.00 µm, RMS 1.50 µm") && reason.contains("cycle-2"), "{reason}");
 }
 
 #[test]
@@ -556,7 +556,7 @@ fn no_pass_is_ground_that_is_not_expected_to_make_it_better() {
     assert_eq!(run.verdicts(), [Verdict::Continue, Verdict::Stalled]);
     assert!(matches!(run.ending(), Some(Ending::NotAccepted { .. })) && run.cell.state() == State::Stopped);
     let told = &run.judgements().last().unwrap().reason;
-    assert!(told.contains("no gain is to be expected") && told.contains("RMS 6.00 um ± 0.02 um is expected"), "{told}");
+    assert!(told.contains("no improvement expected") && told.contains("another pass: RMS 6.00 µm ± 0.02 µm"), "{told}");
 }
 
 #[test]
@@ -667,7 +667,7 @@ fn an_abort_that_nobody_confirms_names_the_emergency_circuit_and_ends() {
         run.send(Event::Deadline);
     }
     assert_eq!(run.cell.state(), State::Aborted);
-    assert_eq!(run.cell.in_words(), "Aborted: neither machine has confirmed that it stands");
+    assert_eq!(run.cell.in_words(), "Aborted: neither machine has confirmed that it is at rest");
     assert!(matches!(run.ending(), Some(Ending::Aborted { confirmed: false, .. })));
     let alarm = run.all.iter().find_map(|c| if let Command::Raise(a) = c { Some(a.clone()) } else { None }).unwrap();
     assert!(alarm.remedy[0].contains("the machine's own emergency circuit"), "{alarm:?}");
@@ -680,7 +680,7 @@ fn an_abort_that_nobody_confirms_names_the_emergency_circuit_and_ends() {
         run.send(Event::Deadline);
     }
     assert_eq!(run.cell.unconfirmed(), [Device::Grinder]);
-    assert_eq!(run.cell.in_words(), "Aborted: the grinder has not confirmed that it stands");
+    assert_eq!(run.cell.in_words(), "Aborted: the grinder has not confirmed that it is at rest");
     // Both have, and neither was seen clear.
     let mut run = Run::good();
     run.start().until(State::Execute(Phase::Grind(JobStep::Run))).send(abort());
@@ -1479,7 +1479,7 @@ fn a_machine_that_is_found_moving_when_its_link_is_back_is_held() {
     run.send(Event::Deadline);
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Reconcile)));
     let message = run.cell.state().to_string();
-    assert!(message.ends_with("the grinder has not confirmed that it stands"), "{message}");
+    assert!(message.ends_with("the grinder has not confirmed that it is at rest"), "{message}");
     run.send(Event::LinkBack { device, boot_id: 7 });
     let commands = run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Running });
     assert_eq!(commands.last(), Some(&Command::HoldMachine { device }));
@@ -1542,7 +1542,7 @@ fn a_machine_in_manual_mode_holds_what_moves_and_nothing_is_started_beside_it() 
         let Some(Command::Raise(alarm)) = commands.first() else { panic!("{commands:?}") };
         assert_eq!(alarm.id, AlarmId::NotAutomatic);
         assert!(alarm.what.contains(&format!("{device}, it is in manual mode")), "{}", alarm.what);
-        assert_eq!(alarm.what.contains("while the grinder is at its job"), device == Device::Cmm, "{}", alarm.what);
+        assert_eq!(alarm.what.contains("while the grinder runs its job"), device == Device::Cmm, "{}", alarm.what);
         assert_eq!(commands.last(), Some(&Command::HoldMachine { device: Device::Grinder }));
         run.until(State::Held(Phase::Grind(JobStep::Run)));
         // Nobody goes on beside it.
@@ -1627,7 +1627,7 @@ fn a_job_without_progress_is_told_and_then_held() {
     let commands = run.send(Event::Deadline);
     let Some(Command::Raise(alarm)) = commands.first() else { panic!("{commands:?}") };
     assert_eq!((alarm.id, commands.len()), (AlarmId::ProgressStands, 1));
-    assert!(alarm.what.contains("grinder, for 30 s; after 30 s more it is held"), "{}", alarm.what);
+    assert!(alarm.what.contains("grinder, for 30 s; the cell holds it after 30 s more"), "{}", alarm.what);
     assert_eq!((run.cell.state(), due(&run)), (run_state, 30 * S));
     // It goes on: the alarm goes away by itself.
     let progressed = |done| Event::Progressed { device, done, total: 1000 };

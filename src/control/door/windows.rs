@@ -171,7 +171,7 @@ fn on_a_thread_of_its_own<T: Send + 'static>(
     let thread = std::thread::Builder::new().spawn(move || {
         tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?.block_on(what)
     })?;
-    thread.join().unwrap_or_else(|_| Err(io::Error::other("the thread that asks has ended")))
+    thread.join().unwrap_or_else(|_| Err(io::Error::other("the thread of the request has ended")))
 }
 
 #[cfg(test)]
