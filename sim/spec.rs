@@ -7,10 +7,10 @@ use serde::{Deserialize, Serialize};
 use crate::Vec3;
 use crate::part::{Aperture, PartSpec};
 
-/// Temperature at which lengths are what drawings say, in degrees Celsius.
+/// Temperature at which lengths are those of drawings, in °C.
 pub(crate) const REFERENCE_C: f64 = 20.0;
 
-/// What is wrong with the grinder.
+/// Errors of the grinder.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct GrinderSpec {
@@ -18,13 +18,13 @@ pub struct GrinderSpec {
     pub wheel_radius_error_um: f64,
     /// Offset of the wheel in x and y.
     pub setting_error_um: [f64; 2],
-    /// By how much the wheel is set too high.
+    /// Height by which the wheel is set too high.
     pub setting_error_z_um: f64,
-    /// By how much the part is tilted in the grinder about x and y of its own frame.
+    /// Tilt of the part in the grinder about x and y of its own frame.
     pub part_tilt_urad: [f64; 2],
     /// Straightness along x: amplitudes of the second and third Legendre polynomial over the part.
     pub straightness_x_um: [f64; 2],
-    /// The same along y.
+    /// Straightness along y: amplitudes of the same polynomials.
     pub straightness_y_um: [f64; 2],
     /// Amplitude of the screw's error along x.
     pub periodic_um: f64,
@@ -42,25 +42,26 @@ pub struct GrinderSpec {
     pub break_in_um: f64,
     /// Share of a finishing stroke after which all but 1/e of the fast wear is over.
     pub break_in_share: f64,
-    /// The wheel is dressed before every pass; else its fast wear is over after the first.
+    /// The wheel is dressed before every pass; otherwise its fast wear is over after the first.
     pub dressed_each_pass: bool,
     /// Growth of the spindle when it is warm through.
     pub thermal_um: f64,
     /// Its time constant.
     pub thermal_tau_s: f64,
-    /// Share of what stands proud that stays, mu.
+    /// Share of the excess height that remains after a pass, mu.
     pub error_copying: f64,
-    /// The wheel is a ball of the radius that the pass states, and leaves grooves around its tracks; else it is straight across them.
+    /// The wheel is a ball of the radius that the pass states, and leaves grooves around its tracks; otherwise it is
+    /// straight across them.
     pub scallops: bool,
     /// RMS of the random part drawn for every pass.
     pub repeatability_um: f64,
     /// Its correlation length.
     pub repeatability_correlation_mm: f64,
-    /// How far the wheel reaches from the middle of the machine in x and y.
+    /// Travel of the wheel from the middle of the machine in x and y.
     pub travel_mm: [f64; 2],
-    /// Fastest feed.
+    /// Maximum feed.
     pub feed_most_mm_min: f64,
-    /// Largest displacement that a map may ask for.
+    /// Maximum displacement of a map.
     pub map_most_um: f64,
 }
 
@@ -119,17 +120,17 @@ impl GrinderSpec {
     }
 }
 
-/// Where the part lies on the measuring machine, and what is wrong with the machine.
+/// Pose of the part on the measuring machine, and errors of the machine.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CmmSpec {
-    /// Where the origin of the model frame lies in the machine's frame.
+    /// Origin of the model frame in the machine's frame.
     pub translation_mm: Vec3,
-    /// How the part is turned, about x, then y, then z.
+    /// Rotation of the part about x, then y, then z.
     pub rotation_deg: Vec3,
-    /// Standard deviation of the part's place from loading to loading, along each axis.
+    /// Standard deviation of the part's position from loading to loading, along each axis.
     pub loading_shift_um: f64,
-    /// The same for its angles.
+    /// Standard deviation of the part's angles from loading to loading.
     pub loading_turn_deg: f64,
     /// Standard deviation of a reported coordinate, on each axis.
     pub noise_um: f64,
@@ -143,23 +144,23 @@ pub struct CmmSpec {
     pub probe_radius_error_um: f64,
     /// Temperature of the part while it is measured.
     pub part_temperature_c: f64,
-    /// Its expansion per kelvin.
+    /// Thermal expansion of the part per kelvin.
     pub cte_per_k: f64,
     /// Radius of the reference sphere on the table.
     pub sphere_radius_mm: f64,
     /// Its centre in the machine's frame.
     pub sphere_centre_mm: Vec3,
-    /// Least coordinates that the ball's centre comes to.
+    /// Minimum coordinates of the ball's centre.
     pub travel_least_mm: Vec3,
-    /// Most.
+    /// Maximum coordinates of the ball's centre.
     pub travel_most_mm: Vec3,
-    /// Time that a point takes.
+    /// Time for a point.
     pub seconds_per_point: f64,
     /// Speed of the travel from one point to the next.
     pub travel_mm_s: f64,
-    /// Touches before the search begins that the machine puts up with in one measurement.
+    /// Maximum number of touches before the search begins in one measurement.
     pub unexpected_touches_most: u32,
-    /// Points are sent as 32-bit counts of a nanometre (format 2) in place of floats (format 1).
+    /// Points are sent as 32-bit counts of a nanometre (format 2) instead of floats (format 1).
     pub scaled_points: bool,
 }
 
@@ -203,13 +204,13 @@ impl CmmSpec {
     }
 }
 
-/// The whole truth in one table.
+/// Complete truth of the simulation in one table.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct WorldSpec {
-    /// What everything random is drawn from.
+    /// Seed of all random numbers.
     pub seed: u64,
-    /// Seconds of the machines' time in a second of ours.
+    /// Seconds of the machines' time per second of real time.
     pub speed: f64,
     /// The part.
     pub part: PartSpec,
@@ -217,7 +218,7 @@ pub struct WorldSpec {
     pub grinder: GrinderSpec,
     /// The measuring machine.
     pub cmm: CmmSpec,
-    /// What is broken, for tests.
+    /// Faults, for tests.
     pub faults: WorldFaults,
 }
 
@@ -234,7 +235,7 @@ impl Default for WorldSpec {
     }
 }
 
-/// How the grinder turns a map over or round.
+/// Reflection or rotation of a map by the grinder.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mirrored {
@@ -251,16 +252,16 @@ pub enum Mirrored {
     QuarterTurn,
 }
 
-/// What the grinder says of its passes that is not so.
+/// False statement of the grinder about its passes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Misreported {
     /// Nothing.
     #[default]
     Nothing,
-    /// The number of the job before.
+    /// The number of the previous job.
     Job,
-    /// That it failed, where the status says that it is complete.
+    /// Failure, although the status says that the pass is complete.
     Result,
     /// Three millimetres as the largest depth.
     Depth,
@@ -272,13 +273,13 @@ pub enum Misreported {
     Duration,
 }
 
-/// What is broken, for tests.
+/// Faults, for tests.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, Serialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct WorldFaults {
     /// The grinder displaces to the wrong side.
     pub map_sign_flipped: bool,
-    /// The grinder turns the map over.
+    /// The grinder reflects or rotates the map.
     pub map_mirrored: Mirrored,
     /// The grinder displaces by the map twice over.
     pub map_doubled: bool,
@@ -288,7 +289,7 @@ pub struct WorldFaults {
     pub misreported: Misreported,
     /// The CMM reports contact points (centre less stated radius along the target's normal).
     pub returns_contact_points: bool,
-    /// And says so in the header of the outbox; else the header says centres.
+    /// The header of the outbox states contact points; otherwise it states centres.
     pub contact_points_declared: bool,
     /// The CMM reports inches, and the header says millimetres.
     pub inches: bool,
@@ -302,18 +303,18 @@ pub struct WorldFaults {
     pub wrong_part: bool,
     /// One record of the points holds a NaN (format 1 only).
     pub non_finite_point: bool,
-    /// So many records are missing at the end of the points.
+    /// Number of records that are missing at the end of the points.
     pub missing_records: u32,
 }
 
-/// Why a table cannot be a world.
+/// Error of a table of a simulated world.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SpecError {
-    /// The key, as a path in the table.
+    /// Key, as a path in the table.
     pub key: &'static str,
-    /// Its value.
+    /// Value of the key.
     pub value: f64,
-    /// What is allowed.
+    /// Allowed values.
     pub limit: &'static str,
 }
 

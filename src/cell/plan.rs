@@ -36,14 +36,14 @@ pub struct CellPlan {
     pub deadlines: Deadlines,
 }
 
-/// What the first cycle begins with.
+/// First step of the first cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Beginning {
     /// A pass of the grinder.
     Grind,
-    /// A measurement of the part as it is; its surface stands over the nominal one by the allowance.
+    /// A measurement of the part as it is; its surface is above the nominal one by the allowance.
     Measure,
 }
 
@@ -80,7 +80,7 @@ impl Tolerance {
     }
 }
 
-/// Which points a peak to valley is taken of.
+/// Points that a peak to valley includes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum PvOf {
@@ -93,7 +93,7 @@ pub enum PvOf {
     MostPoints,
 }
 
-/// What to do when a run does not get on, or a part does not get better.
+/// Response to a run without progress, or to a part that does not improve.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]

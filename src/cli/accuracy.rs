@@ -15,7 +15,7 @@ use super::nominal::{self, NominalTable};
 use super::words::{counted, three_digits};
 use super::{Outcome, finite_above_zero};
 
-/// Tell from a nominal alone how exact distances to it will be, and how fine it must be for a wanted accuracy
+/// Estimate from a nominal surface alone the error of distances to it, and the spacing for a required accuracy
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Most points are left out, twice, and their distance from what is left is measured: they lie on the surface, so that
@@ -31,13 +31,13 @@ pub(super) struct Arguments {
     nominal: PathBuf,
     #[command(flatten)]
     table: NominalTable,
-    /// What scattered points are projected onto
+    /// Projection of scattered points for the triangulation
     #[arg(long, value_parser = word_of::<Projection>(), default_value = "auto")]
     projection: Projection,
-    /// Wanted error of the distance, peak to valley, in nm
+    /// Maximum error of the distance, peak to valley, in nm
     #[arg(long, value_name = "NM", allow_negative_numbers = true, value_parser = finite_above_zero)]
     want: Option<f64>,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

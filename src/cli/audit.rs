@@ -18,7 +18,7 @@ use super::key;
 use super::plant::audit as plant;
 use super::succession;
 
-/// Verify, show or export the record of a run; make the key that signs it
+/// Verify, show or export the record of a run; create the key that signs it
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:
@@ -39,7 +39,7 @@ enum What {
     Key(key::Arguments),
 }
 
-/// Prove that the record is what was written: every record, their order, the end, and every file by its hash
+/// Verify that the record is unchanged: every record, their order, the end, and every file by its hash
 #[derive(Args, Debug)]
 #[command(after_help = "\
 RUN is the folder of a run; without it, the newest under runs/. A folder of runs has each of them proven, and names runs that are
@@ -63,14 +63,15 @@ struct ToVerify {
     /// Copy of journal.anchor that was kept elsewhere
     #[arg(long, value_name = "FILE")]
     anchor: Option<PathBuf>,
-    /// Public key that may have signed, or the file that it was kept in; again for a run that was gone on with by another computer
+    /// Accepted public key, or the file with it; repeat the option for a run that another computer continued
     #[arg(long, value_name = "PUBLIC|FILE", value_parser = key::public)]
     key: Vec<PublicKey>,
-    /// Prove the copy of the plant of this file too, and hold the journal against it: RUN may then be the name of a run that is not here
+    /// Also verify the copy at the plant of this file, and compare the journal with it; RUN may then be the name of a
+    /// run that is not on this computer
     #[cfg(feature = "plant")]
     #[arg(long, value_name = "FILE", conflicts_with = "anchor")]
     plant: Option<PathBuf>,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }
@@ -117,14 +118,14 @@ struct ToExport {
     /// Folder of the run
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
-    /// How the records are written
+    /// Format of the records
     #[arg(long, value_enum, default_value = "jsonl")]
     format: Format,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Format {
-    /// A line of JSON for each record, which proves itself
+    /// A line of JSON for each record, with the hashes to verify it
     Jsonl,
     /// A row for each record, for spreadsheets and databases
     Csv,

@@ -35,7 +35,7 @@ pub(super) struct Arguments {
     /// Recipes, cell files and dialects
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

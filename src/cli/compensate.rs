@@ -18,21 +18,21 @@ use super::nominal::{self, NominalTable};
 use super::words::three_digits;
 use super::{Outcome, finite_above_zero};
 
-/// Correct a program that exists already by a map of the part's error
+/// Correct an existing program by a map of the part's error
 #[derive(Args, Debug)]
 #[command(after_long_help = LONG_HELP, after_help = "Example:\n  regrind compensate --program part.ngc --map error_map.csv --out part-2.ngc\n\n--help \
 tells more than -h.")]
 pub(super) struct Arguments {
-    /// Program to be corrected, in the dialect of LinuxCNC
+    /// Program to correct, in the dialect of LinuxCNC
     #[arg(long, value_name = "FILE")]
     program: PathBuf,
-    /// error_map.csv, whose error is taken off, or correction.csv, which is put on a program without a correction
+    /// error_map.csv, whose error is subtracted, or correction.csv, which is added to a program without a correction
     #[arg(long, value_name = "FILE")]
     map: PathBuf,
-    /// Share of the map that is applied
+    /// Share of the map to apply
     #[arg(long, value_name = "SHARE", default_value_t = 1.0, value_parser = finite_above_zero)]
     gain: f64,
-    /// The program's new text
+    /// File for the corrected program
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Apply the map along the normals of this nominal surface instead of along z
@@ -40,13 +40,13 @@ pub(super) struct Arguments {
     nominal: Option<PathBuf>,
     #[command(flatten)]
     table: NominalTable,
-    /// With --nominal: the program moves the lowest point of a ball of this radius, not its centre; in mm
+    /// With --nominal: the program moves the lowest point of a ball of this radius, in mm, not its centre
     #[arg(long, value_name = "MM", requires = "nominal", value_parser = finite_above_zero)]
     tip_of_radius: Option<f64>,
-    /// How far the new program may be from the corrected path, in um
+    /// Maximum distance of the new program from the corrected path, in µm
     #[arg(long, value_name = "UM", default_value_t = 0.1, value_parser = finite_above_zero)]
     tolerance_um: f64,
-    /// The largest correction that is applied, in um: a map in another unit is refused by it
+    /// Maximum correction, in µm; a map with a larger one is refused, for example a map in another unit
     #[arg(long, alias = "largest-correction-um", value_name = "UM", default_value_t = 500.0, value_parser = finite_above_zero)]
     max_correction_um: f64,
     /// Print JSON instead of a summary

@@ -36,7 +36,7 @@ pub(super) struct Arguments {
     /// Folder of the run
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
-    /// Why, for the record
+    /// Reason, for the record
     #[arg(long, value_name = "TEXT", default_value = "", value_parser = super::remark)]
     reason: String,
     /// Print the answer as JSON
@@ -44,7 +44,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// What a person confirms to a running cell.
+/// Confirmation of a person to a running cell.
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:
@@ -57,22 +57,22 @@ Examples:
 
 Exit codes: 0 it was taken; 2 no such run; 3 the cell refused it, or did not answer.")]
 pub(super) struct Confirmation {
-    /// What is so
+    /// Fact to confirm
     #[arg(value_enum)]
     what: What,
     /// Folder of the run
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
-    /// The machine that was looked at, for `clear`, `still` and `over`
+    /// Inspected machine, for `clear`, `still` and `over`
     #[arg(long, value_parser = word_of::<Device>())]
     machine: Option<Device>,
-    /// First 8 digits, or more, of the map that the grinder works by, for `started` and `done`
+    /// First 8 or more digits of the hash of the map that the grinder uses, for `started` and `done`
     #[arg(long, value_name = "DIGITS")]
     map: Option<String>,
     /// File of the measurement, for `done` of a measuring machine that a person serves
     #[arg(long, value_name = "FILE")]
     file: Option<PathBuf>,
-    /// What was seen at the machine, for `over`
+    /// Observation at the machine, for `over`
     #[arg(long, value_name = "TEXT", default_value = "", value_parser = super::remark)]
     evidence: String,
     /// Print the answer as JSON
@@ -84,15 +84,15 @@ pub(super) struct Confirmation {
 enum What {
     /// The right part is loaded and clamped, wheel and probe are clear of it
     Loaded,
-    /// The machine that a person serves has begun what was asked
+    /// The machine that a person serves has started its job
     Started,
-    /// It has ended that, and is clear of the part
+    /// The machine has finished its job, and is clear of the part
     Done,
-    /// A machine that cannot tell it is clear of the part
+    /// A machine is clear of the part, but cannot report it
     Clear,
-    /// A machine that was to hold or to stop stands still
+    /// A machine that was ordered to hold or stop is at rest
     Still,
-    /// A job that no machine can tell about is over: the machine stands, clear of the part
+    /// A job whose state no machine can report is over: the machine is at rest, clear of the part
     Over,
 }
 

@@ -22,7 +22,7 @@ use super::live::take;
 use super::run::within;
 use super::{Outcome, check, control, key};
 
-/// Look at the computer, the cell file, the machines and a recipe, and say what stands in the way of a run; nothing is moved
+/// Check the computer, the cell file, the machines and a recipe for obstacles to a run; nothing moves
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Of a machine on Modbus it reads who it is and how it stands, and writes nothing but the sign of life of a client. At a server of I++ DME
@@ -34,16 +34,16 @@ Example:
 
 Exit codes: 0 nothing stands in the way; 1 something does; 2 bad cell file.")]
 pub(super) struct Arguments {
-    /// Cell to look at
+    /// Cell to check
     #[arg(value_name = "CELL", default_value = BUILT_IN)]
     cell: PathBuf,
-    /// Recipe that is to be run on it
+    /// Recipe to run on it
     #[arg(long, value_name = "FILE")]
     recipe: Option<PathBuf>,
     /// Folder of the runs
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// Print what was found as JSON
+    /// Print the findings as JSON
     #[arg(long)]
     json: bool,
 }

@@ -11,7 +11,7 @@ use regrind::{config, recipe};
 use super::Outcome;
 use super::failure::Failure;
 
-/// Make a folder to begin in: a recipe, a cell, their schemas for the editor, and a page that says what to type
+/// Create a folder to start with: a recipe, a cell, their schemas for the editor, and a page of commands
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "\
 What is there already is left alone: a folder that has one of the files is refused. The recipe makes a free-form mirror; change what it says of
@@ -25,28 +25,28 @@ Example:
 
 Exit codes: 0 made; 2 the folder has such files already, or cannot be written.")]
 pub(super) struct Arguments {
-    /// Folder to make
+    /// Folder to create
     #[arg(value_name = "DIR")]
     folder: Option<PathBuf>,
-    /// How the machines are reached [default: simulated]
+    /// Connection to the machines [default: simulated]
     #[arg(long, value_enum)]
     machines: Option<Machines>,
-    /// What the part is called
+    /// Name of the part
     #[arg(long, value_name = "NAME", value_parser = super::name)]
     part: Option<String>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Machines {
-    /// Both are simulated within the program
+    /// Both machines are simulated within the program
     Simulated,
     /// Modbus over TCP; simulated by another process until you change it
     ModbusTcp,
     /// Modbus over serial lines; simulated by another process until you change it
     ModbusRtu,
-    /// They take and give files
+    /// The machines read and write files
     Files,
-    /// A person serves them step by step
+    /// A person serves the machines step by step
     Manual,
 }
 

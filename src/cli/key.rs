@@ -15,7 +15,7 @@ use super::outside::settings_folder;
 /// Environment variable with the file of the key. If empty, no key is used.
 const KEY: &str = "REGRIND_KEY";
 
-/// Make the key that signs the records of this computer, once, and print its public half
+/// Create the key that signs the records of this computer, if it does not exist, and print its public half
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The key is made where REGRIND_KEY says, else in $XDG_CONFIG_HOME/regrind/audit.key or ~/.config/regrind/audit.key (on Windows in
@@ -32,7 +32,7 @@ pub(super) struct Arguments {
     /// File of the key
     #[arg(long, value_name = "FILE")]
     key: Option<PathBuf>,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

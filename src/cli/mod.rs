@@ -72,15 +72,15 @@ enum Command {
     Hold(control::Arguments),
     Resume(resume::Arguments),
     Recover(recover::Arguments),
-    /// End a running cell in order: what moves comes to its safe place, and the run is over
+    /// Stop a running cell in order: the machines move to their safe places, and the run ends
     #[command(after_help = control::help("regrind stop --reason \"end of the shift\""))]
     Stop(control::Arguments),
-    /// End a running cell at once: the safe sequence only
+    /// Abort a running cell at once, with the safe sequence only
     #[command(after_help = control::help("regrind abort --reason \"noise at the wheel\""))]
     Abort(control::Arguments),
-    /// Tell a running cell what a person has seen
+    /// Confirm to a running cell what a person has done or seen
     Confirm(control::Confirmation),
-    /// Tell how a running cell is, what it waits for, and what to do next
+    /// Show the state of a running cell, what it waits for, and what to do next
     #[command(after_help = control::help("regrind status runs/freeform-mirror-20260704T120000Z --json"))]
     Status(control::Arguments),
     Watch(watch::Arguments),

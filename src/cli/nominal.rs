@@ -13,13 +13,13 @@ use super::words::count;
 /// Columns and unit of a nominal table, given by a person.
 #[derive(Args, Clone, Debug, Default)]
 pub(super) struct NominalTable {
-    /// Columns of the nominal table, by name or by number from 1, where its header does not tell
+    /// Columns of the nominal table, by name or by number from 1, if its header does not identify them
     #[arg(long, value_name = "x=X_nom,y=Y_nom,z=Z_nom")]
     nominal_columns: Option<Columns>,
     /// Unit of the nominal table: mm, um, nm, cm, m or inch
     #[arg(long, value_name = "UNIT")]
     nominal_unit: Option<Unit>,
-    /// Unit of z in the nominal table, where it is another one than that of x and y
+    /// Unit of z in the nominal table, if it differs from that of x and y
     #[arg(long, value_name = "UNIT")]
     nominal_height_unit: Option<Unit>,
 }

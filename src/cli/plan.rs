@@ -29,13 +29,13 @@ pub(super) struct Arguments {
     /// Recipe of the part
     #[arg(value_name = "RECIPE")]
     recipe: PathBuf,
-    /// Cell that would make it
+    /// Cell that would make the part
     #[arg(long, value_name = "FILE", default_value = BUILT_IN)]
     cell: PathBuf,
-    /// Write the program of the first pass, which has no correction
+    /// Write the program of the first pass, which has no correction, to this file
     #[arg(long, value_name = "FILE")]
     program: Option<PathBuf>,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

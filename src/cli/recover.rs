@@ -19,7 +19,7 @@ use super::run::{epoch, free_folder, operator};
 use super::succession::Place;
 use super::{Outcome, check, control, key};
 
-/// Bring the machines of a cell home that hold what no run knows
+/// Bring machines of a cell to idle that hold a job which no run knows
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Shows how each machine stands and what would bring it nearer to idle: STOP, ACKNOWLEDGE or CLEAR. Nothing is commanded before
@@ -31,13 +31,13 @@ Example:
 
 Exit codes: 0 both machines are idle; 2 bad cell file; 3 a machine was left as it is, refused, or cannot be reached.")]
 pub(super) struct Arguments {
-    /// Cell whose machines are brought home
+    /// Cell whose machines to bring to idle
     #[arg(long, value_name = "FILE")]
     cell: PathBuf,
-    /// Folder of the runs, and of the record of what is done here
+    /// Folder of the runs, and of the record of this recovery
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// Who decides
+    /// Name of the person who decides
     #[arg(long, value_name = "NAME", value_parser = super::name)]
     operator: Option<String>,
 }

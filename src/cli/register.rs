@@ -31,36 +31,38 @@ pub(super) struct Arguments {
     /// Measured points as text or PLY, in mm, or an interferometer's or profilometer's map as X3P, SDF or MetroPro
     #[arg(long, value_name = "FILE")]
     measured: PathBuf,
-    /// Columns of the measured table, by name or by number from 1, where its header does not tell
+    /// Columns of the measured table, by name or by number from 1, if its header does not identify them
     #[arg(long, value_name = "x=X_act,y=Y_act,z=Z_act")]
     columns: Option<Columns>,
     /// Unit of the measured table: mm, um, nm, cm, m or inch
     #[arg(long)]
     unit: Option<Unit>,
-    /// Unit of z in the measured table, where it is another one than that of x and y
+    /// Unit of z in the measured table, if it differs from that of x and y
     #[arg(long, value_name = "UNIT")]
     height_unit: Option<Unit>,
     #[command(flatten)]
     of_nominal: NominalTable,
-    /// Radius of the probe in mm; 0 for one without a ball, such as an optical one. Not needed with --method contact
+    /// Radius of the probe in mm; 0 for a probe without a ball, such as an optical one. Not needed with --method
+    /// contact
     #[arg(long, alias = "probe-radius-mm", value_name = "MM", allow_negative_numbers = true, value_parser = finite_from_zero)]
     probe_radius: Option<f64>,
     /// Folder for the results; created if absent
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// How the surface runs between the nominal points
+    /// Shape of the surface between the nominal points
     #[arg(long, value_parser = word_of::<Distance>(), default_value = "curved")]
     distance: Distance,
-    /// What the measured points are taken for
+    /// Meaning of the measured points
     #[arg(long, value_parser = word_of::<Method>(), default_value = "offset")]
     method: Method,
-    /// What scattered nominal points are projected onto
+    /// Projection of scattered nominal points for the triangulation
     #[arg(long, value_parser = word_of::<Projection>(), default_value = "auto")]
     projection: Projection,
-    /// Coordinates of the pose that stay as they are in --initial, or at zero, separated by commas; no search is made
+    /// Locked directions of the pose, separated by commas: they keep their values from --initial, or zero, and no
+    /// search is made
     #[arg(long, value_parser = word_of::<Coordinate>(), value_delimiter = ',', value_name = "x,y,z,rx,ry,rz")]
     lock: Vec<Coordinate>,
-    /// How the distance of a point counts
+    /// Loss function of the distance of a point
     #[arg(long, value_parser = word_of::<Loss>(), default_value = "none")]
     loss: Loss,
     /// Start at this pose cmm_from_model instead of searching for one
@@ -69,13 +71,13 @@ pub(super) struct Arguments {
     /// Side of the nominal surface on which the probe is
     #[arg(long, value_parser = word_of::<ProbeSide>(), default_value = "auto")]
     side: ProbeSide,
-    /// Refuse a fit with a larger rms deviation
+    /// Maximum rms deviation, in mm; a fit with a larger one is refused
     #[arg(long, value_name = "MM", allow_negative_numbers = true, value_parser = finite_above_zero)]
     max_rms: Option<f64>,
-    /// Leave out points farther off than this many robust standard deviations; `inf` keeps all
+    /// Reject points farther off than this many robust standard deviations as outliers; `inf` keeps all
     #[arg(long, value_name = "N", default_value_t = 6.0, allow_negative_numbers = true, value_parser = above_zero)]
     outlier_sigmas: f64,
-    /// Tell the form apart from the scatter of the probe, with uncertainties that hold for both: model.json and form.csv
+    /// Separate the form from the noise of the probe, with the uncertainties of both: model.json and form.csv
     #[arg(long)]
     model: bool,
     /// Print registration.json instead of a summary

@@ -9,7 +9,7 @@ use super::Outcome;
 use super::control::folder_of;
 use super::failure::Failure;
 
-/// Write the report of a run: one HTML file that opens without a network; its results as QIF or DFQ
+/// Write the report of a run as one HTML file that needs no network; write its results as QIF or DFQ
 #[derive(Args, Debug)]
 #[command(after_help = "\
 RUN is the folder of a run; without it, the newest under runs/. The record is proven first; the report is RUN/report.html.
@@ -25,13 +25,13 @@ pub(super) struct Arguments {
     /// Folder of the run
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
-    /// Write the results as QIF 3.0 too, to FILE or to RUN/results.qif
+    /// Also write the results as QIF 3.0, to FILE or to RUN/results.qif
     #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
     qif: Option<Option<PathBuf>>,
-    /// Write the results as Q-DAS ASCII too, to FILE or to RUN/results.dfq
+    /// Also write the results as Q-DAS ASCII, to FILE or to RUN/results.dfq
     #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
     dfq: Option<Option<PathBuf>>,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

@@ -23,7 +23,7 @@ use super::live::{Live, Work, outcome};
 use super::run::{LEARNED_FROM, epoch, operator, within};
 use super::{Outcome, check, control, key};
 
-/// Let a held cell go on, or take up a run that broke off
+/// Resume a held cell, or a run whose program has ended
 #[derive(Args, Debug)]
 #[command(after_help = "\
 RUN is the folder of a run; without it, the one under runs/ that goes on now, or else the newest that has no end on record.
@@ -44,16 +44,17 @@ pub(super) struct Arguments {
     /// Folder of the run
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
-    /// Why, for the record
+    /// Reason, for the record
     #[arg(long, value_name = "TEXT", default_value = "")]
     reason: String,
-    /// Who takes the run up
+    /// Name of the person who resumes the run
     #[arg(long, value_name = "NAME", value_parser = super::name)]
     operator: Option<String>,
-    /// Take up a run though its record may have lost its last lines: both machines were looked at, and are at no job that it does not know
+    /// Resume a run although its record may have lost its last lines: you have inspected both machines, and neither has
+    /// a job that the record does not know
     #[arg(long)]
     despite_loss: bool,
-    /// Print the answer, or a line for everything that happens, as JSON
+    /// Print the answer, or a line for each event, as JSON
     #[arg(long)]
     json: bool,
 }

@@ -40,32 +40,32 @@ pub(super) struct Arguments {
     /// Recipe of the part
     #[arg(value_name = "RECIPE")]
     pub(super) recipe: PathBuf,
-    /// Cell that makes it; `sim` is the simulated one that comes with the program
+    /// Cell that makes the part; `sim` is the built-in simulated cell
     #[arg(long, value_name = "FILE", default_value = BUILT_IN)]
     pub(super) cell: PathBuf,
     /// Serial number of the part
     #[arg(long, value_name = "SERIAL", value_parser = super::name)]
     pub(super) part: Option<String>,
-    /// Who runs it
+    /// Name of the operator
     #[arg(long, value_name = "NAME", value_parser = super::name)]
     pub(super) operator: Option<String>,
-    /// Folder that the run's own folder is made in
+    /// Folder in which to create the folder of the run
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub(super) runs: PathBuf,
-    /// The right part is loaded and clamped already, wheel and probe are clear of it: do not ask
+    /// Do not ask for the part: the right one is loaded and clamped, and wheel and probe are clear of it
     #[arg(long)]
     pub(super) loaded: bool,
-    /// Play it through without a part, at machines that people serve: everything is marked SIMULATION, and the plan itself may be given back as what was
-    /// measured
+    /// Rehearse without a part, at machines that people serve: everything is marked SIMULATION, and the plan itself is
+    /// accepted as a measurement
     #[arg(long)]
     pub(super) rehearsal: bool,
-    /// Draw another simulated part and run from this number
+    /// Seed of another simulated part and run
     #[arg(long, value_name = "N")]
     pub(super) seed: Option<u64>,
-    /// Show the cell as a page in the browser meanwhile, at this address, as `regrind serve` does
+    /// Also show the cell as a page in the browser at this address, as `regrind serve` does
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = serve::ADDRESS)]
     pub(super) serve: Option<SocketAddr>,
-    /// Ship the record to the plant of this file meanwhile, as `regrind ship` does
+    /// Also replicate the record to the plant of this file, as `regrind ship` does
     #[cfg(feature = "plant")]
     #[arg(long, value_name = "FILE")]
     pub(super) plant: Option<PathBuf>,
@@ -73,11 +73,11 @@ pub(super) struct Arguments {
     #[cfg(feature = "plant")]
     #[arg(skip)]
     pub(super) work: Option<Box<super::work::Taken>>,
-    /// File for what the simulated world knows of the part in the end
+    /// File for the true state of the simulated part at the end
     #[cfg(feature = "plant")]
     #[arg(long, hide = true)]
     pub(super) truth: Option<PathBuf>,
-    /// Print a line of JSON for everything that happens
+    /// Print a line of JSON for each event
     #[arg(long)]
     pub(super) json: bool,
 }

@@ -11,7 +11,7 @@ use super::Outcome;
 use super::control::folders;
 use super::failure::Failure;
 
-/// List the runs: the part, how far it came, and how it ended
+/// List the runs with their part, progress and result
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The runs that are on come first, then the newest. What is shown is read and not proven: `regrind audit verify` does that.
@@ -24,7 +24,7 @@ pub(super) struct Arguments {
     /// Folder of the runs
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// Only runs of parts whose serial number has this in it
+    /// Only runs of parts whose serial number contains this text
     #[arg(long, value_name = "TEXT", default_value = "")]
     part: String,
     /// Print the list as JSON

@@ -14,20 +14,20 @@ Example:
 
 Exit codes: 0 printed; 2 bad arguments; 3 fault.")]
 pub(super) struct Arguments {
-    /// Which schema
+    /// Kind of file
     #[arg(value_enum)]
     of: Kind,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Kind {
-    /// Of recipes
+    /// Recipes
     Recipe,
-    /// Of cell files
+    /// Cell files
     Cell,
-    /// Of dialects of programs
+    /// Dialects of programs
     Dialect,
-    /// Of plant files
+    /// Plant files
     #[cfg(feature = "plant")]
     Plant,
 }

@@ -23,7 +23,7 @@ pub(super) const ADDRESS: &str = "127.0.0.1:7373";
 /// Time for which the page stays after the end of its run, so that every browser receives the result.
 const LINGERS: Duration = Duration::from_secs(3);
 
-/// Show the cell, and the runs that it made, as a page in the browser
+/// Show the cell and its runs as a page in the browser
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The page shows the run that is on, from wherever it was begun, and gives orders to it through the same door as `regrind hold` and
@@ -40,7 +40,7 @@ pub(super) struct Arguments {
     /// Folder of the runs
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// Address and port of the page; a port of 0 takes any that is free
+    /// Address and port of the page; port 0 selects a free port
     #[arg(long, value_name = "ADDRESS", default_value = ADDRESS)]
     listen: SocketAddr,
     #[command(flatten)]
@@ -50,16 +50,17 @@ pub(super) struct Arguments {
     while_stdin: bool,
 }
 
-/// By what a page proves itself, and who is let in.
+/// Certificate and users of a page.
 #[derive(Args, Debug)]
 pub(super) struct Door {
-    /// Certificate of the page in PEM, with those of who signed it behind it; for other addresses than this computer's own. Needs a build with `--features https`, as the packages are
+    /// Certificate of the page in PEM, followed by those of its issuers; required for addresses other than this
+    /// computer's own. The packages support it. From source: `--features https`
     #[arg(long, value_name = "FILE", requires = "key")]
     certificate: Option<PathBuf>,
-    /// Private key of the certificate in PEM, which nobody else may read
+    /// Private key of the certificate in PEM; only its owner may have access
     #[arg(long, value_name = "FILE", requires = "certificate")]
     key: Option<PathBuf>,
-    /// Who may sign in (see `regrind users`); without it, who has the key of the page is let in
+    /// List of the users who may sign in (see `regrind users`); without it, the key of the page gives access
     #[arg(long, value_name = "FILE")]
     users: Option<PathBuf>,
 }

@@ -11,7 +11,7 @@ use regrind::formats::{ResultFolder, write_atomic};
 use super::Outcome;
 use super::failure::Failure;
 
-/// Print what completes the commands in a shell
+/// Print the script that completes the commands in a shell
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:
@@ -21,12 +21,12 @@ Examples:
 
 Exit codes: 0 printed; 2 bad arguments.")]
 pub(super) struct Completions {
-    /// The shell
+    /// Name of the shell
     #[arg(value_enum)]
     shell: Shell,
 }
 
-/// Write the pages of the manual, one a command, for `man`
+/// Write the manual pages for `man`, one for each command
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -35,7 +35,7 @@ Example:
 
 Exit codes: 0 written; 2 the folder cannot be written.")]
 pub(super) struct Pages {
-    /// Folder to write to; made if it is not there
+    /// Folder to write to; created if absent
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 }

@@ -20,7 +20,7 @@ const LONGEST_WAIT: Duration = Duration::from_secs(60);
 /// Time for which replication continues after the end of a run, for its remaining records.
 const LINGERS: Duration = Duration::from_secs(30);
 
-/// Ship the records and files of finished and running runs to the plant
+/// Replicate the records and files of finished and running runs to the plant
 #[derive(Args, Debug)]
 #[command(after_help = "\
 It goes on until it is stopped, whether the plant can be reached or not: what could not go, goes later. The plant proves the chain of every
@@ -33,16 +33,16 @@ Examples:
 Exit codes: 0 stopped by Ctrl-C, or everything has arrived; 1 a run differs from what the plant has of it; 2 bad arguments; 3 with --once, the
 plant cannot be reached.")]
 pub(super) struct Arguments {
-    /// Plant file: where the database is, and who signs in
+    /// Plant file: address and user of the database
     #[arg(long, value_name = "FILE")]
     plant: PathBuf,
     /// Folder of the runs
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// End when everything that is there has arrived
+    /// End when everything has arrived
     #[arg(long)]
     once: bool,
-    /// Print a line of JSON for everything that happens
+    /// Print a line of JSON for each event
     #[arg(long)]
     json: bool,
     /// End a little after standard input does: with the program that began this one

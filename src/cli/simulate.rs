@@ -29,13 +29,13 @@ pub(super) struct Arguments {
     /// Cell whose machines are simulated
     #[arg(long, value_name = "FILE", default_value = "config/modbus-tcp.toml")]
     cell: PathBuf,
-    /// Draw another part and another run from this number
+    /// Seed of another part and another run
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Write what the machines see and do to this file, a line of JSON for each thing as it happens
+    /// Write the events of the machines to this file, a line of JSON for each event
     #[arg(long, value_name = "FILE")]
     log: Option<PathBuf>,
-    /// Print where the machines answer as one line of JSON; a port of 0 in the cell file takes any that is free
+    /// Print the addresses of the machines as one line of JSON; port 0 in the cell file selects a free port
     #[arg(long)]
     json: bool,
 }

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use super::Outcome;
 use super::failure::Failure;
 
-/// Print what the cell does upon every event in every state
+/// Print the response of the cell to every event in every state
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The table is found by trying: every event in every state that can be reached. A line is an event, the state that follows,
@@ -24,16 +24,16 @@ Examples:
 
 Exit codes: 0 printed; 2 bad arguments, or the picture cannot be written; 3 fault.")]
 pub(super) struct Arguments {
-    /// Only states whose name begins so
+    /// Only states whose name begins with this text
     #[arg(long, value_name = "NAME")]
     state: Option<String>,
-    /// Also events that are refused or that nothing follows from
+    /// Also print events that are refused or have no effect
     #[arg(long)]
     all: bool,
     /// Draw the states into this file instead
     #[arg(long, value_name = "FILE", conflicts_with_all = ["state", "all", "json"])]
     svg: Option<PathBuf>,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

@@ -26,7 +26,7 @@ const FAREWELL: Duration = Duration::from_secs(5);
 const ONE_BY_ONE: usize = 8;
 const MINUTE: Duration = Duration::from_secs(60);
 
-/// Tell live values of this cell to a broker (Sparkplug B) and to who asks (OPC UA)
+/// Publish live values of this cell to a broker (Sparkplug B) and to clients (OPC UA)
 #[derive(Args, Debug)]
 #[command(after_help = "\
 To whom stands in the plant file, by [sparkplug] and [opcua]. It goes on until it is stopped, from run to run, whether a run is on or not. Nothing that
@@ -38,13 +38,13 @@ Example:
 
 Exit codes: 0 stopped by Ctrl-C; 2 bad arguments, or what the plant file names cannot be used.")]
 pub(super) struct Arguments {
-    /// Plant file: to whom the cell is told
+    /// Plant file: receivers of the values
     #[arg(long, value_name = "FILE")]
     plant: PathBuf,
     /// Folder of the runs
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// Print a line of JSON for everything that happens
+    /// Print a line of JSON for each event
     #[arg(long)]
     json: bool,
     /// End a little after standard input does: with the program that began this one

@@ -11,7 +11,7 @@ use serde_json::json;
 use super::Outcome;
 use super::failure::Failure;
 
-/// Keep the list of who may sign in to the page of the cell
+/// Manage the users who may sign in to the page of the cell
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Roles: viewer looks; quality looks, and may hold; operator gives every order, but goes on from no alarm that a process engineer clears;
@@ -29,30 +29,30 @@ pub(super) struct Arguments {
 
 #[derive(Subcommand, Debug)]
 enum What {
-    /// Add a person, or give one who is there another role and password
+    /// Add a person, or change the role and password of a person
     Add {
-        /// The name by which they sign in, and which is on record with their orders
+        /// Name for signing in, which is recorded with each order
         #[arg(value_name = "NAME")]
         name: String,
-        /// What they may do: viewer, quality, operator or engineer
+        /// Role: viewer, quality, operator or engineer
         #[arg(long)]
         role: PageRole,
         #[command(flatten)]
         list: Kept,
     },
-    /// Take a person off the list
+    /// Remove a person from the list
     Remove {
-        /// Their name
+        /// Name of the person
         #[arg(value_name = "NAME")]
         name: String,
         #[command(flatten)]
         list: Kept,
     },
-    /// Tell who is on the list
+    /// Print the list
     List {
         #[command(flatten)]
         list: Kept,
-        /// Print JSON instead of words
+        /// Print JSON instead of text
         #[arg(long)]
         json: bool,
     },
@@ -60,7 +60,7 @@ enum What {
 
 #[derive(Args, Debug)]
 struct Kept {
-    /// The list
+    /// File of the list
     #[arg(long = "users", value_name = "FILE", default_value = "users.toml")]
     path: PathBuf,
 }

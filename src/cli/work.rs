@@ -20,7 +20,7 @@ const ROUND: Duration = Duration::from_secs(5);
 /// Folder of downloaded recipes, within the folder of the runs.
 const RECIPES: &str = ".recipes";
 
-/// Make the parts that the plant has queued for this cell, one after the other
+/// Make the parts that are queued for this cell at the plant, one after the other
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The part that is due first is leased to this cell, its recipe is pulled by its hash, and proven: two of the approvers in the plant file must have
@@ -36,40 +36,40 @@ Examples:
 Exit codes: 0 all parts that were there are accepted; 1 one was not, was given back, or was begun here and is not over; 2 bad arguments, or a recipe that is not
 approved; 3 a fault or abort, or the plant cannot be reached.")]
 pub(super) struct Arguments {
-    /// Plant file: where the database is, who signs in, and whose approval counts
+    /// Plant file: address and user of the database, and the approvers of recipes
     #[arg(long, value_name = "FILE")]
     plant: PathBuf,
-    /// Cell that makes them; `sim` is the simulated one that comes with the program
+    /// Cell that makes the parts; `sim` is the built-in simulated cell
     #[arg(long, value_name = "FILE", default_value = BUILT_IN)]
     cell: PathBuf,
-    /// Who stands at the cell
+    /// Name of the person at the cell
     #[arg(long, value_name = "NAME", value_parser = super::name)]
     operator: Option<String>,
-    /// Folder that the runs' own folders are made in
+    /// Folder in which to create the folders of the runs
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// Confirm the part of this serial number, if it is the next; any other is given back
+    /// Confirm the part with this serial number, if it is the next; give back any other part
     #[arg(long, value_name = "SERIAL", value_parser = super::name)]
     part: Option<String>,
-    /// Make one part at most
+    /// Make at most one part
     #[arg(long)]
     once: bool,
-    /// Wait for further parts when there is none, until Ctrl-C
+    /// Wait for further parts when none is left, until Ctrl-C
     #[arg(long, conflicts_with = "once")]
     wait: bool,
-    /// Give a part back that was begun here and of whose run nothing came: somebody has looked that nothing was ground
+    /// Give back a part that was started here without any result of its run: you have checked that nothing was ground
     #[arg(long, value_name = "SERIAL", value_parser = super::name, conflicts_with_all = ["part", "once", "wait"])]
     give_back: Option<String>,
-    /// Give a part up whose run broke off and will not be gone on with: a planner says whether it is made again
+    /// Give up a part whose run was interrupted and will not be resumed: a planner decides whether it is made again
     #[arg(long, value_name = "SERIAL", value_parser = super::name, requires = "why", conflicts_with_all = ["part", "once", "wait", "give_back"])]
     give_up: Option<String>,
-    /// Why it is given up, for who reads it later
+    /// Reason for giving it up, for the record
     #[arg(long, value_name = "WORDS", value_parser = super::name, requires = "give_up")]
     why: Option<String>,
-    /// Draw other simulated parts and runs from this number
+    /// Seed of other simulated parts and runs
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Print a line of JSON for everything that happens in a run
+    /// Print a line of JSON for each event of a run
     #[arg(long)]
     json: bool,
 }

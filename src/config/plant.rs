@@ -13,7 +13,7 @@ use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha2
 
 static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<PlantFile>);
 
-/// A plant of Regrind: its database, whose approval counts, and where live values go.
+/// A plant of Regrind: its database, the approvers of recipes, and the receivers of live values.
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 struct PlantFile {
@@ -22,14 +22,14 @@ struct PlantFile {
     plant: PlantTable,
     /// The database of the plant.
     database: Option<DatabaseSettings>,
-    /// Who may approve recipes: two of them must have signed one before this cell makes a part by it.
+    /// People who may approve recipes: two of them must sign a recipe before this cell makes a part by it.
     #[schemars(length(max = 100))]
     approver: Vec<Approver>,
-    /// Where large files of runs are kept, if not in the database.
+    /// Store for large files of runs. Default: the database.
     artefacts: Option<ArtefactSettings>,
-    /// A broker that is told how the cell is; nobody is told where it is left out.
+    /// Broker to which the cell publishes its status. Default: none.
     sparkplug: Option<SparkplugSettings>,
-    /// A server that shows how the cell is; there is none where it is left out.
+    /// Server that shows the status of the cell. Default: none.
     opcua: Option<OpcUaSettings>,
 }
 
@@ -37,11 +37,12 @@ struct PlantFile {
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 struct PlantTable {
-    /// What this cell is called in the plant; left out on a computer that is no cell's.
+    /// Name of this cell in the plant. Omit it on a computer that belongs to no cell.
     #[schemars(length(min = 1, max = 80), example = &"cell-1")]
     cell: Option<String>,
-    /// How much machines are taken to differ, where somebody knows it: the rms share of what comes back in every pass that is a machine's own. It counts as
-    /// one comparison of this cell's machine with another, beside those that recipes tell which two of them have ground.
+    /// Assumed difference between machines, if it is known: the rms share of the repeatable error that is a machine's
+    /// own. It counts as one comparison of this cell's machine with another, in addition to those from recipes that two
+    /// machines have ground.
     #[schemars(range(min = 0.0, max = 1.0), example = 0.1)]
     machines_differ: Option<f64>,
 }

@@ -235,6 +235,6 @@ drivers! {
     Ippdme(IppdmeWire),
     /// LinuxCNC by linuxcncrsh over TCP, for a grinder.
     Linuxcnc(LinuxcncWire),
-    /// A line for each hit, from a measuring machine that hears nothing.
+    /// A line for each hit, from a measuring machine that accepts no commands.
     HitLines(HitLinesWire),
 }

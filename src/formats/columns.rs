@@ -165,7 +165,7 @@ pub enum Unit {
     /// 1e-3 mm.
     #[serde(rename = "um")]
     Micrometre,
-    /// The unit of everything here.
+    /// 1 mm.
     #[default]
     #[serde(rename = "mm")]
     Millimetre,

@@ -37,7 +37,7 @@ const MOST_BYTES: u64 = 512 << 20;
 /// Bytes at the beginning of a file in which statements are searched.
 const PREAMBLE_BYTES: usize = 64 << 10;
 
-/// What measured coordinates are.
+/// Meaning of measured coordinates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Coordinates {
@@ -60,7 +60,7 @@ impl Coordinates {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum DecimalMark {
-    /// Told from the file.
+    /// Detected from the file.
     #[default]
     Auto,
     /// A point; commas group thousands.

@@ -6,32 +6,32 @@ use std::path::PathBuf;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-/// A broker of MQTT, which is told as a Sparkplug B edge node.
+/// MQTT broker to which the cell publishes as a Sparkplug B edge node.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SparkplugSettings {
     /// Name or address of the broker's computer.
     #[schemars(length(min = 1, max = 255), example = &"plant.example")]
     pub broker: String,
-    /// Its port; 8883 where it proves itself by certificates, else 1883.
+    /// Port of the broker. Default: 8883 with `certificates`, otherwise 1883.
     #[schemars(range(min = 1))]
     pub port: Option<u16>,
     /// The group of the node, without `+`, `/` and `#`.
     #[schemars(length(min = 1, max = 80), example = &"plant")]
     pub group: String,
-    /// By which the node signs in.
+    /// User name with which the node signs in.
     pub user: Option<String>,
-    /// The file that holds the password, and nothing else, for nobody else to read; beside this file where it is relative.
+    /// File with the password and nothing else, readable by its owner only; relative to this file.
     pub password_file: Option<PathBuf>,
-    /// The certificates in PEM by which the broker proves itself. Without them it is reached on this computer alone.
+    /// Certificates in PEM that authenticate the broker. Without them, the broker must be on this computer.
     pub certificates: Option<PathBuf>,
 }
 
-/// A server of OPC UA, which shows the cell and takes nothing.
+/// OPC UA server that shows the cell and accepts no writes.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct OpcUaSettings {
-    /// Address, of this computer alone, and port; a port of 0 takes any that is free.
+    /// Address, of this computer only, and port; port 0 selects a free port.
     #[schemars(with = "String", example = &"127.0.0.1:4840")]
     pub listen: SocketAddr,
 }

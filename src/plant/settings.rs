@@ -9,23 +9,23 @@ use serde::Deserialize;
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DatabaseSettings {
-    /// Name or address of its computer; the folder of a socket where it begins with `/`.
+    /// Name or address of its computer; a value that begins with `/` is the folder of a socket.
     #[schemars(length(min = 1, max = 255), example = &"plant.example")]
     pub host: String,
-    /// Its port.
+    /// Port of the database.
     #[serde(default = "port")]
     #[schemars(range(min = 1))]
     pub port: u16,
-    /// The database.
+    /// Name of the database.
     #[serde(default = "database")]
     #[schemars(length(min = 1, max = 63))]
     pub name: String,
-    /// The role by which this computer signs in.
+    /// Role with which this computer signs in.
     #[schemars(length(min = 1, max = 63), example = &"cell_1")]
     pub user: String,
-    /// The file that holds its password, and nothing else, for nobody else to read; beside this file where it is relative.
+    /// File with the password of the role and nothing else, readable by its owner only; relative to this file.
     pub password_file: Option<PathBuf>,
-    /// The certificates in PEM by which the database proves itself. Without them it is reached on this computer alone.
+    /// Certificates in PEM that authenticate the database. Without them, the database must be on this computer.
     pub certificates: Option<PathBuf>,
 }
 
@@ -37,13 +37,13 @@ fn database() -> String {
     "regrind".to_owned()
 }
 
-/// Where files of runs are kept that are too large for the database.
+/// Store for files of runs that are too large for the database.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ArtefactSettings {
-    /// A folder that all cells and the plant see; beside this file where it is relative.
+    /// Folder that all cells and the plant can access; relative to this file.
     pub folder: PathBuf,
-    /// Files of this size and larger are kept there; smaller ones in the database.
+    /// Minimum size of a file in the folder; smaller files are in the database.
     #[serde(default = "from_mb")]
     #[schemars(range(min = 0.0, max = 1000.0))]
     pub from_mb: f64,
@@ -53,11 +53,11 @@ fn from_mb() -> f64 {
     8.0
 }
 
-/// Somebody whose signature under a recipe counts.
+/// Person whose signature approves a recipe.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Approver {
-    /// What the person is called, as the signature has it.
+    /// Name of the person, as in the signature.
     #[schemars(length(min = 1, max = 80), example = &"A. Smith")]
     pub name: String,
     /// The public half of the person's key, as `regrind audit key --key FILE` prints it.

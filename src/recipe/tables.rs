@@ -27,35 +27,36 @@ impl Um {
     }
 }
 
-/// A recipe of Regrind: what one part shall become and how a cell gets it there.
+/// A recipe of Regrind: the nominal surface of one part, and how a cell measures, judges and grinds the part.
 ///
-/// Lengths are millimetres where a key ends with `_mm`, micrometres where it ends with `_um`. Paths are relative to the recipe.
+/// Lengths are in millimetres if a key ends with `_mm`, and in micrometres if it ends with `_um`. Paths are relative to
+/// the recipe.
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct RecipeFile {
     /// The part.
     #[schemars(extend("x-required" = true))]
     pub part: Part,
-    /// What its surface shall be: a file, or a formula in the tables surface and aperture.
+    /// Nominal surface: a file, or a formula in the tables surface and aperture.
     #[schemars(extend("x-required" = true))]
     pub nominal: NominalTable,
-    /// How it is measured.
+    /// Measurement of the part.
     #[schemars(extend("x-required" = true))]
     pub measure: Measure,
-    /// How the measured points are registered.
+    /// Registration of the measured points.
     pub registration: RegistrationSettings,
-    /// When the part is good. At least one of pv_um and rms_um.
+    /// Acceptance limits of the part: at least one of pv_um and rms_um.
     #[schemars(extend("x-required" = true))]
     pub acceptance: Acceptance,
-    /// How what is left is turned into a correction.
+    /// Computation of a correction from the remaining error.
     #[schemars(extend("x-required" = true))]
     pub compensation: Compensation,
-    /// How the part is ground.
+    /// Grinding of the part.
     #[schemars(extend("x-required" = true))]
     pub grinding: Grinding,
-    /// How often, and what to do when it does not get better.
+    /// Number of cycles, and the response to a cycle without improvement.
     pub cycle: Cycle,
-    /// The truth of a simulated cell; real cells do not look at it.
+    /// Truth of a simulated cell; real cells ignore it.
     #[schemars(schema_with = "any_table")]
     pub simulation: Option<toml::Table>,
 }
@@ -64,40 +65,42 @@ pub(super) struct RecipeFile {
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Part {
-    /// Its name.
+    /// Name of the part.
     #[schemars(length(min = 1, max = 80), extend("x-required" = true), example = "free-form mirror")]
     pub name: String,
-    /// What it is made of.
+    /// Material of the part.
     #[schemars(length(min = 1, max = 80))]
     pub material: Option<String>,
-    /// Number of its drawing.
+    /// Number of the drawing of the part.
     #[schemars(length(min = 1, max = 80))]
     pub drawing: Option<String>,
-    /// Expansion of the part in millionths per kelvin: a measurement that tells its temperature is taken to 20 degrees Celsius by it.
+    /// Thermal expansion of the part in millionths per kelvin. Regrind uses it to correct a measurement with a stated
+    /// temperature to 20 °C.
     #[schemars(range(min = -20.0, max = 100.0), example = 0.55)]
     pub expansion_um_m_k: Option<f64>,
-    /// Its standard uncertainty; left out, a tenth of it.
+    /// Standard uncertainty of the expansion. Default: a tenth of the expansion.
     #[schemars(range(min = 0.0, max = 100.0))]
     pub expansion_uncertainty_um_m_k: Option<f64>,
 }
 
-/// What the surface shall be: `file`, or the tables surface and aperture.
+/// Nominal surface: `file`, or the tables surface and aperture.
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct NominalTable {
     /// File of points (CSV, XYZ, PLY), of a mesh (STL, PLY) or of a surface definition (TOML), in mm.
     #[schemars(length(min = 1, max = 400), example = "mirror.csv")]
     pub file: Option<String>,
-    /// Which columns of a table of points are x, y and z, where its header leaves it open: `x=NAME,y=NAME,z=NAME`, names or numbers from 1.
+    /// Columns of x, y and z in a table of points, if its header does not identify them: `x=NAME,y=NAME,z=NAME`, names
+    /// or numbers from 1.
     #[schemars(length(min = 5, max = 200), example = &"x=X_nom,y=Y_nom,z=Z_nom")]
     pub columns: Option<String>,
-    /// Unit of length of a table of points: mm, um, nm, cm, m or inch; without it mm.
+    /// Unit of length of a table of points: mm, um, nm, cm, m or inch. Default: mm.
     #[schemars(length(min = 1, max = 12), example = &"inch")]
     pub unit: Option<String>,
-    /// Unit of length of z in a table of points, where it is another one than that of x and y.
+    /// Unit of length of z in a table of points, if it differs from that of x and y.
     #[schemars(length(min = 1, max = 12), example = &"um")]
     pub height_unit: Option<String>,
-    /// What scattered points of a file are projected onto.
+    /// Projection of scattered points of a file for the triangulation.
     pub projection: Option<Projection>,
     /// A formula z(x, y).
     #[schemars(with = "Option<Formula>")]
@@ -105,246 +108,254 @@ pub(super) struct NominalTable {
     /// The outline of the part in x, y.
     #[schemars(with = "Option<Aperture>")]
     pub aperture: Option<toml::Table>,
-    /// How finely a formula is sampled: one of the two.
+    /// Sampling of a formula: one of the two keys.
     #[schemars(with = "Option<SamplingDefinition>")]
     pub sampling: Option<toml::Table>,
 }
 
-/// Where points are taken.
+/// Pattern of the targets.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum PatternWord {
-    /// On a grid: spacing_mm, or columns and rows.
+    /// A grid: spacing_mm, or columns and rows.
     #[default]
     Grid,
-    /// On a spiral from the middle outwards: spacing_mm or points.
+    /// A spiral from the middle outwards: spacing_mm or points.
     Spiral,
-    /// At the points of a file.
+    /// The points of a file.
     File,
-    /// Where the operator takes them: points is the least number.
+    /// Places that the operator chooses: points is the minimum number.
     Free,
 }
 
-/// Which targets are touched.
+/// Targets that the CMM touches.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mode {
-    /// All of the pattern.
+    /// All targets of the pattern.
     #[default]
     Fixed,
-    /// Batch by batch those that tell most, until the part can be accepted or its form is known well enough for a correction.
+    /// The most informative targets, batch by batch, until the part can be accepted or its form is known well enough
+    /// for a correction.
     Adaptive,
 }
 
-/// How the part is measured.
+/// Measurement of the part.
 #[derive(Clone, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Measure {
     /// Radius of the probe, or of the reflector of a tracker.
     #[schemars(range(min = 0.05, max = 50.0), example = 1.5)]
     pub probe_radius_mm: f64,
-    /// Which targets are touched.
+    /// Targets that the CMM touches.
     pub mode: Mode,
-    /// The probability with which a part out of tolerance may be accepted in mode adaptive, which needs this key. By writing it you accept
-    /// this risk.
+    /// Probability of accepting a part that is out of tolerance, in mode adaptive, which requires this key. By writing
+    /// this key you accept the risk.
     #[schemars(range(min = 0.01, max = 0.1), example = 0.025)]
     pub accepted_risk: Option<f64>,
-    /// On which side of the nominal surface the probe's centres lie.
+    /// Side of the nominal surface on which the probe centres are.
     pub side: ProbeSide,
-    /// Where points are taken.
+    /// Pattern of the targets.
     pub(super) pattern: PatternWord,
-    /// Distance of the points of a grid or a spiral.
+    /// Distance between the points of a grid or a spiral.
     #[schemars(range(min = 0.005, max = 10000.0))]
     pub(super) spacing_mm: Option<f64>,
-    /// Columns of a grid, along x.
+    /// Number of columns of a grid, along x.
     #[schemars(range(min = 2, max = 2000))]
     pub(super) columns: Option<u32>,
-    /// Rows of a grid, along y.
+    /// Number of rows of a grid, along y.
     #[schemars(range(min = 2, max = 2000))]
     pub(super) rows: Option<u32>,
-    /// Points of a spiral; least number of points of a free measurement.
+    /// Number of points of a spiral; minimum number of points of a free measurement.
     #[schemars(range(min = 10, max = 1000000))]
     pub(super) points: Option<u32>,
     /// File of points in the model frame, in mm.
     #[schemars(length(min = 1, max = 400))]
     pub(super) file: Option<String>,
-    /// Which columns of that file are x, y and z, where its header leaves it open: `x=NAME,y=NAME,z=NAME`, names or numbers from 1.
+    /// Columns of x, y and z in that file, if its header does not identify them: `x=NAME,y=NAME,z=NAME`, names or
+    /// numbers from 1.
     #[schemars(length(min = 5, max = 200), example = &"x=X_nom,y=Y_nom,z=Z_nom")]
     pub(super) file_columns: Option<String>,
-    /// Unit of length of that file, a table: mm, um, nm, cm, m or inch; without it mm.
+    /// Unit of length of that file, a table: mm, um, nm, cm, m or inch. Default: mm.
     #[schemars(length(min = 1, max = 12), example = &"inch")]
     pub(super) file_unit: Option<String>,
-    /// Unit of length of z in that file, where it is another one than that of x and y.
+    /// Unit of length of z in that file, if it differs from that of x and y.
     #[schemars(length(min = 1, max = 12), example = &"um")]
     pub(super) file_height_unit: Option<String>,
-    /// Distance kept from the edge of the part.
+    /// Minimum distance of the targets from the edge of the part.
     #[schemars(range(min = 0.0, max = 10000.0))]
     pub edge_margin_mm: f64,
-    /// From how far the probe approaches a point, ball surface to point.
+    /// Distance from which the probe approaches a point, from the surface of the ball to the point.
     #[schemars(range(min = 0.05, max = 500.0))]
     pub approach_mm: f64,
-    /// How far beyond a point the probe searches.
+    /// Distance that the probe searches beyond a point.
     #[schemars(range(min = 0.01, max = 500.0))]
     pub search_mm: f64,
-    /// Speed of the probe while it searches.
+    /// Speed of the probe during the search.
     #[schemars(range(min = 0.05, max = 500.0))]
     pub speed_mm_s: f64,
-    /// How far above the highest target the probe travels.
+    /// Height above the highest target at which the probe travels.
     #[schemars(range(min = 0.5, max = 2000.0))]
     pub safe_height_mm: f64,
-    /// Least share of the points asked for that must be touched.
+    /// Minimum share of the requested points that must be touched.
     #[schemars(range(min = 0.1, max = 1.0))]
     pub min_coverage: f64,
-    /// Whether the reference sphere is touched before the part.
+    /// Whether the probe touches the reference sphere before the part.
     pub qualify: bool,
-    /// How far the radius found on the reference sphere may be from the probe's.
+    /// Maximum difference between the radius found on the reference sphere and that of the probe.
     #[schemars(range(min = 0.05, max = 1000.0))]
     pub radius_tolerance_um: Um,
-    /// Least and largest temperature, in degrees Celsius, that a measurement may state of itself; one that states none is not used then.
+    /// Minimum and maximum temperature of a measurement, in °C. With this key, a measurement without a temperature is
+    /// not used.
     #[schemars(inner(range(min = -40.0, max = 120.0)), example = [19.5, 20.5])]
     pub temperature_c: Option<[f64; 2]>,
 }
 
-/// Where a registration begins.
+/// Start of a registration.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum StartAt {
-    /// Nowhere in particular.
+    /// A search for the pose.
     #[default]
     Search,
-    /// Where the cell's fixture holds the part.
+    /// The pose of the cell's fixture.
     Fixture,
 }
 
-/// How the measured points are registered.
+/// Registration of the measured points.
 #[derive(Clone, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct RegistrationSettings {
-    /// How the nominal surface runs between its points.
+    /// Shape of the nominal surface between its points.
     pub distance: Distance,
-    /// How a distance counts: as its square, or less when it is large.
+    /// Loss function of the distances: the square, or less for a large distance.
     pub loss: Loss,
-    /// A point farther away than this many robust sigmas does not move the pose; it counts in the figures unless no neighbour found the same.
+    /// Outlier limit in robust standard deviations. A point farther away does not affect the pose. It counts in the
+    /// figures unless no neighbour has the same deviation.
     #[schemars(range(min = 3.0, max = 1000.0))]
     pub outlier_sigmas: f64,
-    /// Coordinates of the model frame that stay as the fixture has them.
+    /// Locked directions of the pose, in the model frame: they keep the values of the fixture.
     #[schemars(length(max = 6))]
     pub lock: Vec<Coordinate>,
-    /// The expanded uncertainty (k = 2) of where the fixture holds the part along what is held; of its turns as much at the edge of the
-    /// part. What a part held elsewhere would look like is in the ± of its figures. Without it the fixture is taken for exact, and nothing
-    /// is told of setting and tilt, which look the same.
+    /// Expanded uncertainty (k = 2) of the fixture along the locked directions; for locked rotations, of the
+    /// displacement at the edge of the part. The ± of the figures includes the effect of a part that lies elsewhere.
+    /// Without this key the fixture is assumed to be exact, and setting and tilt are not estimated, because they have
+    /// the same effect.
     #[schemars(range(min = 0.0, max = 10000.0), example = 0.5)]
     pub lock_uncertainty_um: Option<Um>,
-    /// Where to begin: anywhere, or where the cell's fixture holds the part.
+    /// Start of the registration: a search, or the pose of the cell's fixture.
     pub start: StartAt,
-    /// The farthest that the part may lie from where the fixture holds it.
+    /// Maximum shift of the part from its position in the fixture.
     #[schemars(range(min = 0.001, max = 100000.0))]
     pub max_shift_mm: f64,
-    /// The most that the part may be turned from how the fixture holds it.
+    /// Maximum rotation of the part from its orientation in the fixture.
     #[schemars(range(min = 0.0001, max = 180.0))]
     pub max_turn_deg: f64,
-    /// The least share of the part's surface that the measured points must cover; below, nothing is made of them.
+    /// Minimum share of the part's surface that the measured points must cover. Points that cover less are not used.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub min_coverage: f64,
-    /// Refuse a fit whose rms deviation is above this.
+    /// Maximum rms deviation of a fit; a fit with a larger one is refused.
     #[schemars(range(min = 0.01, max = 1000000.0))]
     pub max_rms_um: Option<Um>,
 }
 
-/// When the part is good.
+/// Acceptance limits of the part.
 #[derive(Clone, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Acceptance {
-    /// Largest peak to valley of the form.
+    /// Maximum peak to valley of the form.
     #[schemars(range(min = 0.001, max = 100000.0))]
     pub pv_um: Option<Um>,
-    /// Which points the peak to valley is taken of.
+    /// Points that the peak to valley includes.
     pub pv_of: PvOf,
-    /// Largest rms of the form.
+    /// Maximum rms of the form.
     #[schemars(range(min = 0.001, max = 100000.0))]
     pub rms_um: Option<Um>,
-    /// Whether a figure must be within its limit with `probability`; else the most probable value is held against it.
+    /// Whether a figure must be within its limit with `probability`. If false, the most probable value is compared with
+    /// the limit.
     pub expanded_uncertainty: bool,
-    /// The probability with which a figure must be within its limit to be accepted, and beyond it to be rejected. Left out 0.975, or where
-    /// `measure.accepted_risk` is less than 0.025, one less that.
+    /// Probability with which a figure must be within its limit to be accepted, and beyond it to be rejected. Default:
+    /// 0.975, or 1 - `measure.accepted_risk` if that risk is less than 0.025.
     #[schemars(range(min = 0.5, max = 0.995), example = 0.975)]
     pub probability: Option<f64>,
 }
 
-/// How what is left is turned into a correction.
+/// Computation of a correction from the remaining error.
 #[derive(Clone, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Compensation {
-    /// A fixed share of the deviation that every cycle takes back; 0 takes nothing back, and passes are ground all the same. Left out, `gain_by`
-    /// chooses it.
+    /// Fixed share of the error that every correction removes. With 0 a correction removes nothing, but the cell still
+    /// grinds the passes. Default: `gain_by` chooses the share.
     #[schemars(range(min = 0.0, max = 1.2))]
     pub(super) gain: Option<f64>,
-    /// What the share that a cycle takes back is chosen by, where `gain` does not fix it.
+    /// Rule for the share of the error that a correction removes, if `gain` does not fix it.
     pub(super) gain_by: Option<GainRule>,
-    /// Root mean square of what a pass adds by itself, where that is known; without it the cycles tell it.
+    /// Root mean square of the error that is new in each pass, if it is known. Without this key, it is estimated from
+    /// the cycles.
     #[schemars(range(min = 0.001, max = 1000.0))]
     pub repeatability_um: Option<Um>,
-    /// Begin with what the last finished run found to come back in every pass, if it had this part and cell, this wheel and way of grinding,
-    /// as many targets, and this cut-off, smoothing and gain. What is measured is then told with the form that earlier parts had after such
-    /// passes, as far as it is like that.
+    /// Start with the repeatable error that the last finished run found, if the run had the same part and cell, the
+    /// same wheel and way of grinding, the same number of targets, and the same cut-off, smoothing and gain. The form
+    /// of earlier parts after the same kind of pass is then the prior of the form, as far as the measurement agrees
+    /// with it.
     pub learn: bool,
-    /// The least that a pass takes off where it takes off least.
+    /// Minimum removal of a pass, at the place where it removes least.
     #[schemars(range(min = 0.0, max = 1000.0))]
     pub min_depth_um: Um,
-    /// Wavelengths shorter than this are left alone.
+    /// Cut-off wavelength; shorter waves are not corrected.
     #[schemars(range(min = 0.05, max = 10000.0), example = 8.0)]
     pub cutoff_mm: f64,
-    /// What makes the map of the deviations smooth.
+    /// Filter that smooths the map of the deviations.
     pub smoothing: Smoothing,
-    /// What the Gaussian filters let pass unchanged.
+    /// Polynomials that the Gaussian filters pass unchanged.
     pub filter_order: Order,
-    /// How the spline's smoothness is chosen, where it is a spline.
+    /// Choice of the spline's smoothness, if `smoothing` is a spline.
     pub roughness: Roughness,
-    /// The correction is nowhere larger than this.
+    /// Maximum correction at any place of the part.
     #[schemars(range(min = 0.01, max = 10000.0), example = 60.0)]
     pub max_correction_um: Um,
-    /// The most that may be taken off anywhere below the surface of the first pass, over all passes; it is allowance and what may go below the
-    /// nominal surface together.
+    /// Maximum removal at any place below the surface of the first pass, over all passes: the allowance plus the
+    /// permitted depth below the nominal surface.
     #[schemars(range(min = 0.01, max = 100000.0), example = 300.0)]
     pub removal_budget_um: Um,
-    /// How much deeper each pass goes than the one before; it goes deeper than that where the part is so low that the wheel would else cut
-    /// air there, and locally by as much as the part stands proud. The most that the machine may take off is grinder.limits.max_depth_mm
-    /// of the cell.
+    /// Depth of each pass below the pass before. A pass goes deeper if the part is so low at a place that the wheel
+    /// would otherwise cut air there. Locally, it removes in addition the height of the excess material. The limit of
+    /// the machine is grinder.limits.max_depth_mm of the cell.
     #[schemars(range(min = 0.01, max = 10000.0), example = 60.0)]
     pub depth_of_cut_um: Um,
-    /// Parameters of the machine that are taken back as such after the first pass, each with its tolerance; the map is what is left. Left out,
-    /// all is left to the map.
+    /// Parameters of the machine that are compensated after the first pass, each with its tolerance; the map has the
+    /// rest of the error. Default: the map has the whole error.
     pub parameters: Option<MachineParameters>,
-    /// Distance of the nodes of the map.
+    /// Distance between the nodes of the map.
     #[schemars(range(min = 0.01, max = 10000.0))]
     pub spacing_mm: f64,
-    /// The correction is refused where it might sit farther than this beside its place on the part (k = 2), because the surface does not
-    /// tell the part's place any better.
+    /// Maximum lateral displacement of the correction on the part (k = 2). A correction is refused if the surface
+    /// determines the position of the part less well.
     #[schemars(range(min = 0.001, max = 1000.0))]
     pub max_displacement_mm: f64,
 }
 
-/// Tolerances of parameters of the machine: the expanded uncertainty (k = 2) with which each is set. One that stands is taken back where it is told
-/// beyond its uncertainty; for more than its tolerance a person is asked.
+/// Tolerances of parameters of the machine: the expanded uncertainty (k = 2) with which each is set. A parameter with a
+/// tolerance is compensated if it exceeds its uncertainty. If it exceeds its tolerance, a person is asked.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct MachineParameters {
-    /// Of the radius of the wheel, a ball.
+    /// Tolerance of the radius of a spherical wheel.
     #[schemars(range(min = 0.1, max = 10000.0), example = 100.0)]
     pub wheel_radius_um: Option<Um>,
-    /// Of where the wheel is set along x; told where the part is held along x.
+    /// Tolerance of the setting of the wheel along x; estimated if x is locked.
     #[schemars(range(min = 0.1, max = 10000.0), example = 15.0)]
     pub wheel_x_um: Option<Um>,
-    /// The same along y.
+    /// Tolerance of the setting of the wheel along y; estimated if y is locked.
     #[schemars(range(min = 0.1, max = 10000.0), example = 15.0)]
     pub wheel_y_um: Option<Um>,
-    /// How high the wheel is set; told where the part is held along z.
+    /// Tolerance of the height of the wheel; estimated if z is locked.
     #[schemars(range(min = 0.1, max = 10000.0), example = 15.0)]
     pub wheel_z_um: Option<Um>,
-    /// Tilt of the part in the grinder about x; told where the part is held about x.
+    /// Tolerance of the tilt of the part in the grinder about x; estimated if rx is locked.
     #[schemars(range(min = 0.1, max = 10000.0), example = 60.0)]
     pub part_tilt_x_urad: Option<f64>,
-    /// The same about y.
+    /// Tolerance of the tilt of the part in the grinder about y; estimated if ry is locked.
     #[schemars(range(min = 0.1, max = 10000.0), example = 60.0)]
     pub part_tilt_y_urad: Option<f64>,
 }
@@ -359,74 +370,75 @@ impl MachineParameters {
     }
 }
 
-/// How the part is ground.
+/// Grinding of the part.
 #[derive(Clone, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Grinding {
     /// The wheel.
     #[schemars(extend("x-required" = true))]
     pub wheel: Wheel,
-    /// How a head tilts the wheel, on a grinder that has one; left out, the wheel stays upright.
+    /// Tilt of the wheel, on a grinder with a tilting head. Default: the wheel is upright.
     pub tilt: Option<Tilt>,
     /// Feed along the track.
     #[schemars(range(min = 0.1, max = 100000.0), example = 600.0)]
     pub feed_mm_min: f64,
-    /// Distance of the tracks; the largest one where scallop_nm is given. Where neither stands it is chosen so that the scallops, the ridges
-    /// between the tracks, take a fifth of acceptance.rms_um and of acceptance.pv_um at most.
+    /// Distance between the tracks; with scallop_nm, its maximum. Without both keys, the distance is chosen so that the
+    /// scallops, the ridges between the tracks, use at most a fifth of acceptance.rms_um and of acceptance.pv_um.
     #[schemars(range(min = 0.001, max = 1000.0))]
     pub track_mm: Option<f64>,
-    /// How the tracks run.
+    /// Pattern of the tracks.
     pub pattern: TrackPattern,
-    /// Whether every track of a raster runs towards +x; else they alternate.
+    /// Whether every track of a raster runs towards +x. If false, the tracks alternate.
     pub one_way: bool,
-    /// Height of the ridges between tracks, at most: the tracks are laid as close as that takes.
+    /// Maximum height of the scallops, the ridges between the tracks. It sets the distance between the tracks.
     #[schemars(range(min = 0.01, max = 1000000.0))]
     pub scallop_nm: Option<f64>,
-    /// How far the straight lines of the program may be from the path of the wheel's centre.
+    /// Maximum distance of the straight lines of the program from the path of the wheel's centre.
     #[schemars(range(min = 0.001, max = 100.0))]
     pub chord_error_um: Um,
-    /// How far tracks go on beyond the edge of the part.
+    /// Length of the tracks beyond the edge of the part.
     #[schemars(range(min = 0.0, max = 1000.0))]
     pub overrun_mm: f64,
-    /// How far above the highest point of its path the wheel travels between tracks.
+    /// Height above the highest point of its path at which the wheel travels between tracks.
     #[schemars(range(min = 0.5, max = 1000.0))]
     pub safe_height_mm: f64,
-    /// How exactly the controller keeps to the program.
+    /// Path mode: how exactly the controller follows the program.
     pub path_mode: PathMode,
-    /// How far the controller may round a corner off with path_mode = "blend".
+    /// Maximum rounding of a corner by the controller with path_mode = "blend".
     #[schemars(range(min = 0.001, max = 1000.0))]
     pub path_tolerance_um: Um,
     /// Passes without in-feed at the end.
     #[schemars(range(max = 20))]
     pub spark_out_passes: u16,
-    /// Level of the first pass over the nominal surface; each further pass goes deeper by the depth of cut.
+    /// Level of the first pass above the nominal surface; each further pass goes deeper by the depth of cut.
     #[schemars(range(min = 0.0, max = 10000.0))]
     pub allowance_um: Um,
-    /// How many mm3 of the part the wheel takes off for each mm3 that it wears (G): `regrind plan` tells the loss of the wheel by it, and
-    /// nothing else goes by it.
+    /// Grinding ratio G: mm³ of material removed for each mm³ of wheel worn. Only `regrind plan` uses it, to estimate
+    /// the wear of the wheel.
     #[schemars(range(min = 0.01, max = 1000000.0), example = 200.0)]
     pub grinding_ratio: Option<f64>,
 }
 
-/// How a wheel leans.
+/// Mode of the tilt of a wheel.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq)]
 #[serde(rename_all = "kebab-case")]
 pub enum Leaning {
-    /// By the same angle everywhere.
+    /// The same angle everywhere.
     #[default]
     Constant,
-    /// After the normal of the surface, seen along the axis of the head: the angle is kept between the normal and the upright direction of the head.
+    /// The head follows the normal of the surface, seen along its axis: the angle between the normal and the upright
+    /// direction of the head is constant.
     Following,
 }
 
-/// How a head tilts the wheel.
+/// Tilt of the wheel by a head.
 #[derive(Clone, Copy, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Tilt {
-    /// Whether it follows the surface.
+    /// Mode of the tilt: constant, or following the surface.
     pub lean: Leaning,
-    /// How far the head is turned, right-handed about its axis: from upright, or from the normal where it follows. A positive B leans to +x, a
-    /// positive A to -y.
+    /// Angle of the head, right-handed about its axis: from upright, or from the normal if the head follows the
+    /// surface. A positive B tilts to +x, a positive A to -y.
     #[schemars(range(min = -90.0, max = 90.0), extend("x-required" = true), example = 20.0)]
     pub angle_deg: f64,
 }
@@ -437,7 +449,7 @@ impl Default for Tilt {
     }
 }
 
-/// Axis of the model frame that a spindle lies along.
+/// Axis of the model frame parallel to a spindle.
 #[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 #[allow(missing_docs)]
@@ -468,7 +480,7 @@ pub enum Wheel {
         #[serde(default = "missing")]
         #[schemars(range(min = 0.05, max = 1000.0), example = 2.0)]
         minor_radius_mm: f64,
-        /// Axis of the model frame that the spindle lies along: across the tracks of a raster is y.
+        /// Axis of the model frame parallel to the spindle; y is across the tracks of a raster.
         #[serde(default)]
         spindle: SpindleAxis,
     },
@@ -482,7 +494,7 @@ pub enum Wheel {
         #[serde(default = "missing")]
         #[schemars(range(min = 0.05, max = 1000.0), example = 2.0)]
         minor_radius_mm: f64,
-        /// Tilt of the spindle from z towards -x; left out, five degrees more than the part slopes.
+        /// Tilt of the spindle from z towards -x. Default: 5° more than the slope of the part.
         #[schemars(range(min = 1.0, max = 80.0))]
         tilt_deg: Option<f64>,
     },
@@ -502,23 +514,24 @@ fn missing() -> f64 {
     f64::NAN
 }
 
-/// How often, and what to do when it does not get better.
+/// Number of cycles, and the response to a cycle without improvement.
 #[derive(Clone, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Cycle {
-    /// What the first cycle begins with: a pass, or a measurement of the part as it is.
+    /// First step of the first cycle: a pass, or a measurement of the part as it is.
     pub begin_with: Beginning,
-    /// Most cycles of grinding and measuring.
+    /// Maximum number of cycles of grinding and measuring.
     #[schemars(range(min = 1, max = 100))]
     pub max_cycles: u16,
-    /// What to do when a cycle brings next to nothing.
+    /// Response to a stall: a cycle that improves the part by next to nothing.
     pub on_stall: Disposal,
-    /// What to do when a cycle makes it worse.
+    /// Response to a cycle that makes the part worse.
     pub on_divergence: Disposal,
-    /// A cycle whose rms falls by less than this, or is expected to, brings next to nothing; so does one whose rms falls by less than 2 %.
+    /// Minimum decrease of the rms in a cycle. A cycle stalls if its rms decreases, or is expected to decrease, by less
+    /// than this, or by less than 2 %.
     #[schemars(range(min = 0.0, max = 10000.0))]
     pub stall_um: Um,
-    /// Whether a part that comes from the queue of a plant is confirmed by a person at the cell before its run begins.
+    /// Whether a person at the cell confirms a part from the queue of a plant before its run begins.
     pub confirm_work: bool,
 }
 

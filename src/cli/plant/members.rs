@@ -12,7 +12,7 @@ use super::super::failure::Failure;
 use super::super::{Outcome, key, name};
 use super::{Where, open, open_any};
 
-/// Lay the database out, or bring it up to this program's layout, as its owner
+/// Set up the database, or update it to this program's layout, as its owner
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The owner of the database signs in, with the right to make roles. What is there stays; it may be said again at any time.
@@ -26,7 +26,7 @@ pub(super) struct ToInit {
     plant: Where,
 }
 
-/// Let a cell, a planner or a reader sign in, with a new password
+/// Enrol a cell, a planner, a reader or a worker, with a new password
 #[derive(Args, Debug)]
 #[command(after_help = "\
 A cell reads what is its own, ships its records and takes work; a planner reads everything, brings recipes and queues parts; a reader
@@ -38,16 +38,17 @@ Examples:
 
 Exit codes: 0 enrolled; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToEnrol {
-    /// What it is called in the plant; its role is called so too, in small letters, digits and `_`
+    /// Name in the plant, and of the role in the database: small letters, digits and `_`
     #[arg(value_name = "NAME", value_parser = name)]
     name: String,
-    /// What it does
+    /// Kind of the new member
     #[arg(long = "as", value_enum, default_value = "cell")]
     role: Kind,
-    /// File for the password; made, or written over
+    /// File for the password; created or overwritten
     #[arg(long, value_name = "FILE")]
     password_file: PathBuf,
-    /// Public key that may sign the records of the cell, or the file that `regrind audit key --json` was kept in; again for another
+    /// Public key that may sign the records of the cell, or the file with the output of `regrind audit key --json`;
+    /// repeat the option for another key
     #[arg(long, value_name = "PUBLIC|FILE", value_parser = key::public)]
     key: Vec<PublicKey>,
     #[command(flatten)]
@@ -56,17 +57,17 @@ pub(super) struct ToEnrol {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Kind {
-    /// A cell
+    /// Makes parts
     Cell,
-    /// Who queues parts and brings recipes
+    /// Queues parts and proposes recipes
     Planner,
-    /// Who looks
+    /// Reads everything
     Reader,
-    /// Who makes the simulated runs of studies
+    /// Makes the simulated runs of studies
     Worker,
 }
 
-/// Take a cell out of the plant: it cannot sign in any more, and its records stay
+/// Remove a cell from the plant: it can no longer sign in, and its records stay
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -74,14 +75,14 @@ Example:
 
 Exit codes: 0 retired; 1 there is no such cell; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToRetire {
-    /// What it is called in the plant
+    /// Name of the cell in the plant
     #[arg(value_name = "NAME")]
     name: String,
     #[command(flatten)]
     plant: Where,
 }
 
-/// Tell which cells there are, and when each was heard of last
+/// List the cells, with the time of the last contact
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -91,7 +92,7 @@ Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToList {
     #[command(flatten)]
     plant: Where,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

@@ -20,7 +20,7 @@ use super::failure::Failure;
 use super::{Outcome, check};
 pub(super) use recipes::is_below;
 
-/// Keep the database of a plant of many cells
+/// Manage the database of a plant of many cells
 #[derive(Args, Debug)]
 #[command(after_help = "\
 A cell runs, holds and accepts without a plant; the plant never commands a motion. The database is PostgreSQL 15 or later; who signs in, and
@@ -76,10 +76,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     }
 }
 
-/// Which plant is meant.
+/// Plant to use.
 #[derive(Args, Clone, Debug)]
 pub(super) struct Where {
-    /// Plant file: where the database is, and who signs in
+    /// Plant file: address and user of the database
     #[arg(long = "plant", value_name = "FILE")]
     file: PathBuf,
 }

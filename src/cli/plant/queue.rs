@@ -8,7 +8,7 @@ use super::super::failure::Failure;
 use super::super::{Outcome, name};
 use super::{Where, open};
 
-/// Queue parts that are to be made by a recipe
+/// Queue parts to make by a recipe
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Cells take them by `regrind work`, the one that is due first before the others. Nothing begins by itself: a person at the cell confirms each,
@@ -22,23 +22,23 @@ pub(super) struct ToQueue {
     /// Serial numbers of the parts
     #[arg(value_name = "SERIAL", required = true, value_parser = name)]
     serials: Vec<String>,
-    /// What the recipe is called in the plant
+    /// Name of the recipe in the plant
     #[arg(long, value_name = "NAME")]
     recipe: String,
-    /// Its version; without it, the newest
+    /// Version of the recipe; by default the newest
     #[arg(long, value_name = "N")]
     version: Option<i32>,
-    /// The cell that is to make them; without it, whichever asks first
+    /// Cell that makes them; by default the first that asks
     #[arg(long, value_name = "NAME")]
     cell: Option<String>,
-    /// The day by which they are due
+    /// Due date
     #[arg(long, value_name = "YYYY-MM-DD")]
     due: Option<jiff::civil::Date>,
     #[command(flatten)]
     plant: Where,
 }
 
-/// Take a part out of the queue that nobody has begun
+/// Remove a part from the queue, if it is not started
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -49,14 +49,14 @@ pub(super) struct ToUnqueue {
     /// Its number in the queue (`regrind plant work`)
     #[arg(value_name = "N")]
     work: i64,
-    /// Why, for who reads it later
+    /// Reason, for the record
     #[arg(long, value_name = "WORDS", value_parser = name)]
     why: String,
     #[command(flatten)]
     plant: Where,
 }
 
-/// List the parts that are to be made, and those that are being made
+/// List the parts that are queued or in work
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -66,7 +66,7 @@ Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToList {
     #[command(flatten)]
     plant: Where,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

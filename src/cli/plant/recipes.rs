@@ -13,7 +13,7 @@ use super::super::failure::Failure;
 use super::super::{Outcome, check, name};
 use super::{Where, open};
 
-/// Bring a recipe to the plant, as the next version of its name
+/// Propose a recipe to the plant, as the next version under its name
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The recipe is checked as `regrind check` does, and goes with the files that it names, which lie beside it or below. No part is made by it before
@@ -27,14 +27,14 @@ pub(super) struct ToPropose {
     /// Recipe of the part
     #[arg(value_name = "RECIPE")]
     recipe: PathBuf,
-    /// What it is called in the plant; without it, as its file
+    /// Name in the plant; by default the name of the file
     #[arg(long, value_name = "NAME", value_parser = name)]
     name: Option<String>,
     #[command(flatten)]
     plant: Where,
 }
 
-/// Sign a recipe, so that parts are made by it when two people have
+/// Sign a recipe; cells make parts by it after two people have signed it
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The key is a person's own (`regrind audit key --key FILE` makes one). Its public half stands in the plant file of each cell, by which the cell
@@ -45,26 +45,26 @@ Example:
 
 Exit codes: 0 signed; 2 no such recipe, one that the person has signed already, or the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToApprove {
-    /// What it is called in the plant
+    /// Name of the recipe in the plant
     #[arg(value_name = "NAME")]
     name: String,
-    /// Its version; without it, the newest
+    /// Version of the recipe; by default the newest
     #[arg(long, value_name = "N")]
     version: Option<i32>,
-    /// Who signs, as plant files have the name
+    /// Person who signs, with the name from the plant files
     #[arg(long, value_name = "NAME", value_parser = name)]
     person: String,
     /// File of the person's key
     #[arg(long, value_name = "FILE")]
     key: PathBuf,
-    /// Print the recipe first, and sign nothing
+    /// Print the recipe, and sign nothing
     #[arg(long)]
     look: bool,
     #[command(flatten)]
     plant: Where,
 }
 
-/// Take a recipe back: no part is begun by it any more
+/// Withdraw a recipe: cells start no further part by it
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -72,20 +72,20 @@ Example:
 
 Exit codes: 0 withdrawn; 1 there is no such recipe, or it was withdrawn before; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToWithdraw {
-    /// What it is called in the plant
+    /// Name of the recipe in the plant
     #[arg(value_name = "NAME")]
     name: String,
-    /// Its version
+    /// Version of the recipe
     #[arg(long, value_name = "N")]
     version: i32,
-    /// Why, for who reads it later
+    /// Reason, for the record
     #[arg(long, value_name = "WORDS", value_parser = name)]
     why: String,
     #[command(flatten)]
     plant: Where,
 }
 
-/// List the recipes, and who has signed each
+/// List the recipes and their signatures
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -95,7 +95,7 @@ Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToList {
     #[command(flatten)]
     plant: Where,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

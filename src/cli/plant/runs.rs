@@ -19,20 +19,20 @@ Examples:
 
 Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToList {
-    /// Serial number of the part, or how it begins
+    /// Serial number of the part, or its first characters
     #[arg(long, value_name = "SERIAL")]
     part: Option<String>,
-    /// How many at most
+    /// Maximum number of entries
     #[arg(long, value_name = "N", default_value_t = 40)]
     most: u32,
     #[command(flatten)]
     plant: Where,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }
 
-/// Bring a run back from the plant as a run folder, and prove it
+/// Fetch a run from the plant as a run folder, and verify it
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Records and files are written as they were at the cell; `regrind report`, `regrind audit` and whatever else reads a run reads it.
@@ -42,20 +42,20 @@ Example:
 
 Exit codes: 0 brought back and proven; 1 it cannot be believed, or is not whole; 2 no such run; 3 the plant cannot be reached.")]
 pub(super) struct ToFetch {
-    /// What the run is called
+    /// Name of the run
     #[arg(value_name = "RUN")]
     run: String,
-    /// The cell that made it, where several have a run of that name
+    /// Cell of the run, if several cells have a run of this name
     #[arg(long, value_name = "NAME")]
     cell: Option<String>,
-    /// Folder that the run's own folder is made in
+    /// Folder in which to create the folder of the run
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     #[command(flatten)]
     plant: Where,
 }
 
-/// Tell what should not have been: journals that were cut, refused work, broken chains
+/// List incidents: cut journals, refused work, broken chains
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -63,12 +63,12 @@ Example:
 
 Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToTell {
-    /// How many at most
+    /// Maximum number of entries
     #[arg(long, value_name = "N", default_value_t = 40)]
     most: u32,
     #[command(flatten)]
     plant: Where,
-    /// Print JSON instead of words
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }

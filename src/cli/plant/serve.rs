@@ -27,7 +27,7 @@ Examples:
 
 Exit codes: 0 stopped by Ctrl-C; 2 bad arguments, or the database refuses it. A database that cannot be reached is waited for.")]
 pub(super) struct Arguments {
-    /// Address and port of the page; a port of 0 takes any that is free
+    /// Address and port of the page; port 0 selects a free port
     #[arg(long, value_name = "ADDRESS", default_value = ADDRESS)]
     listen: SocketAddr,
     #[command(flatten)]

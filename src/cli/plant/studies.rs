@@ -24,7 +24,7 @@ const MOST_JOBS: usize = 1_000_000;
 /// Quantile of the normal distribution for a 95 % interval.
 const Z: f64 = 1.96;
 
-/// Make a recipe many times in simulation, on as many computers as there are, and tell what came of it
+/// Simulate a recipe many times, on any number of computers, and summarise the results
 #[derive(Args, Debug)]
 #[command(after_help = "\
 For commissioning: how often a recipe is accepted, in how many cycles, by which gain or tolerance, and how often an accepted part is truly out of
@@ -49,7 +49,7 @@ enum What {
     Stop(ToStop),
 }
 
-/// Begin a study: a job for each seed and each set of values
+/// Start a study: a job for each seed and each set of values
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -60,13 +60,14 @@ struct ToBegin {
     /// Recipe, with a table [simulation]
     #[arg(value_name = "RECIPE")]
     recipe: PathBuf,
-    /// What the study is called
+    /// Name of the study
     #[arg(long, value_name = "NAME", value_parser = name)]
     name: String,
-    /// What the simulated parts and runs are drawn from
+    /// Seeds of the simulated parts and runs
     #[arg(long, value_name = "FIRST..LAST", value_parser = seeds)]
     seeds: (u64, u64),
-    /// A key of the recipe and the values that it has, apart by commas; again for another key: every value with every other
+    /// Key of the recipe and its values, separated by commas; repeat the option for another key: the study has all
+    /// combinations
     #[arg(long, value_name = "KEY=VALUE,VALUE", value_parser = variation)]
     vary: Vec<(String, Vec<Value>)>,
     #[command(flatten)]
@@ -81,17 +82,17 @@ Example:
 
 Exit codes: 0 none is left; 2 bad arguments, or the database refuses it; 3 it cannot be reached.")]
 struct ToWork {
-    /// How many runs at a time
+    /// Number of runs at a time
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=64))]
     workers: u8,
-    /// Wait for further jobs when there is none, until Ctrl-C
+    /// Wait for further jobs when none is left, until Ctrl-C
     #[arg(long)]
     wait: bool,
     #[command(flatten)]
     plant: Where,
 }
 
-/// Tell what came of a study, for each set of values
+/// Show the results of a study for each set of values
 #[derive(Args, Debug)]
 #[command(after_help = "\
 `accepted` has its interval of 95 % (Wilson 1927). `false accepts` are accepted parts that are truly out of tolerance, as the simulated world knows.
@@ -101,7 +102,7 @@ Example:
 
 Exit codes: 0 told; 1 there is no such study; 2 the database refuses it; 3 it cannot be reached.")]
 struct ToShow {
-    /// What the study is called
+    /// Name of the study
     #[arg(value_name = "NAME")]
     name: String,
     #[command(flatten)]
@@ -111,7 +112,7 @@ struct ToShow {
     json: bool,
 }
 
-/// Give out no more jobs of a study
+/// Stop a study: assign no further job of it
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -119,7 +120,7 @@ Example:
 
 Exit codes: 0 stopped; 1 there is no such study, or it was stopped before; 2 the database refuses it; 3 it cannot be reached.")]
 struct ToStop {
-    /// What the study is called
+    /// Name of the study
     #[arg(value_name = "NAME")]
     name: String,
     #[command(flatten)]

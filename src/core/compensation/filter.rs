@@ -48,7 +48,7 @@ const MOST_SPREAD: f64 = 4.5;
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Order {
-    /// Constants pass: the plain weighted mean, which is pulled askew by slopes at edges.
+    /// Constants pass: the plain weighted mean, which is biased at edges with a slope.
     Constant,
     /// Planes pass.
     #[default]

@@ -50,7 +50,7 @@ const RESPONSE_SIGMA_OF_NEXT_PART: f64 = 0.02;
 /// Limits of a credible response; one outside them has other causes than the correction and is ignored.
 pub(super) const RESPONSE_LIMITS: [f64; 2] = [0.5, 1.5];
 
-/// By what is chosen how much of an error is taken back.
+/// Rule for the share of an error that a correction removes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -58,9 +58,9 @@ pub enum GainRule {
     /// Always the same share of the newest error.
     #[cfg_attr(feature = "schema", schemars(skip))]
     Fixed(f64),
-    /// What the passes have told of what comes back and what does not, one share for all wavelengths.
+    /// One share for all wavelengths, estimated from the errors of the passes that repeat and that do not.
     Adaptive,
-    /// The same for each octave of wavelengths by itself.
+    /// The same estimate for each octave of wavelengths separately.
     #[default]
     Wavelength,
 }

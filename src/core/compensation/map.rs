@@ -18,7 +18,7 @@ use crate::geometry::{Grid, Sample};
 /// Minimum cut-off of the surface that readings are compared with, in distances between readings.
 const WIDE: f64 = 4.0;
 
-/// What makes the deviations smooth.
+/// Filter that smooths the deviations.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -26,8 +26,8 @@ pub enum Smoothing {
     /// The areal Gaussian filter, ISO 16610-61.
     #[default]
     Gaussian,
-    /// Its robust form, ISO 16610-71: what stands out counts less. What stands out is told on a surface with a cut-off of four distances
-    /// between readings at least.
+    /// The robust areal Gaussian filter, ISO 16610-71: outliers count less. They are detected on a surface with a
+    /// cut-off of at least four distances between readings.
     RobustGaussian,
     /// A smoothing surface of tensor-product cubic B-splines.
     Spline,

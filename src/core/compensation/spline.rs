@@ -40,15 +40,16 @@ const STEP: f64 = 0.02;
 /// the surface.
 const RIDGE: f64 = 1e-13;
 
-/// How the smoothness of a spline is chosen.
+/// Choice of the smoothness of a spline.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Roughness {
-    /// Half of a wave as long as the cut-off passes.
+    /// Half of the amplitude of a wave at the cut-off passes.
     #[default]
     Cutoff,
-    /// Generalised cross-validation, no rougher than by the cut-off: what predicts readings left out best.
+    /// Generalised cross-validation, no rougher than by the cut-off: the smoothness that predicts withheld readings
+    /// best.
     CrossValidation,
 }
 

@@ -16,7 +16,7 @@ const MOST_CORNERS: usize = 4000;
 
 /// The outline of a part in the (x, y) plane.
 ///
-/// Units: millimetres. As written in TOML: `kind = "circle"`, `radius_mm = 30.0`; a centre left out is the origin.
+/// Units: millimetres. As written in TOML: `kind = "circle"`, `radius_mm = 30.0`; the default centre is the origin.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]

@@ -5,7 +5,7 @@ use crate::surface::{Distance, Side};
 
 use super::robust::Loss;
 
-/// What the measured points are taken for.
+/// Meaning of the measured points.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -30,9 +30,9 @@ pub enum Start {
     Pose(Pose),
 }
 
-/// On which side of the nominal surface the probe centres lie.
+/// Side of the nominal surface on which the probe centres are.
 ///
-/// A side that is given is refused if the points fit the other one much better.
+/// A given side is refused if the points fit the other side much better.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// How the distance of a point counts in the objective.
+/// Loss function of the distance of a point in the objective.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -12,7 +12,7 @@ pub enum Loss {
     None,
     /// As its square near the surface and linearly beyond 1.345 robust sigmas: 95 % efficient on Gaussian errors.
     Huber,
-    /// As the biweight with 4.685 robust sigmas: a point farther away has no pull at all.
+    /// As the biweight with 4.685 robust sigmas: a point farther away has no effect.
     Tukey,
 }
 

@@ -9,12 +9,12 @@ use super::nominal::Nominal;
 use super::patch::{Lattice, Patch};
 use super::simd::{dot, minus};
 
-/// How the surface runs between the corners of a facet.
+/// Shape of the surface between the corners of a facet.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Distance {
-    /// As the cubic that its corners and normals define.
+    /// The cubic that its corners and normals define.
     #[default]
     Curved,
     /// Flat, eq. (2).

@@ -8,20 +8,20 @@ use crate::geometry::{Point, Vector, bounds};
 use super::error::SurfaceError;
 use super::normals::tangents;
 
-/// What to project scattered points onto before they are triangulated.
+/// Projection of scattered points for the triangulation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Projection {
-    /// The first of the others, in their order, that is one-to-one.
+    /// The first of the other projections, in their order, that is one-to-one.
     #[default]
     Auto,
     /// The xy plane of the model frame.
     Xy,
     /// The plane that fits the points best.
     BestFit,
-    /// Latitude and longitude about the centre of the best sphere, drawn as a stereographic map so that neither the pole
-    /// nor the meridian of 180 degrees is special; for more than a hemisphere.
+    /// Latitude and longitude about the centre of the best sphere, as a stereographic map, so that neither the pole nor
+    /// the meridian of 180° is special; for more than a hemisphere.
     Spherical,
 }
 

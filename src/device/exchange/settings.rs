@@ -25,24 +25,26 @@ const FOLDER_TIMEOUT: Duration = Duration::from_secs(30);
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ExchangeWire {
-    /// Folder into which Regrind writes what the machine shall do; relative to this file.
+    /// Folder into which Regrind writes the jobs of the machine; relative to this file.
     #[schemars(length(min = 1, max = 400), extend("x-required" = true), example = "exchange/cmm/out")]
     pub outbox: String,
     /// Folder in which results appear; relative to this file.
     #[schemars(length(min = 1, max = 400), extend("x-required" = true), example = "exchange/cmm/in")]
     pub inbox: String,
-    /// A file that has not changed for so long is complete.
+    /// Time without a change after which a file is complete.
     #[schemars(range(min = 0.05, max = 3600.0))]
     pub stable_for_s: f64,
-    /// What the coordinates of results are, where the files do not say so themselves; said nowhere, they are refused.
+    /// Meaning of the coordinates of results, if the files do not state it; coordinates without a stated meaning are
+    /// refused.
     pub coordinates: Option<Coordinates>,
     /// Decimal mark of results.
     pub decimal: DecimalMark,
     /// Unit of length of results.
     pub unit: Unit,
-    /// Unit of length of z in a table, where it is another one than that of x and y.
+    /// Unit of length of z in a table, if it differs from that of x and y.
     pub height_unit: Option<Unit>,
-    /// Which columns of results are x, y and z, where their headers leave it open: `x=NAME,y=NAME,z=NAME`, names or numbers from 1.
+    /// Columns of x, y and z in results, if their headers do not identify them: `x=NAME,y=NAME,z=NAME`, names or
+    /// numbers from 1.
     #[schemars(length(min = 5, max = 200), example = &"x=X_act,y=Y_act,z=Z_act")]
     pub columns: Option<Columns>,
     /// Stations of a measurement, each with its own frame.
@@ -54,21 +56,23 @@ pub struct ExchangeWire {
     /// Name of the group of reference points within the file.
     #[schemars(length(min = 1, max = 80))]
     pub reference_group: Option<String>,
-    /// By how much a reference point may be off after the best fit of its station.
+    /// Maximum residual of a reference point after the best fit of its station.
     #[schemars(range(min = 0.0001, max = 100.0))]
     pub reference_limit_mm: f64,
-    /// Names of result files: `{part}`, `{job}` and `{cycle}` are filled in, one `*` stands for any characters.
+    /// Names of result files: `{part}`, `{job}` and `{cycle}` are filled in, and one `*` matches any characters.
     #[schemars(length(min = 1, max = 200))]
     pub result: String,
-    /// Whether files may be taken that lay in the inbox before the plan was handed over.
+    /// Whether to accept files that were in the inbox before the plan was handed over.
     pub accept_earlier_files: bool,
-    /// By how much the probe radius that a file states may differ from the recipe's.
+    /// Maximum difference between the probe radius in a file and that of the recipe.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub probe_tolerance_mm: f64,
-    /// Sensor of the machine, by its name in DMIS: the plan is then written as a DMIS program too, `plan.dmi`, which recalls and selects it.
+    /// Sensor of the machine, by its name in DMIS. With this key, the plan is also written as a DMIS program,
+    /// `plan.dmi`, which recalls and selects the sensor.
     #[schemars(length(min = 1, max = 40), example = &"PROBE6")]
     pub dmis_sensor: Option<String>,
-    /// Whether the machine stands apart and cannot reach the part where the other one works: then nobody is asked whether it is clear.
+    /// Whether the machine is separate and cannot reach the part at the other machine. If true, no person is asked
+    /// whether it is clear.
     pub cannot_reach_part: bool,
 }
 
@@ -100,10 +104,10 @@ impl Default for ExchangeWire {
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct StationTable {
-    /// File of its points in the inbox; one `*` stands for any characters.
+    /// File of its points in the inbox; one `*` matches any characters.
     #[schemars(length(min = 1, max = 200), extend("x-required" = true), example = "M1_*.txt")]
     pub points: String,
-    /// File of the reference points as it sees them, in the inbox; `*` for the same characters.
+    /// File of the reference points as the station measures them, in the inbox; `*` matches the same characters.
     #[schemars(length(min = 1, max = 200), extend("x-required" = true), example = "ref_*.yaml")]
     pub reference: String,
 }

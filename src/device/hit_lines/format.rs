@@ -18,7 +18,7 @@ const MAX_ANGLE_DEG: f64 = 36_000.0;
 /// Maximum number of digits before the decimal mark, and after it.
 const MAX_DIGITS: usize = 9;
 
-/// How a machine writes a hit.
+/// Format of a hit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum LineFormat {
@@ -77,7 +77,7 @@ impl LineFormat {
     }
 }
 
-/// What stands between two values.
+/// Separator between two values.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 #[expect(missing_docs, reason = "the names say it")]

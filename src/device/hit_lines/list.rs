@@ -8,14 +8,14 @@ use serde::Deserialize;
 use crate::payload::{MeasuredPoint, Plan, PointStatus};
 use regrind_formats::result::Coordinates;
 
-/// What becomes of a touch where there was one before.
+/// Handling of a touch of a target that was touched before.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Repeated {
     /// It is refused, and the measurement is held.
     #[default]
     Refuse,
-    /// It takes the place of the one before.
+    /// It replaces the earlier touch.
     Replace,
 }
 

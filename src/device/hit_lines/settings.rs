@@ -22,14 +22,15 @@ use regrind_formats::result::Coordinates;
 /// Device name in a simulated cell for a pseudo-terminal that is created at the start.
 const AUTO: &str = "auto";
 
-/// A line for each hit, from a measuring machine or an arm that hears nothing.
+/// A line for each hit, from a measuring machine or an arm that accepts no commands.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct HitLinesWire {
-    /// Serial port, as the operating system calls it; left out where a terminal server is named. In a simulated cell "auto" makes one.
+    /// Name of the serial port in the operating system; omit it if `host` names a terminal server. In a simulated cell
+    /// "auto" creates a port.
     #[schemars(length(min = 1, max = 400), example = &"/dev/ttyUSB0")]
     pub device: Option<String>,
-    /// Bits a second.
+    /// Bits per second.
     #[schemars(range(min = 300, max = 4000000))]
     pub baud: u32,
     /// Data bits.
@@ -39,54 +40,56 @@ pub struct HitLinesWire {
     /// Stop bits.
     #[schemars(range(min = 1, max = 2))]
     pub stop_bits: u8,
-    /// Name or address of a terminal server; left out where a serial port is named.
+    /// Name or address of a terminal server; omit it if `device` names a serial port.
     #[schemars(length(min = 1, max = 253), example = &"192.168.0.30")]
     pub host: Option<String>,
-    /// Its port.
+    /// Port of the terminal server.
     #[schemars(range(min = 0, max = 65535))]
     pub port: u16,
-    /// How a hit is written.
+    /// Format of a hit.
     #[schemars(extend("x-required" = true), example = &"decimal")]
     pub format: Option<LineFormat>,
-    /// What the coordinates are: centres of the probe, or contacts.
+    /// Meaning of the coordinates: centres of the probe, or contacts.
     #[schemars(extend("x-required" = true), example = &"centres")]
     pub coordinates: Option<Coordinates>,
-    /// How many digits stand behind the decimal mark of a coordinate, in each of them; a line with another number is refused.
+    /// Number of digits after the decimal mark of each coordinate; a line with another number is refused.
     #[schemars(range(min = 1, max = 9))]
     pub decimals: u8,
     /// Decimal mark.
     pub decimal: Mark,
-    /// What stands between two values.
+    /// Separator between two values.
     pub separator: Separator,
     /// Unit of coordinates with a decimal mark; whole numbers are micrometres.
     pub unit: Unit,
-    /// Which axis of the machine the first, second and third value are.
+    /// Axes of the machine for the first, second and third value.
     pub axes: Axes,
-    /// Where a rotary table has to stand, by its angle in the line.
+    /// Required angle of a rotary table, as the line reports it.
     #[schemars(range(min = -36000.0, max = 36000.0))]
     pub rotary_deg: f64,
-    /// By how much it may be off.
+    /// Tolerance of the angle of the rotary table.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub rotary_tolerance_deg: f64,
-    /// A point farther than this from every target is refused; a nearer one belongs to the nearest.
+    /// Maximum distance of a point from its target. A point belongs to the nearest target, and is refused if all
+    /// targets are farther away.
     #[schemars(range(min = 0.001, max = 100.0))]
     pub limit_mm: f64,
-    /// The same line, to the last digit, within this is the same touch, sent twice.
+    /// Time within which an identical line is the same touch, sent twice.
     #[schemars(range(min = 0, max = 10000))]
     pub duplicate_window_ms: u32,
-    /// What becomes of a second touch of a target.
+    /// Handling of a second touch of a target.
     pub repeated_touch: Repeated,
-    /// For the rest of a line that has begun.
+    /// Timeout of the rest of a line that has begun.
     #[schemars(range(min = 10, max = 60000))]
     pub line_timeout_ms: u32,
-    /// Beginnings of lines that mean nothing, such as headers.
+    /// Beginnings of lines to ignore, such as headers.
     #[schemars(length(max = 32), inner(length(min = 1, max = 80)))]
     pub ignored_prefixes: Vec<String>,
-    /// Where the machine's own part program leads the probe clear of the part behind its last point: so long after it, it is. Left out, a person
-    /// is asked.
+    /// Time after the last point at which the probe is clear of the part, if the machine's own part program moves it
+    /// clear. Default: a person is asked.
     #[schemars(range(min = 0.1, max = 3600.0))]
     pub clear_after_s: Option<f64>,
-    /// Folder in which the list of what is to be touched is put as `plan.csv` when it begins, for a part program; relative to this file.
+    /// Folder into which Regrind writes the list of targets, `plan.csv`, at the start of a measurement, for a part
+    /// program; relative to this file.
     #[schemars(length(min = 1, max = 400))]
     pub plan_folder: Option<String>,
 }
@@ -111,7 +114,7 @@ pub enum Mark {
     Comma,
 }
 
-/// Which axes the three values are.
+/// Axes of the three values.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 #[expect(missing_docs, reason = "the names say it")]

@@ -21,43 +21,46 @@ pub struct IppdmeWire {
     /// Name or address of the server.
     #[schemars(length(min = 1, max = 253), extend("x-required" = true), example = "192.168.0.20")]
     pub host: String,
-    /// Port; 0, in a simulated cell only, for one that is free at the start.
+    /// Port; 0, in a simulated cell only, selects a free port at the start.
     #[schemars(range(min = 0, max = 65535))]
     pub port: u16,
-    /// Tool, as the server calls it.
+    /// Name of the tool at the server.
     #[schemars(length(min = 1, max = 80), extend("x-required" = true), example = &"Probe1")]
     pub tool: String,
-    /// By how much the radius that the server tells of its tool, or of a touch, may differ from the recipe's.
+    /// Maximum difference between the radius that the server reports for its tool, or for a touch, and that of the
+    /// recipe.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub probe_tolerance_mm: f64,
-    /// Speed of travel between targets; the server may keep it lower.
+    /// Speed of travel between targets; the server may limit it further.
     #[schemars(range(min = 0.1, max = 2000.0))]
     pub travel_speed_mm_s: f64,
-    /// Speed of scanning, for a probe that can: rows of targets are passed over in contact, and reported at the targets; left out, every one is touched.
+    /// Speed of scanning, for a probe that can scan: it moves over rows of targets in contact, and the points at the
+    /// targets are reported. Default: every target is touched.
     #[schemars(range(min = 0.1, max = 500.0), example = 10.0)]
     pub scan_speed_mm_s: Option<f64>,
-    /// The farthest from one target to the next within a scan; what lies farther apart is touched.
+    /// Maximum distance from one target to the next within a scan; targets farther apart are touched.
     #[schemars(range(min = 0.001, max = 100.0))]
     pub scan_step_mm: f64,
-    /// The part's frame, in which the probe is sent: origin of the machine in it, then theta, psi and phi in degrees; left out, the machine's own.
+    /// Frame of the part, in which the probe is commanded: origin of the machine in it, then theta, psi and phi in
+    /// degrees. Default: the frame of the machine.
     #[schemars(inner(range(min = -100000.0, max = 100000.0)), example = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0])]
     pub part_frame: Option<[f64; 6]>,
-    /// How often a target is tried again that was missed.
+    /// Number of retries for a missed target.
     #[schemars(range(min = 0, max = 10))]
     pub retries: u8,
-    /// For the connection, and for the acknowledgement of a command.
+    /// Timeout of the connection, and of the acknowledgement of a command.
     #[schemars(range(min = 10, max = 600000))]
     pub answer_timeout_ms: u32,
-    /// For the end of a command, over twice the time that its way takes.
+    /// Timeout of the end of a command, in addition to twice the time of its travel.
     #[schemars(range(min = 10, max = 3600000))]
     pub completion_timeout_ms: u32,
-    /// For the end of an abort.
+    /// Timeout of the end of an abort.
     #[schemars(range(min = 10, max = 600000))]
     pub abort_timeout_ms: u32,
-    /// Between two tries to have errors forgotten behind an abort; some servers are not ready at once.
+    /// Interval between two attempts to clear errors after an abort; some servers are not ready at once.
     #[schemars(range(min = 1, max = 60000))]
     pub delay_after_abort_ms: u32,
-    /// Of silence, after which the server is asked whether it is alive.
+    /// Silence after which the server is asked whether it is alive.
     #[schemars(range(min = 10, max = 600000))]
     pub alive_every_ms: u32,
 }
@@ -100,7 +103,7 @@ pub struct IppdmeSettings {
     pub scan: Option<Scanning>,
     /// Frame of the part; `None` for the machine's own.
     pub part_frame: Option<[f64; 6]>,
-    /// How often a target is tried again that was missed.
+    /// Number of retries for a missed target.
     pub retries: u8,
     /// Minimum and maximum corner of the box that the probe's centre must not leave, in mm.
     pub volume_mm: [[f64; 3]; 2],

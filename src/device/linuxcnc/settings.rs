@@ -28,29 +28,29 @@ pub struct LinuxcncWire {
     /// Password of `hello` (option -w of linuxcncrsh).
     #[schemars(length(min = 1, max = 80))]
     pub connect_password: String,
-    /// Password of `set enable` (option -e of linuxcncrsh), by which a client takes control.
+    /// Password of `set enable` (option -e of linuxcncrsh), with which a client takes control.
     #[schemars(length(min = 1, max = 80))]
     pub control_password: String,
-    /// Folder of programs that the controller sees too; relative to this file.
+    /// Folder of programs that the controller can also access; relative to this file.
     #[schemars(length(min = 1, max = 400), extend("x-required" = true), example = "/mnt/grinder/nc_files/regrind")]
     pub programs: String,
-    /// The same folder as the controller sees it; left out, as this computer does.
+    /// Path of the same folder at the controller. Default: its path on this computer.
     #[schemars(length(min = 1, max = 200), example = "/home/cnc/linuxcnc/nc_files/regrind")]
     pub programs_at_controller: Option<String>,
-    /// For a simulated cell: the program, with its arguments, that prints the path which the controller executes and which the simulated wheel
-    /// follows; relative to this file where it has a slash in it.
+    /// For a simulated cell: the program, with its arguments, that prints the path that the controller executes. The
+    /// simulated wheel follows this path. The program is relative to this file if its name contains a slash.
     #[schemars(length(min = 1, max = 20), example = ["linuxcnc/executed-path"])]
     pub executed_path: Option<Vec<String>>,
     /// Joints that must be homed.
     #[schemars(range(min = 1, max = 6))]
     pub joints: u8,
-    /// For the connection, and for the answer to a line; the controller takes 100 ms for an order.
+    /// Timeout of the connection, and of the answer to a line; the controller needs 100 ms for an order.
     #[schemars(range(min = 500, max = 60000))]
     pub answer_timeout_ms: u32,
-    /// For a mode, a program or a start to show after the order for it was heard.
+    /// Timeout for a mode, a program or a start to take effect after its order was acknowledged.
     #[schemars(range(min = 100, max = 600000))]
     pub settle_timeout_ms: u32,
-    /// For what a program wrote of itself to be seen in the folder after it has stopped running.
+    /// Timeout for the record that a program writes to appear in the folder after the program has stopped.
     #[schemars(range(min = 10, max = 600000))]
     pub record_timeout_ms: u32,
 }

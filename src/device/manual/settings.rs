@@ -13,18 +13,20 @@ use regrind_formats::{Columns, Unit};
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ManualWire {
-    /// What the coordinates of measurements are, where the files do not say so themselves; said nowhere, they are refused.
+    /// Meaning of the coordinates of measurements, if the files do not state it; coordinates without a stated meaning
+    /// are refused.
     pub coordinates: Option<Coordinates>,
     /// Decimal mark of measurements.
     pub decimal: DecimalMark,
     /// Unit of length of measurements.
     pub unit: Unit,
-    /// Unit of length of z in a table, where it is another one than that of x and y.
+    /// Unit of length of z in a table, if it differs from that of x and y.
     pub height_unit: Option<Unit>,
-    /// Which columns of measurements are x, y and z, where their headers leave it open: `x=NAME,y=NAME,z=NAME`, names or numbers from 1.
+    /// Columns of x, y and z in measurements, if their headers do not identify them: `x=NAME,y=NAME,z=NAME`, names or
+    /// numbers from 1.
     #[schemars(length(min = 5, max = 200), example = &"x=X_act,y=Y_act,z=Z_act")]
     pub columns: Option<Columns>,
-    /// By how much the probe radius that a file states may differ from the recipe's.
+    /// Maximum difference between the probe radius in a file and that of the recipe.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub probe_tolerance_mm: f64,
 }

@@ -13,7 +13,8 @@ use regrind_document::Document;
 /// Number of registers that a Modbus device can have.
 const REGISTERS: u32 = 1 << 16;
 
-/// Which word of a value of several registers comes first. The bytes within a register are high byte first always.
+/// First word of a value of several registers. Within a register, the high byte comes first, except with `badc` and
+/// `dcba`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum WordOrder {
@@ -118,7 +119,7 @@ pub struct TcpWire {
     /// Name or address.
     #[schemars(length(min = 1, max = 253), extend("x-required" = true), example = "192.168.0.10")]
     pub host: String,
-    /// Port; 0, in a simulated cell only, for one that is free at the start.
+    /// Port; 0, in a simulated cell only, selects a free port at the start.
     #[schemars(range(min = 0, max = 65535))]
     pub port: u16,
     /// Unit identifier.
@@ -182,10 +183,10 @@ impl TcpWire {
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct RtuWire {
-    /// Device of the line, as the operating system calls it.
+    /// Name of the serial device in the operating system.
     #[schemars(length(min = 1, max = 400), extend("x-required" = true), example = "/dev/ttyUSB0")]
     pub device: String,
-    /// Bits a second.
+    /// Bits per second.
     #[schemars(range(min = 1200, max = 4000000))]
     pub baud: u32,
     /// Parity.
@@ -235,11 +236,11 @@ impl RtuWire {
     }
 }
 
-/// Where the blocks of docs/modbus.md stand: 0-based addresses.
+/// Addresses of the blocks of docs/modbus.md, from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct RegisterMap {
-    /// Which word of a value of several registers comes first: big is the high one.
+    /// First word of a value of several registers: big is the high one.
     pub word_order: WordOrder,
     /// Identity, 32 registers.
     #[schemars(range(min = 0, max = 65535))]
@@ -347,7 +348,7 @@ impl RegisterMap {
     }
 }
 
-/// How the value of a signal is kept in its registers.
+/// Coding of the value of a signal in its registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 #[expect(missing_docs, reason = "they say it")]
@@ -375,24 +376,24 @@ impl SignalType {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct SignalTable {
-    /// Its name.
+    /// Name of the value.
     #[schemars(length(min = 1, max = 60), extend("x-required" = true), example = &"spindle_load")]
     pub name: Option<String>,
     /// Address of its first register, from 0.
     #[schemars(range(min = 0, max = 65535), extend("x-required" = true), example = 1000)]
     pub address: Option<u16>,
-    /// How it is coded.
+    /// Coding of the value.
     #[serde(rename = "type")]
     #[schemars(extend("x-required" = true), example = &"u16")]
     pub kind: Option<SignalType>,
-    /// Which word comes first; as `registers.word_order` when left out.
+    /// First word of the value. Default: `registers.word_order`.
     pub word_order: Option<WordOrder>,
-    /// What the number is multiplied by.
+    /// Factor by which the number is multiplied.
     pub scale: f64,
-    /// Its unit after that.
+    /// Unit of the value after the multiplication.
     #[schemars(length(max = 20))]
     pub unit: String,
-    /// Least and largest value that is believed.
+    /// Minimum and maximum plausible value.
     #[schemars(extend("x-required" = true), example = [0.0, 100.0])]
     pub range: Option<[f64; 2]>,
 }

@@ -13,48 +13,48 @@ use regrind_core::compensation::path::{ArcOptions, PathMode, Rotary};
 /// The dialect of LinuxCNC, which a cell has that says nothing.
 pub const LINUXCNC: &str = "linuxcnc";
 
-/// How a kind of control wants its programs written.
+/// Format of the programs of a kind of control.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Dialect {
-    /// What it is called.
+    /// Name of the dialect, and extension of its files.
     #[schemars(extend("x-required" = true))]
     pub dialect: Naming,
     /// Lines and comments.
     #[schemars(extend("x-required" = true))]
     pub text: Text,
-    /// Numbers of blocks; left out, blocks have none.
+    /// Numbers of blocks. Default: blocks have no numbers.
     pub blocks: Option<Blocks>,
-    /// How numbers are written.
+    /// Format of numbers.
     #[schemars(extend("x-required" = true))]
     pub numbers: Numbers,
     /// The words of a move.
     #[schemars(extend("x-required" = true))]
     pub words: Words,
-    /// How arcs are written; left out, there are lines only.
+    /// Format of arcs. Default: lines only.
     pub arcs: Option<ArcWords>,
-    /// How a control is told how exactly to keep to the path; a mode that is left out is refused.
+    /// Lines that select the path mode of a control; an omitted mode is refused.
     pub path: Modes,
-    /// How a control is told of a head that tilts the wheel; where it is left out, or what is left out of it, is refused.
+    /// Lines for a head that tilts the wheel; a way of tilting that is omitted here is refused.
     pub rotary: Tilting,
-    /// What stands before and after the moves.
+    /// Lines before and after the moves.
     #[schemars(extend("x-required" = true))]
     pub program: Frame,
 }
 
-/// What a dialect is called.
+/// Name of a dialect, and extension of its files.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Naming {
-    /// Its name.
+    /// Name of the dialect.
     #[schemars(length(min = 1, max = 40), extend("x-required" = true), example = &"fanuc")]
     pub name: String,
-    /// The extension of its files, without the point.
+    /// Extension of its files, without the point.
     #[schemars(length(min = 1, max = 8), extend("x-required" = true), example = &"nc")]
     pub extension: String,
 }
 
-/// How a line ends.
+/// End of a line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum LineEnd {
@@ -69,18 +69,18 @@ pub enum LineEnd {
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Text {
-    /// How lines end.
+    /// End of each line.
     pub line_end: LineEnd,
-    /// Longest line, in characters; longer comments are divided.
+    /// Maximum length of a line, in characters; longer comments are divided.
     #[schemars(range(min = 40, max = 10000))]
     pub longest_line: usize,
-    /// What begins a comment.
+    /// Text that begins a comment.
     #[schemars(length(min = 1, max = 8), extend("x-required" = true), example = &"(")]
     pub comment_begins: String,
-    /// What ends it, if not the end of its line.
+    /// Text that ends a comment, if the end of its line does not.
     #[schemars(length(max = 8), example = &")")]
     pub comment_ends: String,
-    /// Whether there are capital letters only.
+    /// Whether programs have capital letters only.
     pub upper_case: bool,
 }
 
@@ -95,19 +95,19 @@ impl Default for Text {
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Blocks {
-    /// What stands before the number.
+    /// Text before the number.
     #[schemars(length(max = 4), example = &"N")]
     pub letter: String,
-    /// Of the first block.
+    /// Number of the first block.
     #[schemars(range(max = 100000))]
     pub first: u32,
-    /// From each to the next.
+    /// Step from each number to the next.
     #[schemars(range(min = 1, max = 1000))]
     pub step: u32,
-    /// Largest; after it comes the first again.
+    /// Largest number; the first number follows it.
     #[schemars(range(min = 1, max = 999999999))]
     pub last: u32,
-    /// Whether comments and the lines before them have numbers too.
+    /// Whether comments and the lines before them also have numbers.
     pub all: bool,
 }
 
@@ -117,25 +117,25 @@ impl Default for Blocks {
     }
 }
 
-/// How numbers are written.
+/// Format of numbers.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Numbers {
-    /// Decimals of a coordinate, all of which are written.
+    /// Number of decimals of a coordinate; all of them are written.
     #[schemars(range(min = 2, max = 6), extend("x-required" = true), example = 4)]
     pub decimals: u8,
-    /// Whether a coordinate from 0 on has a plus sign.
+    /// Whether a coordinate of 0 or more has a plus sign.
     pub plus: bool,
     /// Largest coordinate.
     #[schemars(range(min = 1.0, max = 1e6))]
     pub largest_mm: f64,
-    /// Decimals of an angle in degrees, all of which are written.
+    /// Number of decimals of an angle in degrees; all of them are written.
     #[schemars(range(min = 2, max = 6))]
     pub angle_decimals: u8,
-    /// Decimals of a feed at most; zeros at the end are left out.
+    /// Maximum number of decimals of a feed; trailing zeros are omitted.
     #[schemars(range(max = 6))]
     pub feed_decimals: u8,
-    /// Whether a whole feed has a point behind it: where a number without one counts increments.
+    /// Whether a whole feed ends with a point, for controls on which a number without a point counts increments.
     pub feed_point: bool,
 }
 
@@ -149,24 +149,24 @@ impl Default for Numbers {
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Words {
-    /// What begins a rapid move.
+    /// Text that begins a rapid move.
     #[schemars(length(min = 1, max = 20), extend("x-required" = true), example = &"G0 ")]
     pub rapid: String,
-    /// What ends one.
+    /// Text that ends a rapid move.
     #[schemars(length(max = 20), example = &" R0 FMAX")]
     pub rapid_ends: String,
-    /// What begins a straight move at feed.
+    /// Text that begins a straight move at feed.
     #[schemars(length(min = 1, max = 20), extend("x-required" = true), example = &"G1 ")]
     pub line: String,
-    /// Whether these begin every block; else they stay in force.
+    /// Whether these texts begin every block; otherwise they stay in force.
     pub each_block: bool,
-    /// The three axes.
+    /// Words of the three axes.
     #[schemars(inner(length(min = 1, max = 4)))]
     pub axes: [String; 3],
-    /// What stands between the words of a block.
+    /// Text between the words of a block.
     #[schemars(length(max = 2))]
     pub between: String,
-    /// What stands before a feed, in mm/min.
+    /// Text before a feed, in mm/min.
     #[schemars(length(min = 1, max = 4))]
     pub feed: String,
 }
@@ -185,56 +185,56 @@ impl Default for Words {
     }
 }
 
-/// How the centre of an arc is told.
+/// Format of the centre of an arc.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum CentreWords {
-    /// By `centre_words`, from the beginning of the arc.
+    /// By `centre_words`, relative to the start of the arc.
     #[default]
     FromStart,
-    /// By `centre_words`, as a place.
+    /// By `centre_words`, in absolute coordinates.
     Absolute,
-    /// By `centre_block`, a block of its own before the arc that names the place by the words of the axes.
+    /// By `centre_block`, a separate block before the arc that gives the coordinates with the words of the axes.
     BlockBefore,
 }
 
-/// How arcs are written.
+/// Format of arcs.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ArcWords {
-    /// What begins an arc that turns clockwise, seen against the axis across its plane.
+    /// Text that begins a clockwise arc, seen against the axis across its plane.
     #[schemars(length(min = 1, max = 20), extend("x-required" = true), example = &"G2 ")]
     pub clockwise: String,
-    /// What stands behind its places.
+    /// Text after the coordinates of the arc.
     #[schemars(length(max = 20), example = &" DR-")]
     pub clockwise_ends: String,
-    /// What begins one that turns counter-clockwise.
+    /// Text that begins a counter-clockwise arc.
     #[schemars(length(min = 1, max = 20), extend("x-required" = true), example = &"G3 ")]
     pub counter_clockwise: String,
-    /// What stands behind its places.
+    /// Text after the coordinates of the arc.
     #[schemars(length(max = 20), example = &" DR+")]
     pub counter_clockwise_ends: String,
-    /// What selects the planes of x and y, of z and x, of y and z, before an arc in another plane than the last one; left out where the axes named
-    /// tell it.
+    /// Texts that select the planes of x and y, of z and x, of y and z, before an arc in another plane than the last
+    /// one. Omit them if the axes in the block determine the plane.
     #[schemars(inner(length(min = 1, max = 20)))]
     pub planes: Option<[String; 3]>,
-    /// How the centre is told.
+    /// Format of the centre.
     pub centre: CentreWords,
     /// The words of the centre along the three axes.
     #[schemars(inner(length(min = 1, max = 4)))]
     pub centre_words: Option<[String; 3]>,
-    /// What begins the block of the centre.
+    /// Text that begins the block of the centre.
     #[schemars(length(min = 1, max = 20), example = &"CC ")]
     pub centre_block: Option<String>,
-    /// Whether the third axis may move along with an arc.
+    /// Whether the third axis may move during an arc.
     pub third_axis: bool,
-    /// How much the radius at the end may differ from that at the beginning, as the control takes it.
+    /// Maximum difference between the radius at the end and at the start that the control accepts.
     #[schemars(range(min = 0.0, max = 1000.0), extend("x-required" = true), example = 2.0)]
     pub radius_error_um: f64,
-    /// Lines behind `program.setup` of a program with arcs.
+    /// Lines after `program.setup` of a program with arcs.
     #[schemars(length(max = 16), inner(length(min = 1, max = 200)))]
     pub begin: Vec<String>,
-    /// Lines before `program.end` of one.
+    /// Lines before `program.end` of a program with arcs.
     #[schemars(length(max = 16), inner(length(min = 1, max = 200)))]
     pub end: Vec<String>,
 }
@@ -259,11 +259,11 @@ impl Default for ArcWords {
     }
 }
 
-/// How a control is told how exactly to keep to the path.
+/// Lines that select the path mode of a control.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Modes {
-    /// For `path_mode = "blend"`; `{tolerance_mm}` stands for how far corners may be rounded off.
+    /// For `path_mode = "blend"`; `{tolerance_mm}` is the maximum rounding of corners.
     pub blend: Option<Mode>,
     /// For `path_mode = "exact-path"`.
     pub exact_path: Option<Mode>,
@@ -271,7 +271,7 @@ pub struct Modes {
     pub exact_stop: Option<Mode>,
 }
 
-/// What a path mode is called by.
+/// Lines that select a path mode.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Mode {
@@ -283,22 +283,23 @@ pub struct Mode {
     pub end: Vec<String>,
 }
 
-/// How a control is told of a head that tilts the wheel.
+/// Lines for a head that tilts the wheel.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Tilting {
-    /// Where the control keeps the wheel's centre while the head turns: the program has the centre's places, and its feeds are the centre's.
+    /// For a control that keeps the wheel's centre while the head turns: positions and feeds of the program are those
+    /// of the centre.
     pub tool_centre: Option<Turning>,
-    /// Where the program has the places of the slides: the turn of the pivot is in them, and a feed is the inverse of the time of a block, in 1/min,
-    /// since a slide may go far where the wheel hardly moves.
+    /// For a program with the positions of the slides: they include the rotation about the pivot. A feed is the inverse
+    /// of the time of a block, in 1/min, because a slide can move far while the wheel hardly moves.
     pub slides: Option<Turning>,
 }
 
-/// What a way of tilting is called by.
+/// Lines that select a way of tilting.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Turning {
-    /// Lines before the moves, after those of the path mode; none where the control does so anyway.
+    /// Lines before the moves, after those of the path mode; none if the control does so anyway.
     #[schemars(length(max = 16), inner(length(min = 1, max = 200)))]
     pub begin: Vec<String>,
     /// Lines after them.
@@ -306,19 +307,20 @@ pub struct Turning {
     pub end: Vec<String>,
 }
 
-/// What stands before and after the moves.
+/// Lines before and after the moves.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Frame {
-    /// Longest name of a program.
+    /// Maximum length of the name of a program.
     #[schemars(range(min = 4, max = 80))]
     pub longest_name: usize,
-    /// First and last number of programs: each cycle has the next one.
+    /// First and last number of programs; each cycle uses the next number.
     pub numbers: Option<[u32; 2]>,
-    /// Lines before the comments; `{name}` and `{number}` are the program's.
+    /// Lines before the comments; `{name}` and `{number}` are those of the program.
     #[schemars(length(max = 32), inner(length(min = 1, max = 200)))]
     pub begin: Vec<String>,
-    /// Lines after the comments: units of mm and mm/min, absolute places, the plane, the work offset, no compensations.
+    /// Lines after the comments: units of mm and mm/min, absolute coordinates, the plane, the work offset, no
+    /// compensations.
     #[schemars(length(max = 32), inner(length(min = 1, max = 200)))]
     pub setup: Vec<String>,
     /// Lines at the end.

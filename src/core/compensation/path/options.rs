@@ -5,12 +5,12 @@ use serde::{Deserialize, Serialize};
 use super::wheel::LEAST_LEAN;
 use super::{Lean, PathError, Rotary, Wheel};
 
-/// How tracks run.
+/// Pattern of the tracks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Pattern {
-    /// Along x, one beside the other in y from the least to the largest.
+    /// Along x, one after the other from the lowest y to the highest.
     #[default]
     Raster,
     /// On a spiral about the middle of the outline, from outside inwards, turning clockwise seen from +z.
@@ -33,7 +33,7 @@ pub enum TrackSpacing {
     },
 }
 
-/// How exactly a controller keeps to the path that a program describes.
+/// Path mode: how exactly a controller follows the path that a program describes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -41,9 +41,9 @@ pub enum PathMode {
     /// G64: corners are rounded off within a tolerance.
     #[default]
     Blend,
-    /// G61: every point is passed through.
+    /// G61: the path passes through every point.
     ExactPath,
-    /// G61.1: every point is stopped at.
+    /// G61.1: the machine stops at every point.
     ExactStop,
 }
 

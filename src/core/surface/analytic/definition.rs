@@ -44,11 +44,11 @@ pub struct SurfaceDefinition {
     pub surface: Formula,
     /// The outline, in the surface's own frame.
     pub aperture: Aperture,
-    /// How finely the surface is sampled; 0.1 nm when left out.
+    /// Sampling of the surface. Default: an accuracy of 0.1 nm.
     pub sampling: Option<SamplingDefinition>,
 }
 
-/// A formula as written, told apart by `kind`.
+/// A formula as written; `kind` selects its form.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "kind", rename_all = "kebab-case")]
@@ -63,7 +63,7 @@ pub enum Formula {
     Asphere(AsphereDefinition),
     /// A section of one of the others, away from its axis.
     OffAxis(OffAxisDefinition),
-    /// A curve turned about a line.
+    /// A curve rotated about a line.
     Toroid(ToroidDefinition),
     /// Two conics, one in x and one in y.
     Biconic(BiconicDefinition),
@@ -160,14 +160,14 @@ pub struct SphereDefinition {
     pub radius_mm: f64,
 }
 
-/// How finely a surface is sampled, as written: one of the two.
+/// Sampling of a surface, as written: one of the two keys.
 #[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SamplingDefinition {
     /// Distance between nodes along x and y, in millimetres.
     pub spacing_mm: Option<f64>,
-    /// Largest error of the surface between the nodes, in nanometres.
+    /// Maximum error of the surface between the nodes, in nanometres.
     pub accuracy_nm: Option<f64>,
 }
 

@@ -15,12 +15,12 @@ const WAY_STEPS: u32 = 64;
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum SectionFrame {
-    /// The parent's own.
+    /// The frame of the parent.
     Parent,
-    /// The parent's, moved without turning so that the origin lies on the surface at the section's centre.
+    /// The frame of the parent, translated so that the origin is on the surface at the section's centre.
     Shifted,
-    /// Its origin on the surface at the section's centre and z along the parent's normal there; turned from the parent's
-    /// frame by the smallest rotation, so that x and y stay as near to the parent's as they can.
+    /// A frame with its origin on the surface at the section's centre and z along the parent's normal there; the
+    /// smallest rotation leads to it from the parent's frame, so that x and y stay as near to the parent's as possible.
     Tilted,
 }
 

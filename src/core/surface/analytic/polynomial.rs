@@ -24,7 +24,7 @@ pub struct XyPolynomial {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct XyPolynomialDefinition {
-    /// What x and y are divided by, in millimetres; 1 for coefficients in mm^(1 - i - j).
+    /// Divisor of x and y, in millimetres; 1 for coefficients in mm^(1 - i - j).
     pub normalisation_radius_mm: f64,
     /// Terms [i, j, coefficient in millimetres].
     #[cfg_attr(feature = "schema", schemars(schema_with = "terms_schema"))]

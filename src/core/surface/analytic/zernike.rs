@@ -19,7 +19,7 @@ use super::{EXTRAPOLATION, jacobi};
 /// Largest degree n.
 const LARGEST_DEGREE: u32 = 100;
 
-/// Which degree and azimuthal order an index stands for.
+/// Numbering of the terms: the degree and azimuthal order of an index.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -52,7 +52,7 @@ impl ZernikeNumbering {
     }
 }
 
-/// How large a term is.
+/// Normalisation of a term.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -77,13 +77,13 @@ pub struct Zernike {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ZernikeDefinition {
-    /// Which numbering the coefficients follow.
+    /// Numbering of the coefficients.
     pub numbering: ZernikeNumbering,
     /// Radius of the disc in millimetres.
     pub normalisation_radius_mm: f64,
     /// Coefficient by index, `{ Z4 = 1e-3 }` or `{ 4 = 1e-3 }`, in millimetres.
     pub coefficients_mm: BTreeMap<String, f64>,
-    /// How large a term is, where it is not what goes with the numbering.
+    /// Normalisation of the terms, if it is not the default of the numbering.
     pub normalisation: Option<ZernikeNormalisation>,
     /// The conic the polynomials are added to; none for a plane.
     pub base: Option<ConicDefinition>,
