@@ -184,10 +184,10 @@ fn list_of(table: &Value) -> String {
             text.push_str("It has no further key.\n");
             continue;
         }
-        text.push_str("| key | unit | may be | left out | what it is |\n|---|---|---|---|---|\n");
+        text.push_str("| key | unit | values | default | meaning |\n|---|---|---|---|---|\n");
         for (key, value) in rows {
             let left_out = match value.get("default") {
-                _ if required.iter().any(|name| name == key) => "**must stand**".into(),
+                _ if required.iter().any(|name| name == key) => "**required**".into(),
                 Some(default) => format!("`{}`", shown(default)),
                 None => "-".into(),
             };
