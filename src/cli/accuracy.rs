@@ -18,13 +18,13 @@ use super::{Outcome, finite_above_zero};
 /// Estimate from a nominal surface alone the error of distances to it, and the spacing for a required accuracy
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Most points are left out, twice, and their distance from what is left is measured: they lie on the surface, so that
-the distance is the error. What is told is extrapolated from there.
+Most points are withheld, twice, and their distance from the surface of the other points is measured. The points lie on
+the nominal surface, so the distance is the error. The result is extrapolated from these two errors.
 
 Example:
   regrind accuracy --nominal lens.csv --want 1
 
-Exit codes: 0 as exact as wanted, by the curved distance; 1 not so; 2 bad arguments or data; 3 fault.")]
+Exit codes: 0 the curved distance is accurate enough; 1 it is not; 2 bad arguments or data; 3 fault.")]
 pub(super) struct Arguments {
     /// Nominal surface: points as text or PLY, a mesh as STL or PLY, or a TOML definition, in mm
     #[arg(long, value_name = "FILE")]

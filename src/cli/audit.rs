@@ -42,20 +42,22 @@ enum What {
 /// Verify that the record is unchanged: every record, their order, the end, and every file by its hash
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; without it, the newest under runs/. A folder of runs has each of them proven, and names runs that are
-missing, renamed or exchanged: each run has a number and names the record of the one before. That the newest are missing shows
-only by an anchor that was kept elsewhere, or at a plant. A record whose end was cut off together with its anchor is found only with --anchor and a copy of journal.anchor that was kept elsewhere; one that was written anew from its beginning,
-only with that or with --key and the public key that was kept elsewhere. Without --key the signatures are held against the
-key that the record itself names. How to prove a record without this program: docs/journal.md.
+RUN is the folder of a run; by default the newest under runs/. In a folder of runs, each run is verified, and missing,
+renamed or exchanged runs are named: each run has a number and names the record of the run before. Missing newest runs
+show only by an anchor that was kept elsewhere, or at a plant. A record whose end was cut off together with its anchor
+is detected only with --anchor and a copy of journal.anchor that was kept elsewhere. A record that was rewritten from
+its beginning is detected only with this copy, or with --key and the public key that was kept elsewhere. Without --key,
+the signatures are checked against the key that the record itself names. docs/journal.md shows how to verify a record
+without this program.
 
 Examples:
   regrind audit verify runs
   regrind audit verify runs/freeform-mirror-20260704T120000Z --key /mnt/quality/grinding-cell-2.key
   regrind audit verify runs/freeform-mirror-20260704T120000Z --anchor /mnt/quality/SN-0042.anchor
 
-Exit codes: 0 sound and closed; 1 broken: the first record that cannot be believed is named, or the run broke off, its anchor is
-missing, or its end is not signed and the run names a key; 2 no such run, or no record in it; 4 sound so far, and under way: a
-process holds the run, and its end is still to come.")]
+Exit codes: 0 intact and closed; 1 broken: the first invalid record is named, or the run was interrupted, its anchor is
+missing, or its end is not signed although the run names a key; 2 no such run, or no record in it; 4 intact so far and
+still running: a process holds the run.")]
 struct ToVerify {
     /// Folder of the run
     #[arg(value_name = "RUN")]
@@ -79,7 +81,7 @@ struct ToVerify {
 /// Print the record as a table
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run, also of one that is under way; without it, the newest under runs/. Nothing is proven here; see
+RUN is the folder of a run, also of a running one; by default the newest under runs/. This command verifies nothing; see
 `regrind audit verify`.
 
 Example:
@@ -104,10 +106,10 @@ struct ToShow {
 /// Print the whole record: lines of JSON as they were hashed, or CSV
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; without it, the newest under runs/. The members `prev_hash` and `hash` at the end of a line are
+RUN is the folder of a run; by default the newest under runs/. The members `prev_hash` and `hash` at the end of a line are
 the chain; `hash` is SHA-256 of \"regrind journal record 1\", a line feed, prev_hash, a line feed, and the line without these two.
-docs/verify_journal.py proves such a file. CSV is that of RFC 4180: a row for each record, its columns named in the first, the
-payload as its JSON text, every field as it is.
+docs/verify_journal.py verifies this file. CSV follows RFC 4180: the first row names the columns, each record is a row,
+the payload is its JSON text, and no field is altered.
 
 Examples:
   regrind audit export runs/freeform-mirror-20260704T120000Z > record.jsonl

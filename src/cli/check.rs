@@ -23,14 +23,13 @@ use super::nominal;
 /// Check recipes, cell files and dialects: every problem with line, column and remedy
 #[derive(Args, Debug)]
 #[command(after_help = "\
-A file with a table [cell] is a cell file, one with a table [dialect] a dialect of programs, any other
-a recipe. Of a recipe the files that it
-names and the truth of a simulated cell are read too.
+A file with a table [cell] is a cell file, a file with a table [dialect] is a dialect of programs, and any other file is
+a recipe. For a recipe, the files that it names and the truth of a simulated cell are also checked.
 
 Example:
   regrind check recipes/*.toml config/*.toml
 
-Exit codes: 0 all are good; 2 one is not; 3 fault.")]
+Exit codes: 0 all files are good; 2 a file is not; 3 fault.")]
 pub(super) struct Arguments {
     /// Recipes, cell files and dialects
     #[arg(value_name = "FILE", required = true)]

@@ -21,7 +21,7 @@ use super::{Outcome, finite_above_zero};
 /// Correct an existing program by a map of the part's error
 #[derive(Args, Debug)]
 #[command(after_long_help = LONG_HELP, after_help = "Example:\n  regrind compensate --program part.ngc --map error_map.csv --out part-2.ngc\n\n--help \
-tells more than -h.")]
+shows more than -h.")]
 pub(super) struct Arguments {
     /// Program to correct, in the dialect of LinuxCNC
     #[arg(long, value_name = "FILE")]
@@ -58,29 +58,30 @@ const LONG_HELP: &str = "\
 Example:
   regrind compensate --program part.ngc --map error_map.csv --out part-2.ngc
 
-x and y of the map are those of the program's work coordinates (G54): the model frame. A map is applied along z unless
---nominal is given; on a slope a correction e then lacks e (1 - nz). With --nominal the wheel is a ball of any radius,
-and the program moves its centre, or its lowest point with --tip-of-radius.
+x and y of the map are those of the program's work coordinates (G54): the model frame. Without --nominal, the map is
+applied along z; on a slope, a correction e is then too small by e (1 - nz). With --nominal, the wheel is a ball of any
+radius, and the program moves its centre, or its lowest point with --tip-of-radius.
 
-Straight moves at feed are divided where the correction changes along them. An arc stays an arc where the correction
-is the same all along it, else it becomes chords. Rapid moves (G0), moves in machine coordinates (G53) and ways to the
-reference point (G28, G30) stay as they are; the axes that they move are not known after them, nor is Z after a change
-of the tool's length (G43, G49), nor any axis after M6 or another zero. A move at feed from an axis that is not known is
-refused. Refused too, with their line: a word that has no meaning in its line, variables, O-words, canned cycles, cutter
-compensation, G92 and other moved zeros, inverse time, axes that turn away from 0, a change of the work coordinates on
-the way. Comments are kept, line numbers are not.
+Straight moves at feed are divided if the correction changes along them. An arc stays an arc if the correction is
+constant along it; otherwise it becomes chords. Rapid moves (G0), moves in machine coordinates (G53) and moves to the
+reference point (G28, G30) stay as they are. The axes that they move are unknown after them. Z is unknown after a change
+of the tool's length (G43, G49), and every axis after M6 or another zero. A move at feed from an unknown axis is refused.
+The command also refuses, with their line: a word without a meaning in its line, variables, O-words, canned cycles,
+cutter compensation, G92 and other moved zeros, inverse time, axes that turn away from 0, and a change of the work
+coordinates within the program. Comments are kept; line numbers are not.
 
-Between its nodes a map is a cubic spline, which swings by a tenth of a step beside it. Nodes with 0 in a column `valid`
-are taken as they are of a map of Regrind; of another one the nearest valid value stands there.
+Between its nodes, a map is a cubic spline. Next to a step, the spline swings by a tenth of the step. In a map of
+Regrind, nodes with 0 in a column `valid` keep their value; in another map, they get the nearest valid value.
 
-A program without a move at feed is refused, one of whose moves at feed hardly any lie over the map, and a correction of more
-than --max-correction-um. Lengths beside the map are told: there its outermost values are levelled off within five
-nodes. Before the new program gets its name its lines are read again by other means and held against base and map.
+The command refuses a program without a move at feed, a program with hardly any move at feed over the map, and a
+correction of more than --max-correction-um. It reports lengths outside the map: there the outermost values of the map
+level off within five nodes. Before the new program gets its name, an independent reader reads its lines again, and they
+are compared with the old program and the map.
 
-The new program names the hash of the old one and of the map. Refused are a program that names the map already, a map of another
-part, an error that was measured after a pass with another correction than the program has in it, and a correction.csv, which is
-absolute, for a program that has a correction already. The program goes no deeper by it: where the map raises the tool it
-cuts air, unless its zero is set lower.
+The new program names the hashes of the old program and of the map. The command refuses a program that names the map
+already, a map of another part, an error that was measured after a pass with another correction than that of the
+program, and a correction.csv, which is absolute, for a program with a correction. The program does not go deeper: if the
+map raises the tool, the tool cuts air, unless its zero is set lower.
 
 Exit codes: 0 written; 2 bad arguments or data; 3 fault.";
 

@@ -20,13 +20,13 @@ use super::words::time_left;
 pub(super) fn help(example: &str) -> String {
     format!(
         "\
-RUN is the folder of a run; without it, the one under runs/ that goes on now. Who gave the order is recorded as the operating
-system knows them.
+RUN is the folder of a run; by default the run under runs/ that is running now. The record has the name of the person in
+the operating system.
 
 Example:
   {example}
 
-Exit codes: 0 the order was taken; 2 no such run; 3 the cell refused the order, or did not answer."
+Exit codes: 0 the cell accepted the order; 2 no such run; 3 the cell refused the order, or did not answer."
     )
 }
 
@@ -55,7 +55,7 @@ Examples:
   regrind confirm clear --machine cmm
   regrind confirm over --machine grinder --evidence \"stands, wheel up, one pass was ground\"
 
-Exit codes: 0 it was taken; 2 no such run; 3 the cell refused it, or did not answer.")]
+Exit codes: 0 the cell accepted it; 2 no such run; 3 the cell refused it, or did not answer.")]
 pub(super) struct Confirmation {
     /// Fact to confirm
     #[arg(value_enum)]

@@ -25,14 +25,15 @@ use super::{Outcome, check, control, key};
 /// Check the computer, the cell file, the machines and a recipe for obstacles to a run; nothing moves
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Of a machine on Modbus it reads who it is and how it stands, and writes nothing but the sign of life of a client. At a server of I++ DME
-it opens a session, asks the same, and ends it; of a LinuxCNC it asks without taking control. To a machine that prints its
-hits it listens for 5 s. Of machines that take files, or that a person serves, nothing is read.
+From a machine on Modbus, it reads the identity and the status, and writes only the heartbeat of a client. At a server of
+I++ DME, it opens a session, reads the same, and ends the session. From a LinuxCNC, it reads without taking control. At a
+machine that prints its hits, it listens for 5 s. From machines that exchange files, or that a person serves, it reads
+nothing.
 
 Example:
   regrind doctor config/modbus-tcp.toml --recipe recipes/freeform-mirror.toml
 
-Exit codes: 0 nothing stands in the way; 1 something does; 2 bad cell file.")]
+Exit codes: 0 no obstacle; 1 an obstacle to a run; 2 bad cell file.")]
 pub(super) struct Arguments {
     /// Cell to check
     #[arg(value_name = "CELL", default_value = BUILT_IN)]

@@ -14,16 +14,16 @@ use super::failure::Failure;
 /// Create a folder to start with: a recipe, a cell, their schemas for the editor, and a page of commands
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "\
-What is there already is left alone: a folder that has one of the files is refused. The recipe makes a free-form mirror; change what it says of
-the part, the wheel and the measurement. The cell begins as the one that ships for such machines.
+Existing files are not changed: a folder that has one of the files is refused. The recipe makes a free-form mirror; change
+its part, wheel and measurement. The cell file is the shipped one for these machines.
 
-On a terminal it asks for what is not given.
+On a terminal, the command asks for arguments that are not given.
 
 Example:
   regrind init mirrors --machines modbus-tcp
   cd mirrors && regrind check recipe.toml cell.toml
 
-Exit codes: 0 made; 2 the folder has such files already, or cannot be written.")]
+Exit codes: 0 created; 2 the folder has such files already, or cannot be written.")]
 pub(super) struct Arguments {
     /// Folder to create
     #[arg(value_name = "DIR")]
@@ -122,7 +122,7 @@ fn wanted(arguments: &Arguments) -> Result<Wanted, Failure> {
     if !(io::stdin().is_terminal() && io::stdout().is_terminal()) {
         return Err(Failure::NoFolder);
     }
-    let folder = PathBuf::from(ask("Folder to make", "regrind", |given| Ok(given.to_owned()))?);
+    let folder = PathBuf::from(ask("Folder to create", "regrind", |given| Ok(given.to_owned()))?);
     let machines = match machines {
         Some(machines) => machines,
         None => ask_for_machines()?,
@@ -130,13 +130,13 @@ fn wanted(arguments: &Arguments) -> Result<Wanted, Failure> {
     let shipped = machines.recipe().1;
     let part = match part {
         Some(part) => part,
-        None => ask("What the part is called", shipped, super::name)?,
+        None => ask("Name of the part", shipped, super::name)?,
     };
     Ok(Wanted { folder, machines, part: Some(part) })
 }
 
 fn ask_for_machines() -> Result<Machines, Failure> {
-    let mut list = "How the machines are reached:\n".to_owned();
+    let mut list = "Connection to the machines:\n".to_owned();
     for (number, machines) in (1..).zip(Machines::value_variants()) {
         let named = machines.to_possible_value();
         let help = named.as_ref().and_then(|value| value.get_help()).map(ToString::to_string).unwrap_or_default();

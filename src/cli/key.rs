@@ -18,16 +18,16 @@ const KEY: &str = "REGRIND_KEY";
 /// Create the key that signs the records of this computer, if it does not exist, and print its public half
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The key is made where REGRIND_KEY says, else in $XDG_CONFIG_HOME/regrind/audit.key or ~/.config/regrind/audit.key (on Windows in
-%LOCALAPPDATA%), readable by its owner only. A key that is there is kept, and its public half is printed. Every run of this user
-signs with it from then on.
+The file of the key is that of REGRIND_KEY, otherwise $XDG_CONFIG_HOME/regrind/audit.key or ~/.config/regrind/audit.key
+(on Windows in %LOCALAPPDATA%). Only its owner can read it. An existing key is kept, and its public half is printed. All
+later runs of this user sign with it.
 
 Examples:
   regrind audit key
   regrind audit key --json > /mnt/quality/grinding-cell-2.key
   regrind audit verify --key /mnt/quality/grinding-cell-2.key
 
-Exit codes: 0 printed; 2 the file cannot be made or read, others may read it, or it holds no key.")]
+Exit codes: 0 printed; 2 the file cannot be created or read, others can read it, or it has no key.")]
 pub(super) struct Arguments {
     /// File of the key
     #[arg(long, value_name = "FILE")]

@@ -24,7 +24,7 @@ use super::words::{counted, three_digits};
 Example:
   regrind plan recipes/freeform-mirror.toml
 
-Exit codes: 0 everything is within its limits; 2 bad recipe or cell, or something is beyond its limits; 3 fault.")]
+Exit codes: 0 everything is within its limits; 2 bad recipe or cell, or a limit is exceeded; 3 fault.")]
 pub(super) struct Arguments {
     /// Recipe of the part
     #[arg(value_name = "RECIPE")]

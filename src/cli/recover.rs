@@ -22,9 +22,9 @@ use super::{Outcome, check, control, key};
 /// Bring machines of a cell to idle that hold a job which no run knows
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Shows how each machine stands and what would bring it nearer to idle: STOP, ACKNOWLEDGE or CLEAR. Nothing is commanded before
-you type that word; anything else leaves the machine as it is. Each step is on record in a folder of its own below --runs. A job
-that a run there knows is better gone on with by `regrind resume`.
+Shows the state of each machine and the command that brings it nearer to idle: STOP, ACKNOWLEDGE or CLEAR. The command is
+sent only after you type that word; any other input leaves the machine as it is. Each step is recorded in a new folder
+under --runs. If a run there knows the job, prefer `regrind resume`.
 
 Example:
   regrind recover --cell config/modbus-tcp.toml

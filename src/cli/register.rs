@@ -23,7 +23,7 @@ use super::{Outcome, above_zero, finite_above_zero, finite_from_zero};
 /// Register measured probe centres to the offset of a nominal surface
 #[derive(Args, Debug)]
 #[command(after_long_help = LONG_HELP, after_help = "Example:\n  regrind register --nominal lens.csv --measured cmm.csv \
---probe-radius 1.5 --out registered\n\n--help tells more than -h.")]
+--probe-radius 1.5 --out registered\n\n--help shows more than -h.")]
 pub(super) struct Arguments {
     /// Nominal surface: points as text or PLY, a mesh as STL or PLY, or a TOML definition, in mm
     #[arg(long, value_name = "FILE")]
@@ -90,19 +90,19 @@ Example:
   regrind register --nominal lens.csv --measured cmm.csv --probe-radius 1.5 --out registered
 
 Writes into the folder:
-  registration.json           the pose cmm_from_model (4 rows of 4, mm), and how well it is known
+  registration.json           the pose cmm_from_model (4 rows of 4, mm), and its uncertainty
   deviations.csv              a row per measured point in the order given: contact point and normal in the
-                              model frame, deviation (positive where material stands proud), used (1 or 0)
+                              model frame, deviation (positive for excess material), used (1 or 0)
   deviation_uncertainty.csv   standard uncertainty of each deviation in mm, in the same order
 with --model also
-  model.json                  PV and RMS of the form with 95 % intervals, the scatter of the probe taken off; how
-                              well the place of the nominal frame is known beside a form that nobody knows
-  form.csv                    the form at each point that was used, and its standard uncertainty, in mm
+  model.json                  PV and RMS of the form without the noise of the probe, with 95 % intervals; the
+                              uncertainty of the position of the nominal frame for an unknown form
+  form.csv                    the form at each used point, and its standard uncertainty, in mm
 
-`covariance` is 6 x 6 in the order [translation; rotation] of the twist, in mm and rad: of the small motion in
-the model frame that takes the true pose to the one found. Directions that are locked or held have no variance.
-`objective_mm2` is the sum of squared deviations after each step that was taken; `trace` has every step, and how
-many points took part in it. `outliers` and `off_part` count the measured points from 0.
+`covariance` is 6 x 6 in the order [translation; rotation] of the twist, in mm and rad: the small motion in the
+model frame from the true pose to the estimated pose. Locked and undetermined directions have no variance.
+`objective_mm2` is the sum of squared deviations after each accepted step; `trace` has every step with its number
+of points. `outliers` and `off_part` are indices of measured points, from 0.
 
 Exit codes: 0 registered; 2 bad arguments or data; 3 fault.";
 

@@ -12,8 +12,8 @@ use super::failure::Failure;
 /// Write the report of a run as one HTML file that needs no network; write its results as QIF or DFQ
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; without it, the newest under runs/. The record is proven first; the report is RUN/report.html.
-Results for other systems hold each measurement with its figures, limits, uncertainties and verdict.
+RUN is the folder of a run; by default the newest under runs/. The record is verified first. The report is
+RUN/report.html. Results for other systems have each measurement with its figures, limits, uncertainties and verdict.
 
 Examples:
   regrind report runs/freeform-mirror-20260704T120000Z

@@ -26,20 +26,22 @@ use super::{Outcome, check, control, key};
 /// Resume a held cell, or a run whose program has ended
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; without it, the one under runs/ that goes on now, or else the newest that has no end on record.
+RUN is the folder of a run; by default the run under runs/ that is running now, otherwise the newest without an end in
+its record.
 
-A run whose program has ended without an end on record (a crash, a cut of the power) is taken up in this terminal: the record is
-verified and done again without commanding anything, the machines are asked what became of their jobs, and the cell comes to
-Held, \"the program was started again\". Then look at the machines, and give the same command from another terminal: it goes on.
-Where the folder shows that records were lost (the log of the database or journal.anchor is gone, or damaged) nothing is taken
-up before somebody has looked at both machines and says so by --despite-loss; otherwise `regrind recover` brings them home.
+A run whose program has ended without an end in its record (a crash, a power failure) is resumed in this terminal. The
+record is verified and replayed without any command, the machines are asked for the state of their jobs, and the cell
+goes to Held, \"the program was started again\". Then inspect the machines, and give the same command in another
+terminal: the run continues. If the folder shows that records were lost (the log of the database or journal.anchor is
+missing or damaged), the run resumes only with --despite-loss, which confirms that you have inspected both machines.
+Otherwise bring the machines to idle with `regrind recover`.
 
 Examples:
   regrind resume
   regrind resume runs/freeform-mirror-20260704T120000Z --reason \"coolant is filled up\"
 
-Exit codes: 0 the order was taken, or the part is accepted; 1 finished, not in tolerance, or the record is broken; 2 no such run, or
-one that is over; 3 the cell refused the order, fault or abort.")]
+Exit codes: 0 the cell accepted the order, or the part is accepted; 1 finished, not in tolerance, or the record is
+broken; 2 no such run, or the run is over; 3 the cell refused the order, fault or abort.")]
 pub(super) struct Arguments {
     /// Folder of the run
     #[arg(value_name = "RUN")]

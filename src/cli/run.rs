@@ -28,8 +28,8 @@ pub(super) const LEARNED_FROM: &str = "learned_from.json";
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Without --cell everything is simulated, on real Modbus TCP connections within this program, and marked SIMULATION.
-Ctrl-C once holds the cell at the next safe place; twice aborts it. A terminal that is closed (SIGHUP) and a service that
-is stopped (SIGTERM) end the run in order; told again, they abort it.
+Ctrl-C once holds the cell at the next safe place; twice aborts it. A closed terminal (SIGHUP) and a stopped service
+(SIGTERM) end the run in order; a second signal aborts it.
 
 Example:
   regrind run recipes/freeform-mirror.toml

@@ -14,7 +14,7 @@ use super::failure::Failure;
 /// List the runs with their part, progress and result
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The runs that are on come first, then the newest. What is shown is read and not proven: `regrind audit verify` does that.
+Active runs are first, then the newest. The list is not verified; see `regrind audit verify`.
 
 Example:
   regrind runs --part SN-0042

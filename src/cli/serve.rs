@@ -26,9 +26,9 @@ const LINGERS: Duration = Duration::from_secs(3);
 /// Show the cell and its runs as a page in the browser
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The page shows the run that is on, from wherever it was begun, and gives orders to it through the same door as `regrind hold` and
-the like. It opens by the address that is printed, with its key, and on this computer only. For other computers it needs a certificate,
-by whose names they reach it, and users, who sign in; or they use a tunnel: ssh -L 7373:127.0.0.1:7373 CELL
+The page shows the active run, wherever it was started, and gives orders to it in the same way as `regrind hold`. Open it
+on this computer, with the printed address and its key. For other computers, the page needs a certificate with the names
+by which they reach it, and users that sign in. Alternatively, use a tunnel: ssh -L 7373:127.0.0.1:7373 CELL
 
 Examples:
   regrind serve --runs runs

@@ -23,15 +23,16 @@ const LINGERS: Duration = Duration::from_secs(30);
 /// Replicate the records and files of finished and running runs to the plant
 #[derive(Args, Debug)]
 #[command(after_help = "\
-It goes on until it is stopped, whether the plant can be reached or not: what could not go, goes later. The plant proves the chain of every
-record as it arrives, and a journal that was cut or rewritten after it was shipped is told here and there. No order of the cell waits for it.
+The command runs until it is stopped, also while the plant cannot be reached: it sends the rest later. The plant verifies
+the chain of every record on arrival. A journal that was cut or rewritten after it was replicated is reported here and at
+the plant. No order of the cell waits for this command.
 
 Examples:
   regrind ship --plant plant.toml
   regrind ship --plant plant.toml --runs /srv/runs --once
 
-Exit codes: 0 stopped by Ctrl-C, or everything has arrived; 1 a run differs from what the plant has of it; 2 bad arguments; 3 with --once, the
-plant cannot be reached.")]
+Exit codes: 0 stopped by Ctrl-C, or everything has arrived; 1 a run differs from its copy at the plant; 2 bad arguments;
+3 with --once, the plant cannot be reached.")]
 pub(super) struct Arguments {
     /// Plant file: address and user of the database
     #[arg(long, value_name = "FILE")]

@@ -15,7 +15,7 @@ use super::{Outcome, simulated};
 /// Serve the simulated CMM and grinder of a cell on their wires until stopped
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Both machines share one simulated part: its truth is the table [simulation] of the recipe.
+Both machines share one simulated part. The table [simulation] of the recipe is its truth.
 
 Example:
   regrind simulate --cell config/modbus-tcp.toml --log machines.jsonl

@@ -14,9 +14,8 @@ use super::failure::Failure;
 /// Print the response of the cell to every event in every state
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The table is found by trying: every event in every state that can be reached. A line is an event, the state that follows,
-and the commands that are given. More than one answer means that it depends on the values of the event or on what happened
-before.
+The table is computed from every event in every reachable state. A line has an event, the next state, and the commands of
+the cell. More than one answer means that the response depends on the values of the event or on earlier events.
 
 Examples:
   regrind states --state Held

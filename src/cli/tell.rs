@@ -29,14 +29,14 @@ const MINUTE: Duration = Duration::from_secs(60);
 /// Publish live values of this cell to a broker (Sparkplug B) and to clients (OPC UA)
 #[derive(Args, Debug)]
 #[command(after_help = "\
-To whom stands in the plant file, by [sparkplug] and [opcua]. It goes on until it is stopped, from run to run, whether a run is on or not. Nothing that
-comes in is an order: a value that somebody writes and a command that somebody sends are refused, told here, and recorded in the run that is on.
-`regrind run --plant` begins it by itself; docs/live.md has every value.
+The tables [sparkplug] and [opcua] of the plant file name the receivers. The command runs until it is stopped, from run to
+run, also without an active run. It accepts no orders: written values and received commands are refused, reported here,
+and recorded in the active run. `regrind run --plant` starts it by itself. docs/live.md lists every value.
 
 Example:
   regrind tell --plant plant.toml --runs /srv/runs
 
-Exit codes: 0 stopped by Ctrl-C; 2 bad arguments, or what the plant file names cannot be used.")]
+Exit codes: 0 stopped by Ctrl-C; 2 bad arguments, or an entry of the plant file cannot be used.")]
 pub(super) struct Arguments {
     /// Plant file: receivers of the values
     #[arg(long, value_name = "FILE")]

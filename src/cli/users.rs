@@ -14,8 +14,9 @@ use super::failure::Failure;
 /// Manage the users who may sign in to the page of the cell
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Roles: viewer looks; quality looks, and may hold; operator gives every order, but goes on from no alarm that a process engineer clears;
-engineer gives every order. The list has of a password only what proves it. A change counts at once, for a page that is open too.
+Roles: viewer can only look; quality can look and hold; operator can give every order, but cannot resume from an alarm that
+a process engineer clears; engineer can give every order. The list has only a hash of each password. A change takes
+effect at once, also for an open page.
 
 Example:
   regrind users add \"A. Smith\" --role operator

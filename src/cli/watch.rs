@@ -30,14 +30,13 @@ const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
 /// Watch a running cell: its state, progress, figures and error map, with a key to hold it
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; without it, the one under runs/ that goes on now. Keys: h holds the cell, u shows how well the map is known, q leaves
-the cell as it is.
-Where the output is no terminal, each new state is a line.
+RUN is the folder of a run; by default the run under runs/ that is running now. Keys: h holds the cell, u shows the
+uncertainty of the map, q quits and leaves the cell as it is. If the output is not a terminal, each new state is a line.
 
 Example:
   regrind watch
 
-Exit codes: 0 the run ended, or q was pressed; 2 no such run; 3 its program has gone.")]
+Exit codes: 0 the run ended, or q was pressed; 2 no such run; 3 its program is no longer running.")]
 pub(super) struct Arguments {
     /// Folder of the run
     #[arg(value_name = "RUN")]

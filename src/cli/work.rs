@@ -23,9 +23,10 @@ const RECIPES: &str = ".recipes";
 /// Make the parts that are queued for this cell at the plant, one after the other
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The part that is due first is leased to this cell, its recipe is pulled by its hash, and proven: two of the approvers in the plant file must have
-signed it. Who stands at the cell confirms the part by its serial number, typed or scanned; anything else gives it back. From the moment it is
-begun it belongs to its run, and no other cell gets it, whatever becomes of this one. It ends when no part is left, or when one did not turn out.
+The part with the earliest due date is leased to this cell. Its recipe is fetched by its hash and verified: two of the
+approvers in the plant file must have signed it. The person at the cell confirms the part by its serial number, typed or
+scanned; any other input gives the part back. From its start the part belongs to its run, and no other cell gets it, also
+if this cell fails. The command ends when no part is left, or when a part is not accepted.
 
 Examples:
   regrind work --plant cell-1.toml --cell config/modbus-tcp.toml --operator \"A. Smith\"
@@ -33,8 +34,8 @@ Examples:
   regrind work --plant cell-1.toml --give-back SN-0042
   regrind work --plant cell-1.toml --give-up SN-0042 --why \"the blank broke\"
 
-Exit codes: 0 all parts that were there are accepted; 1 one was not, was given back, or was begun here and is not over; 2 bad arguments, or a recipe that is not
-approved; 3 a fault or abort, or the plant cannot be reached.")]
+Exit codes: 0 all queued parts are accepted; 1 a part was not accepted, was given back, or was started here and is not
+over; 2 bad arguments, or a recipe that is not approved; 3 a fault or abort, or the plant cannot be reached.")]
 pub(super) struct Arguments {
     /// Plant file: address and user of the database, and the approvers of recipes
     #[arg(long, value_name = "FILE")]

@@ -15,12 +15,13 @@ use super::{Where, open, open_any};
 /// Set up the database, or update it to this program's layout, as its owner
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The owner of the database signs in, with the right to make roles. What is there stays; it may be said again at any time.
+Sign in as the owner of the database, with the right to create roles. Existing data is kept; the command can be repeated
+at any time.
 
 Example:
   createdb regrind && regrind plant init --plant owner.toml
 
-Exit codes: 0 laid out; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 set up; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToInit {
     #[command(flatten)]
     plant: Where,
@@ -29,8 +30,9 @@ pub(super) struct ToInit {
 /// Enrol a cell, a planner, a reader or a worker, with a new password
 #[derive(Args, Debug)]
 #[command(after_help = "\
-A cell reads what is its own, ships its records and takes work; a planner reads everything, brings recipes and queues parts; a reader
-(Grafana, say) reads everything; a worker makes the runs of studies. The password is written to a file that nobody else may read: carry it to the computer that signs in.
+A cell reads its own data, replicates its records and takes work. A planner reads everything, proposes recipes and queues
+parts. A reader, such as Grafana, reads everything. A worker makes the runs of studies. The password is in a file that
+only its owner can read: carry it to the computer that signs in.
 
 Examples:
   regrind plant enrol cell-1 --plant owner.toml --password-file cell-1.password --key cell-1.key
@@ -88,7 +90,7 @@ pub(super) struct ToRetire {
 Example:
   regrind plant cells --plant planner.toml
 
-Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 listed; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToList {
     #[command(flatten)]
     plant: Where,

@@ -23,15 +23,16 @@ pub(super) use recipes::is_below;
 /// Manage the database of a plant of many cells
 #[derive(Args, Debug)]
 #[command(after_help = "\
-A cell runs, holds and accepts without a plant; the plant never commands a motion. The database is PostgreSQL 15 or later; who signs in, and
-where it is, stands in a plant file (config/plant/plant.toml). docs/plant.md goes from one cell to four.
+A cell runs, holds and accepts without a plant. The plant never commands a motion. The database is PostgreSQL 15 or later;
+a plant file (config/plant/plant.toml) gives its address and user. docs/plant.md leads from one cell to four.
 
 Examples:
   regrind plant init --plant owner.toml
   regrind plant enrol cell-1 --plant owner.toml --password-file cell-1.password --key cell-1.key
   regrind plant cells --plant planner.toml
 
-Exit codes: 0 done; 1 what was looked at is not as it should be; 2 bad arguments, or the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 done; 1 a check failed, or something does not exist; 2 bad arguments, or the
+database refuses it; 3 it cannot be reached.")]
 pub(super) struct Arguments {
     #[command(subcommand)]
     what: What,

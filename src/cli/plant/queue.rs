@@ -11,13 +11,14 @@ use super::{Where, open};
 /// Queue parts to make by a recipe
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Cells take them by `regrind work`, the one that is due first before the others. Nothing begins by itself: a person at the cell confirms each,
-unless the recipe says otherwise (cycle.confirm_work).
+Cells take the parts with `regrind work`, in the order of their due dates. Nothing starts by itself: a person at the cell
+confirms each part, unless the recipe has cycle.confirm_work = false.
 
 Example:
   regrind plant queue SN-0042 SN-0043 --recipe freeform-mirror --due 2027-03-01 --plant planner.toml
 
-Exit codes: 0 queued; 2 no such recipe, one that two people have not signed, a part that is queued already; 3 the database cannot be reached.")]
+Exit codes: 0 queued; 2 no such recipe, it lacks the signatures of two people, or a part is queued already; 3 the
+database cannot be reached.")]
 pub(super) struct ToQueue {
     /// Serial numbers of the parts
     #[arg(value_name = "SERIAL", required = true, value_parser = name)]
@@ -44,7 +45,7 @@ pub(super) struct ToQueue {
 Example:
   regrind plant unqueue 17 --why \"the blank is broken\" --plant planner.toml
 
-Exit codes: 0 taken out; 1 it is begun, or there is no such part; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 removed; 1 it is started, or there is no such part; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToUnqueue {
     /// Its number in the queue (`regrind plant work`)
     #[arg(value_name = "N")]
@@ -62,7 +63,7 @@ pub(super) struct ToUnqueue {
 Example:
   regrind plant work --plant planner.toml
 
-Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 listed; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToList {
     #[command(flatten)]
     plant: Where,

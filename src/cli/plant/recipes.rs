@@ -16,13 +16,13 @@ use super::{Where, open};
 /// Propose a recipe to the plant, as the next version under its name
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The recipe is checked as `regrind check` does, and goes with the files that it names, which lie beside it or below. No part is made by it before
-two people have signed it.
+The recipe is checked as by `regrind check`. The files that it names, in its folder or below, are proposed with it. No
+part is made by it before two people have signed it.
 
 Example:
   regrind plant propose recipes/freeform-mirror.toml --plant planner.toml
 
-Exit codes: 0 brought; 2 the recipe is not as it should be, is there already, or the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 proposed; 2 the recipe is bad or exists already, or the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToPropose {
     /// Recipe of the part
     #[arg(value_name = "RECIPE")]
@@ -37,13 +37,15 @@ pub(super) struct ToPropose {
 /// Sign a recipe; cells make parts by it after two people have signed it
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The key is a person's own (`regrind audit key --key FILE` makes one). Its public half stands in the plant file of each cell, by which the cell
-proves the signature itself: `[[approver]]`, name and key. What is signed is the hash of name, version, text and files together.
+The key belongs to one person (`regrind audit key --key FILE` creates one). The plant file of each cell has its public
+half in `[[approver]]`, with the name, so that the cell verifies the signature itself. The signature covers the hash of
+name, version, text and files together.
 
 Example:
   regrind plant approve freeform-mirror --person \"A. Smith\" --key smith.key --plant planner.toml
 
-Exit codes: 0 signed; 2 no such recipe, one that the person has signed already, or the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 signed; 2 no such recipe, the person has signed it already, or the database refuses it; 3 it cannot be
+reached.")]
 pub(super) struct ToApprove {
     /// Name of the recipe in the plant
     #[arg(value_name = "NAME")]
@@ -91,7 +93,7 @@ pub(super) struct ToWithdraw {
 Example:
   regrind plant recipes --plant planner.toml
 
-Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 listed; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToList {
     #[command(flatten)]
     plant: Where,

@@ -17,7 +17,7 @@ Examples:
   regrind plant runs --plant planner.toml
   regrind plant runs --part SN-00 --plant planner.toml
 
-Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 listed; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToList {
     /// Serial number of the part, or its first characters
     #[arg(long, value_name = "SERIAL")]
@@ -35,12 +35,13 @@ pub(super) struct ToList {
 /// Fetch a run from the plant as a run folder, and verify it
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Records and files are written as they were at the cell; `regrind report`, `regrind audit` and whatever else reads a run reads it.
+Records and files are the same as at the cell: `regrind report`, `regrind audit` and other readers of a run can read the
+folder.
 
 Example:
   regrind plant fetch freeform-mirror-20260704T120000Z --plant planner.toml --out runs
 
-Exit codes: 0 brought back and proven; 1 it cannot be believed, or is not whole; 2 no such run; 3 the plant cannot be reached.")]
+Exit codes: 0 fetched and verified; 1 the run is invalid or incomplete; 2 no such run; 3 the plant cannot be reached.")]
 pub(super) struct ToFetch {
     /// Name of the run
     #[arg(value_name = "RUN")]
@@ -61,7 +62,7 @@ pub(super) struct ToFetch {
 Example:
   regrind plant incidents --plant planner.toml
 
-Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 listed; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToTell {
     /// Maximum number of entries
     #[arg(long, value_name = "N", default_value_t = 40)]

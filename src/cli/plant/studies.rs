@@ -27,8 +27,9 @@ const Z: f64 = 1.96;
 /// Simulate a recipe many times, on any number of computers, and summarise the results
 #[derive(Args, Debug)]
 #[command(after_help = "\
-For commissioning: how often a recipe is accepted, in how many cycles, by which gain or tolerance, and how often an accepted part is truly out of
-tolerance. Each run is a job of the plant's database; a worker that dies loses nothing, for its job is given to another.
+For commissioning: a study shows how often a recipe is accepted, in how many cycles, with which gain or tolerance, and how
+often an accepted part is truly out of tolerance. Each run is a job in the plant's database. If a worker dies, nothing is
+lost: another worker gets its job.
 
 Examples:
   regrind study begin recipes/freeform-mirror.toml --name gains --seeds 1..200 --vary compensation.gain=0.6,0.8,1.0 --plant planner.toml
@@ -55,7 +56,8 @@ enum What {
 Example:
   regrind study begin mirror.toml --name limits --seeds 1..50 --vary acceptance.pv_um=2.5,3.0 --vary cycle.max_cycles=3,5 --plant planner.toml
 
-Exit codes: 0 begun; 2 the recipe is not as it should be with one of the values, or there is a study of that name; 3 the database cannot be reached.")]
+Exit codes: 0 started; 2 the recipe is bad with one of the values, or there is a study of that name; 3 the database
+cannot be reached.")]
 struct ToBegin {
     /// Recipe, with a table [simulation]
     #[arg(value_name = "RECIPE")]
@@ -95,12 +97,13 @@ struct ToWork {
 /// Show the results of a study for each set of values
 #[derive(Args, Debug)]
 #[command(after_help = "\
-`accepted` has its interval of 95 % (Wilson 1927). `false accepts` are accepted parts that are truly out of tolerance, as the simulated world knows.
+`accepted` has a 95 % interval (Wilson 1927). `false accepts` are accepted parts whose true form in the simulation is out
+of tolerance.
 
 Example:
   regrind study show gains --plant planner.toml
 
-Exit codes: 0 told; 1 there is no such study; 2 the database refuses it; 3 it cannot be reached.")]
+Exit codes: 0 shown; 1 there is no such study; 2 the database refuses it; 3 it cannot be reached.")]
 struct ToShow {
     /// Name of the study
     #[arg(value_name = "NAME")]
