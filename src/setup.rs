@@ -49,13 +49,13 @@ pub enum SetupError {
     )]
     Limit { recipe: Box<Path>, cell: Box<Path>, key: &'static str, found: f64, allowed: Box<str>, limit: &'static str },
     #[error(
-        "{recipe}: measure.qualify asks for the reference sphere, and {cell} has none; add [cmm.reference_sphere] to the cell file, or write \
-         qualify = false"
+        "{recipe}: measure.qualify requires the reference sphere, and {cell} has none; add [cmm.reference_sphere] to \
+         the cell file, or write qualify = false"
     )]
     NoSphere { recipe: PathBuf, cell: PathBuf },
     #[error(
-        "{}: the reference sphere at {at} mm leaves {gap_mm:.1} mm beside the part of {} where the fixture holds it, and the probe needs \
-         {needed_mm:.1} mm; correct [cmm.reference_sphere] or [cmm.fixture]",
+        "{}: the gap between the reference sphere at {at} mm and the part of {} in its fixture is {gap_mm:.1} mm; \
+         the probe requires {needed_mm:.1} mm; correct [cmm.reference_sphere] or [cmm.fixture]",
         .cell.display(), .recipe.display()
     )]
     SphereInPart { recipe: Box<Path>, cell: Box<Path>, at: Box<str>, gap_mm: f64, needed_mm: f64 },
@@ -66,17 +66,18 @@ pub enum SetupError {
     )]
     Travel { recipe: Box<Path>, cell: Box<Path>, number: usize, at: Box<str>, allowed: Box<str> },
     #[error(
-        "{recipe}: the measuring pattern is `free`, and {cell} reaches its CMM over a wire that needs a plan; choose grid, spiral or file"
+        "{recipe}: the measuring pattern is `free`, and the wire of the CMM in {cell} requires a plan; choose grid, \
+         spiral or file"
     )]
     NeedsPlan { recipe: PathBuf, cell: PathBuf },
     #[error(
-        "{}: {key} needs the temperature of each measurement, and {} reaches its CMM over a wire that tells none; leave the key out, or use \
-         another wire", .recipe.display(), .cell.display()
+        "{}: {key} requires the temperature of each measurement, and the wire of the CMM in {} reports none; remove \
+         the key, or use another wire", .recipe.display(), .cell.display()
     )]
     NoTemperature { recipe: Box<Path>, cell: Box<Path>, key: &'static str },
     #[error(
-        "{recipe}: grinding.track_mm is missing, and cannot be chosen by the scallops between the tracks, because no path is laid over this part: \
-         {source}; add grinding.track_mm"
+        "{recipe}: grinding.track_mm is missing, and the scallops between the tracks cannot determine it, because \
+         there is no path over this part: {source}; add grinding.track_mm"
     )]
     Tracks { recipe: PathBuf, source: PathError },
     #[error("{}: {source} (cell file {})", .recipe.display(), .cell.display())]

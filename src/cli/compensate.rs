@@ -97,7 +97,7 @@ struct Document<'a> {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let others = [Some(&arguments.map), arguments.nominal.as_ref()];
     if let Some(path) = others.into_iter().flatten().find(|path| is_same_file(path, &arguments.out)) {
-        let what = "the corrected program would take the place of this file".to_owned();
+        let what = "the corrected program would overwrite this file".to_owned();
         let path = path.clone();
         return Err(Failure::Program(GcodeError::Program { path, what, remedy: "give another name to --out" }));
     }

@@ -117,13 +117,14 @@ fn folder(runs: &Path) -> Finding {
     match written {
         Err(error) => Finding::new("folder of the runs", Found::Obstacle, error.to_string()),
         Ok(()) if free < LITTLE_BYTES => {
-            let words = format!("{} has {} MB free; a run of many points takes hundreds", runs.display(), free >> 20);
+            let words =
+                format!("{} has {} MB free; a run of many points requires hundreds of MB", runs.display(), free >> 20);
             Finding::new("folder of the runs", Found::Notice, words)
         }
         Ok(()) => Finding::new(
             "folder of the runs",
             Found::Good,
-            format!("{} can be written, {} GB are free", runs.display(), free >> 30),
+            format!("{} is writable, {} GB are free", runs.display(), free >> 30),
         ),
     }
 }
@@ -133,7 +134,8 @@ fn folder(runs: &Path) -> Finding {
 fn open_runs(runs: &Path) -> Option<Finding> {
     let open = control::folders(runs).filter(|folder| is_open_to_all(folder)).count();
     let words = format!(
-        "{open} of them can be read by every user of this computer, and held up by them while they are on: `chmod o-rwx {}/*`",
+        "every user of this computer can read {open} of them, and can block them while they are active: `chmod o-rwx \
+         {}/*`",
         runs.display()
     );
     (open > 0).then(|| Finding::new("runs", Found::Notice, words))
@@ -151,7 +153,8 @@ fn clock(runs: &Path) -> Finding {
     let last = last.unwrap_or_default();
     if now.as_str() < LEAST || now < last {
         let words = format!(
-            "it shows {now:.19}, and the last record was written at {last:.19}: set it; records are ordered by their numbers all the same"
+            "it shows {now:.19}, and the last record was written at {last:.19}: set the clock; the numbers of the \
+             records keep their order"
         );
         return Finding::new("clock", Found::Notice, words);
     }
@@ -166,7 +169,7 @@ fn signing() -> Finding {
         Ok(None) => Finding::new(
             "audit key",
             Found::Notice,
-            "there is none, and records are not signed: regrind audit key makes one",
+            "there is no key, so records are not signed; to make one: regrind audit key",
         ),
         Err(error) => Finding::new("audit key", Found::Obstacle, error.to_string()),
     }
@@ -183,7 +186,11 @@ fn fits(recipe: &Path, cell: &CellConfig) -> Result<String, Failure> {
 
 async fn machines(cell: &CellConfig) -> Vec<Finding> {
     if within(cell) {
-        return vec![Finding::new("machines", Found::Good, "simulated within the program: there is nothing to reach")];
+        return vec![Finding::new(
+            "machines",
+            Found::Good,
+            "simulated within the program: there is nothing to connect",
+        )];
     }
     let settings = |link| setup::modbus(link, cell.simulated, 1, 1);
     let [cmm, grinder] = [&cell.cmm.link, &cell.grinder.link];
@@ -218,7 +225,7 @@ async fn server<M: Machine>(kind: MachineKind, link: &Link, made: Result<M, Driv
     let looked = async {
         let identity = machine.connect().await?;
         let status = machine.status().await?;
-        let words = format!("{}: {} stands {}", machine.name(), identity.name, in_short(&status));
+        let words = format!("{}: {} is {}", machine.name(), identity.name, in_short(&status));
         let told = machine.notes().iter().fold(words, |words, note| format!("{words}; {note}"));
         machine.release().await?;
         Ok::<_, DeviceError>(told)
@@ -253,7 +260,8 @@ async fn heard(link: &Link, made: Result<impl Machine, DriverError>) -> Finding 
         None => {
             let listened = LISTENS.as_secs();
             let words = format!(
-                "{name} is open, and no line came in {listened} s: touch something within them, and the formats are told that it fits"
+                "{name} is open, and no line arrived in {listened} s: touch something within this time to see the \
+                 formats that it matches"
             );
             Finding::new(what, Found::Notice, words)
         }
@@ -268,7 +276,7 @@ async fn machine<M: Machine>(
 ) -> Finding {
     let what = device.to_string();
     let Some(settings) = settings else {
-        let words = "it tells nothing over a wire; what it is reached by is there";
+        let words = "it reports nothing over a wire; its folders and settings are valid";
         return match setup::is_there(cell, device) {
             Ok(()) => Finding::new(what, Found::Notice, words),
             Err(error) => Finding::new(what, Found::Obstacle, error.to_string()),
@@ -289,7 +297,7 @@ async fn machine<M: Machine>(
         return Finding::new(
             what,
             Found::Obstacle,
-            format!("there is no port {port}: see the cable, and the name in the cell file"),
+            format!("there is no port {port}: check the cable, and the name in the cell file"),
         );
     }
     match make(settings) {
@@ -297,7 +305,7 @@ async fn machine<M: Machine>(
         Ok(mut machine) => {
             let looked = look(&mut machine).await;
             let name = machine.name().to_owned();
-            Finding::of(&what, looked.map(|status: Status| format!("{name} stands {}", in_short(&status))))
+            Finding::of(&what, looked.map(|status: Status| format!("{name} is {}", in_short(&status))))
         }
     }
 }

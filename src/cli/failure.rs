@@ -46,21 +46,22 @@ pub(super) enum Failure {
     Registration { measured: PathBuf, nominal: PathBuf, source: RegistrationError, hint: &'static str },
     #[error("--probe-radius: {source}")]
     ProbeRadius { source: RegistrationError },
-    #[error("--probe-radius is missing; give the radius of the probe in millimetres, or --method contact")]
+    #[error("--probe-radius is missing; give the radius of the probe in mm, or --method contact")]
     NoProbeRadius,
-    #[error("{path}: a map holds points of the surface and no centres of a probe; give --method contact")]
+    #[error("{path}: a map has points of the surface, not centres of a probe; give --method contact")]
     MapOfContacts { path: PathBuf },
-    #[error("{path}: --projection is for points, and this is {what}; leave it out")]
+    #[error("{path}: --projection is for points, and this is {what}; remove it")]
     Projection { path: PathBuf, what: &'static str },
     #[error(
-        "{path}: no pose: {reason}; give 16 numbers, row by row, as text or JSON, or the registration.json of an earlier run"
+        "{path}: not a pose: {reason}; give 16 numbers, row by row, as text or JSON, or the registration.json of an \
+         earlier run"
     )]
     Initial { path: PathBuf, reason: String },
     #[error("{bad} of {files} files {} problems; they are listed above", if *bad == 1 { "has" } else { "have" })]
     Checked { bad: usize, files: usize },
     #[error(transparent)]
     Setup(SetupError),
-    #[error("what {run} learned cannot be begun with: {source}; or write learn = false")]
+    #[error("the run cannot start from the learned error of {run}: {source}; or write learn = false")]
     TooMuchLearned { run: String, source: NextPassError },
     #[error("{path}: {reason}")]
     Simulation { path: PathBuf, reason: String },
@@ -70,57 +71,63 @@ pub(super) enum Failure {
     #[error("{}: {flaws} flaw(s) among the runs, the first: {first}", .runs.display())]
     RunsLack { runs: PathBuf, flaws: usize, first: String },
     #[error(
-        "{}: the cell file asks for a record that is signed (cell.require_signature), and this user has no key; `regrind audit key` makes one",
+        "{}: the cell file requires a signed record (cell.require_signature), and this user has no key; make one \
+         with `regrind audit key`",
         .cell.display()
     )]
     Unsigned { cell: PathBuf },
-    #[error("{}: the record is not whole: {lacks}", .run.display())]
+    #[error("{}: the record is incomplete: {lacks}", .run.display())]
     NotWhole { run: PathBuf, lacks: &'static str },
     #[error("{path}: {reason}; give a copy of the journal.anchor of this run")]
     Anchor { path: PathBuf, reason: String },
     #[error(
-        "there is no place for a key: REGRIND_KEY is empty, or neither it nor HOME is set; name the file with --key"
+        "the file of the key is unknown: REGRIND_KEY is empty, or neither it nor HOME is set; name the file with \
+         --key"
     )]
     NoPlaceForKey,
     #[error(transparent)]
     Report(ReportError),
-    #[error("--state {name}: no state begins so; give one of {known}")]
+    #[error("--state {name}: no state begins with this; give one of {known}")]
     NoState { name: String, known: String },
     #[error(transparent)]
     Journal(JournalError),
     #[error(transparent)]
     Machine(JournalError),
-    #[error("{path}: no control socket can be made there: {source}; give --runs a local folder with a shorter name")]
+    #[error("{path}: no control socket can be created there: {source}; give --runs a local folder with a shorter name")]
     ControlSocket { path: PathBuf, source: io::Error },
-    #[error("{path}: no run was made there; name the folder of a run")]
+    #[error("{path}: there is no run; name the folder of a run")]
     NoRun { path: PathBuf },
-    #[error("{path}: no cell runs there ({source}); `regrind audit show` tells how the run ended")]
+    #[error("{path}: no cell runs there ({source}); to see how the run ended: `regrind audit show`")]
     NotRunning { path: PathBuf, source: io::Error },
     #[error(
-        "{path}: whether a cell runs there is not known: this user may not ask it ({source}); ask as the user who runs the cell"
+        "{path}: it is unknown whether a cell runs there: this user has no permission ({source}); ask as the user of \
+         the cell"
     )]
     MayNotAsk { path: PathBuf, source: io::Error },
     #[error(
-        "{path}: the program of the cell is there and does not answer; what was asked is not carried out once it does. Its process stands \
-         still (SIGSTOP, a debugger) or the computer is overloaded. A machine that hears nothing of it holds by itself: look at both machines"
+        "{path}: the program of the cell does not answer, and will not execute this request later. Its process is \
+         stopped (SIGSTOP, a debugger), or the computer is overloaded. A machine that receives nothing from it holds \
+         by itself: check both machines"
     )]
     NoAnswer { path: PathBuf },
-    #[error("{} runs go on: name one of {}", .runs.len(), .runs.iter().map(|run| run.display().to_string()).collect::<Vec<_>>().join(", "))]
+    #[error("{} runs are active: name one of {}", .runs.len(), .runs.iter().map(|run| run.display().to_string()).collect::<Vec<_>>().join(", "))]
     SeveralRuns { runs: Vec<PathBuf> },
-    #[error("{}: the run is over, there is nothing to go on with; `regrind report` tells how it ended", .run.display())]
+    #[error("{}: the run is over and cannot continue; to see how it ended: `regrind report`", .run.display())]
     Over { run: PathBuf },
     #[error(
-        "{path}: the disk has {} MB left, and the first cycle may take {} MB; make room, or name another folder by --runs",
+        "{path}: the disk has {} MB free, and the first cycle may require {} MB; free space, or name another folder \
+         with --runs",
         .free >> 20, .needed.div_ceil(1 << 20)
     )]
     NoSpace { path: PathBuf, free: u64, needed: u64 },
     #[error(
-        "the page cannot be shown at {address}: {source}; choose another port with --listen, or 0 for any that is free"
+        "the page cannot be shown at {address}: {source}; choose another port with --listen, or 0 for any free port"
     )]
     Page { address: SocketAddr, source: io::Error },
     #[error(
-        "{address} is open to other computers; give the page a certificate (--certificate FILE --key FILE) and users (--users FILE), or \
-         show it at 127.0.0.1 and reach it from elsewhere through a tunnel: ssh -L 7373:127.0.0.1:7373 CELL"
+        "{address} is open to other computers; give the page a certificate (--certificate FILE --key FILE) and users \
+         (--users FILE), or show it at 127.0.0.1 and use a tunnel from other computers: ssh -L 7373:127.0.0.1:7373 \
+         CELL"
     )]
     ForOthers { address: SocketAddr },
     #[error(transparent)]
@@ -131,7 +138,10 @@ pub(super) enum Failure {
     #[error("{why}")]
     OpenWork { why: String },
     #[cfg(feature = "plant")]
-    #[error("{}: it cannot be read: {source}; check that it is there, and yours to read", .path.display())]
+    #[error(
+        "{}: it cannot be read: {source}; check that it exists, and that you have the right to read it",
+        .path.display()
+    )]
     Unreadable { path: PathBuf, source: io::Error },
     #[cfg(feature = "plant")]
     #[error(transparent)]
@@ -139,39 +149,43 @@ pub(super) enum Failure {
     #[cfg(feature = "plant")]
     #[error(transparent)]
     Live(#[from] regrind_live::LiveError),
-    #[error("{}: there is no user {name:?}; `regrind users list` tells who is there", .path.display())]
+    #[error("{}: there is no user {name:?}; to see all users: `regrind users list`", .path.display())]
     NoUser { name: String, path: PathBuf },
-    #[error("the two passwords are not alike; nothing was changed")]
+    #[error("the two passwords differ; nothing was changed")]
     NotAlike,
     #[error(
-        "{}: the end of its record may be lost: {what}. A machine may be at a job that the record does not know, so the run is not gone on with: look at \
-         both machines, bring them home by `regrind recover` and begin a new run; or go on by `regrind resume --despite-loss`",
+        "{}: the end of its record may be lost: {what}. A machine may have a job that is not on record, so the run \
+         is not resumed: check both machines, bring them home with `regrind recover` and begin a new run; or \
+         continue with `regrind resume --despite-loss`",
         .run.display()
     )]
     MayBeLost { run: PathBuf, what: String },
-    #[error("{}: its program ended before anything was asked of a machine; begin a new run", .run.display())]
+    #[error("{}: its program ended before its first request to a machine; begin a new run", .run.display())]
     NotBegun { run: PathBuf },
     #[error(
-        "{}: a rehearsal is played at machines that people serve, and a wire reaches one of this cell; write `simulated = true` into the cell file and \
-         simulate it, or leave --rehearsal out",
+        "{}: a rehearsal requires machines that people operate, and this cell has a machine on a wire; write \
+         `simulated = true` into the cell file and simulate it, or remove --rehearsal",
         .cell.display()
     )]
     NoRehearsal { cell: PathBuf },
-    #[error("{}: its simulated machines ended with the program that ran it; begin a new run", .run.display())]
+    #[error("{}: its simulated machines ended with its program; begin a new run", .run.display())]
     WorldGone { run: PathBuf },
     #[error(
-        "{}: it was begun by regrind {program}, and this program cannot go on with it ({what}); go on with that one, or bring the machines home \
-         by `regrind recover` and begin a new run",
+        "{}: regrind {program} began it, and this program cannot resume it ({what}); resume it with that version, or \
+         bring the machines home with `regrind recover` and begin a new run",
         .run.display()
     )]
     EarlierRun { run: PathBuf, program: String, what: String },
-    #[error("{}: {what} is not what the run began with; put back the files that the recipe and the cell file name", .run.display())]
+    #[error(
+        "{}: {what} changed since the begin of the run; restore the files that the recipe and the cell file name",
+        .run.display()
+    )]
     OtherTask { run: PathBuf, what: &'static str },
-    #[error("the port of the {device} cannot be had: {source}")]
+    #[error("the port of the {device} is not available: {source}")]
     Port { device: regrind::cell::Device, source: io::Error },
     #[error("{device}: {source}")]
     Recover { device: regrind::cell::Device, source: regrind::drive::recover::RecoverError },
-    #[error("not both machines are known to be idle; begin again, or see to the one that tells nothing over a wire")]
+    #[error("it is unknown whether both machines are idle; begin again, or check the machine without a wire")]
     NotHome,
     #[error(transparent)]
     Learned(regrind::formats::LearnedError),
@@ -179,30 +193,30 @@ pub(super) enum Failure {
     Replay(regrind::drive::ReplayError),
     #[error("the order is not acknowledged: {message}")]
     OrderRefused { message: String },
-    #[error("`confirm over` needs --machine and --evidence: which machine was looked at, and what was seen")]
+    #[error("`confirm over` requires --machine and --evidence: the machine that you checked, and your finding")]
     Evidence,
-    #[error("--map is too short: the first 8 digits, or more, of the map at the grinder, as in correction.json")]
+    #[error("--map is too short: give at least the first 8 digits of the map at the grinder, as in correction.json")]
     ShortMap,
-    #[error("`confirm clear` needs --machine: which machine was looked at")]
+    #[error("`confirm clear` requires --machine: the machine that you checked")]
     NoMachine,
-    #[error("{path} is there already; choose another folder, or move it away")]
+    #[error("{path} already exists; choose another folder, or move it away")]
     IsThere { path: PathBuf },
     #[error("no model of the error: {0}")]
     NoModel(regrind::model::ModelError),
-    #[error("no folder to make is named; give it as in: regrind init mirrors --machines modbus-tcp")]
+    #[error("the folder to create is missing; give it as in: regrind init mirrors --machines modbus-tcp")]
     NoFolder,
-    #[error("{path}: {source}; --runs names the folder of the runs")]
+    #[error("{path}: {source}; give the folder of the runs with --runs")]
     NoRuns { path: PathBuf, source: std::io::Error },
     #[error("{path} cannot be found: {source}; name the file of the measurement")]
     NoFile { path: PathBuf, source: std::io::Error },
-    #[error("the run did not come to its end: {reason}")]
+    #[error("the run did not finish: {reason}")]
     Ended { reason: String },
-    #[error("the result cannot be told: {what} is not a finite number; please report it with the files that led to it")]
+    #[error("the result cannot be given: {what} is not a finite number; report it with the files that led to it")]
     NotFinite { what: &'static str },
     /// The input was valid and the place was writable before, but writing failed.
     #[error("the result could not be saved: {0}")]
     NotSaved(FormatError),
-    #[error("signals of the operating system cannot be heard: {0}")]
+    #[error("signals of the operating system cannot be received: {0}")]
     Signals(io::Error),
     #[error("the terminal cannot be written to: {0}")]
     Terminal(io::Error),
@@ -273,7 +287,7 @@ impl Failure {
         use RegistrationError::*;
         let hint = match source {
             DoesNotFit { .. } => " (--max-rms)",
-            NotConverged { .. } => " (--initial), or hold the directions that the part does not tell (--lock)",
+            NotConverged { .. } => " (--initial), or lock the directions that the part does not determine (--lock)",
             TooFewUsed { .. } => " (--initial)",
             WrongSide { .. } => " (--side)",
             Undetermined => " (--lock)",

@@ -234,10 +234,10 @@ impl Begun {
             return differs("the nominal surface");
         }
         if task.setting != self.setting {
-            return differs("how the part is ground, measured and corrected");
+            return differs("the setting of grinding, measuring and correction");
         }
         if serde_json::to_value(&plan).ok().as_ref() != Some(&self.plan) {
-            return differs("what the cell decides by");
+            return differs("the plan of the cell");
         }
         Ok((task, plan))
     }

@@ -75,8 +75,8 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
     // A simulated machine beside one that a person serves is a rehearsal. With both served by people nothing is
     // simulated.
     if simulated == Some(true) && machines.iter().all(|m| m.wire.is_some_and(Wire::is_by_person)) {
-        let found = "is true, and both machines are reached by files or served by hand";
-        document.report("cell.simulated", found, "nobody simulates a person", "write `simulated = false`");
+        let found = "is true, and both machines are connected by files or operated by hand";
+        document.report("cell.simulated", found, "a person cannot be simulated", "write `simulated = false`");
     }
     let [cmm_link, grinder_link] = machines.map(|machine| machine.link(simulated, document));
     if let (Some(cmm), Some(grinder)) = (&cmm_link, &grinder_link) {
@@ -124,13 +124,8 @@ impl Machine<'_> {
         if !wire.has_registers() {
             let idle = [("registers", self.registers.is_some()), ("signals", !self.signals.is_empty())];
             for (table, _) in idle.iter().filter(|(_, there)| *there) {
-                let found = "stands beside a wire that has no registers";
-                document.report(
-                    &self.key(table),
-                    found,
-                    "it would be read by nobody",
-                    "leave it out, or change the wire",
-                );
+                let found = "is set for a wire that has no registers";
+                document.report(&self.key(table), found, "it would have no effect", "remove it, or change the wire");
             }
         }
         let expected_name = self.expected_name.cloned();
@@ -149,7 +144,7 @@ impl Machine<'_> {
                     u64::from(written.retries) + 1,
                     written.request_timeout_ms
                 ),
-                "a machine cannot be lost before every try has failed",
+                "it must cover every try",
                 "raise it, or lower `request_timeout_ms` or `retries`",
             );
         }
@@ -158,7 +153,7 @@ impl Machine<'_> {
                 document.report(
                     &self.key(&format!("timing.{name}")),
                     format!("is {ms} ms, more than half of `lost_after_ms`, {} ms", written.lost_after_ms),
-                    "one that comes late must not mean that the machine is lost",
+                    "one late poll or heartbeat must not count as a lost machine",
                     "lower it, or raise `lost_after_ms`",
                 );
             }
@@ -190,12 +185,12 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
     // LinuxCNC reads only its own dialect and frame.
     if matches!(grinder.wire, Some(Wire::Linuxcnc(_))) {
         if written.dialect != LINUXCNC {
-            let found = format!("is {:?} beside LinuxCNC", written.dialect);
-            document.report("grinder.program.dialect", found, "it reads its own alone", "leave it out");
+            let found = format!("is {:?} for LinuxCNC", written.dialect);
+            document.report("grinder.program.dialect", found, "LinuxCNC reads only its own dialect", "remove it");
         }
         if written.folder.is_some() {
-            let found = "stands beside a wire that brings the program";
-            document.report("grinder.program.folder", found, "the wire has a folder of its own", "leave it out");
+            let found = "is set for a wire that transfers the program";
+            document.report("grinder.program.folder", found, "the wire has its own folder", "remove it");
         }
     }
     let dialect = match dialect::read(&written.dialect, path) {
@@ -205,8 +200,8 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
             let file = dialect::file_of(&written.dialect, path).unwrap_or_default();
             let found =
                 format!("is {:?}: {}", written.dialect, problems.to_string().lines().next().unwrap_or_default());
-            let remedy = format!("name one of these, or correct it: regrind check {}", file.display());
-            let allowed = format!("it must be {known} or a good file");
+            let remedy = format!("name one of these, or correct the file: regrind check {}", file.display());
+            let allowed = format!("it must be {known} or a valid file");
             document.report("grinder.program.dialect", found, &allowed, &remedy);
             return None;
         }
@@ -215,15 +210,15 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
     match arcs_within_mm.map(|mm| dialect.arcs(mm)) {
         Some(Err(DialectError::NoArcs { dialect })) => document.report(
             "grinder.program.arcs_within_um",
-            format!("stands beside the dialect `{dialect}`, which has no words for arcs"),
-            "arcs are written by the words of [arcs] in a dialect",
-            "leave it out, or write [arcs] into a dialect of your own",
+            format!("is set for the dialect `{dialect}`, which has no words for arcs"),
+            "arcs require [arcs] in the dialect",
+            "remove it, or write [arcs] into a dialect of your own",
         ),
         Some(Err(DialectError::ArcsFine { dialect, found_um, decimals, least_um })) => document.report(
             "grinder.program.arcs_within_um",
-            format!("is {found_um}"),
-            &format!("the {decimals} decimals of the dialect `{dialect}` move points by up to {least_um:.4} um"),
-            "allow more, or have the control read more decimals and write them into a dialect of your own",
+            format!("is {found_um} µm"),
+            &format!("the {decimals} decimals of the dialect `{dialect}` move points by up to {least_um:.4} µm"),
+            "raise it, or write more decimals into a dialect of your own if the control reads them",
         ),
         _ => {}
     }
@@ -272,8 +267,13 @@ fn travel(written: &TravelTable, machine: &str, document: &mut Document) -> Opti
     let (least_mm, most_mm) = (written.min_mm?, written.max_mm?);
     for (k, axis) in ["x", "y", "z"].into_iter().enumerate() {
         if least_mm[k] >= most_mm[k] {
-            let found = format!("is {} in {axis}, `max_mm` is {}", least_mm[k], most_mm[k]);
-            document.report(&format!("{machine}.travel.min_mm"), found, "it must be less", "are the two interchanged?");
+            let found = format!("is {} mm in {axis}, and `max_mm` is {} mm", least_mm[k], most_mm[k]);
+            document.report(
+                &format!("{machine}.travel.min_mm"),
+                found,
+                "it must be less than `max_mm`",
+                "check whether the two are swapped",
+            );
         }
     }
     Some(Travel { least_mm, most_mm })
@@ -284,17 +284,17 @@ fn rotary(written: &RotaryTable, document: &mut Document) -> Option<Rotary> {
         document.report(
             "grinder.rotary.turns",
             "is \"table\"",
-            "programs tilt the wheel by its head, and no part by its table",
-            "leave the table [grinder.rotary] out: the wheel then stays upright",
+            "programs tilt the wheel with its head, not the part with its table",
+            "remove the table [grinder.rotary]: the wheel then stays upright",
         );
     }
     let (letter, range_deg) = (written.axis?, [written.min_deg?, written.max_deg?]);
     if range_deg[0] >= range_deg[1] {
         document.report(
             "grinder.rotary.min_deg",
-            format!("is {}, `max_deg` is {}", range_deg[0], range_deg[1]),
-            "it must be less",
-            "are the two interchanged?",
+            format!("is {}°, and `max_deg` is {}°", range_deg[0], range_deg[1]),
+            "it must be less than `max_deg`",
+            "check whether the two are swapped",
         );
     }
     let max_rate_deg_min = written.max_rate_deg_min?;
@@ -308,8 +308,8 @@ fn limits(grinder: &GrinderTable, document: &mut Document) -> Option<GrinderLimi
         document.report(
             "grinder.limits.min_wheel_radius_mm",
             format!("is {} mm, more than `max_wheel_radius_mm`, {} mm", wheel_radius_mm[0], wheel_radius_mm[1]),
-            "no wheel would fit",
-            "are the two interchanged?",
+            "no wheel can fit",
+            "check whether the two are swapped",
         );
     }
     Some(GrinderLimits {

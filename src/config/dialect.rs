@@ -67,7 +67,8 @@ pub fn parse_dialect(path: &Path, text: &str) -> Result<(Dialect, [u8; 32]), Pro
         }
     }
     document.finish()?;
-    let missing = || Problems::whole(path, text, "something is missing".into(), "compare it with a shipped dialect");
+    let missing =
+        || Problems::whole(path, text, "a required value is missing".into(), "compare it with a shipped dialect");
     Ok((written.ok_or_else(missing)?, sha256(text)))
 }
 

@@ -229,7 +229,7 @@ impl CellConfig {
         document.finish()?;
         let cell = checked.and_then(|checked| checked.into_cell(path, text, renamed));
         cell.ok_or_else(|| {
-            Problems::whole(path, text, "something is missing".into(), "compare it with config/sim.toml")
+            Problems::whole(path, text, "a required value is missing".into(), "compare it with config/sim.toml")
         })
     }
 

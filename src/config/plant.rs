@@ -114,7 +114,7 @@ impl PlantConfig {
         });
         document.finish()?;
         found.ok_or_else(|| {
-            Problems::whole(path, text, "something is missing".into(), "compare it with config/plant/plant.toml")
+            Problems::whole(path, text, "a required value is missing".into(), "compare it with config/plant/plant.toml")
         })
     }
 

@@ -9,12 +9,13 @@ use regrind_core::geometry::{Point, Vector, fit_rigid};
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum PlanMismatch {
     /// The points equal the points of the plan.
-    #[error("it is the plan itself, to its last digit, and no measurement; export what was measured")]
+    #[error("it is identical to the plan and not a measurement; export the measured points")]
     EqualsPlan,
     /// Points that are too far from their targets, for every pose of the part in its fixture.
     #[error(
-        "touched point {number} lies {distance_mm:.3} mm from its target when all are laid on the plan, turned by {rotation_deg:.1} degrees; at most {limit_mm:.1} mm \
-         and {MAX_ROTATION_DEG:.0} degrees can be: are the rows in the order of the plan, and is it the plan of this part?"
+        "touched point {number} lies {distance_mm:.3} mm from its target after the fit of all points to the plan, \
+         which turns them by {rotation_deg:.1}°; the limits are {limit_mm:.1} mm and {MAX_ROTATION_DEG:.0}°: check \
+         that the rows are in the order of the plan, and that it is the plan of this part"
     )]
     OffTarget {
         /// Position of the worst point among the touched points of the part, from 1.

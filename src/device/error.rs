@@ -20,7 +20,8 @@ pub enum DeviceError {
     // ----------------------------------------------------------------------------------------------------
     /// There is no connection, and none could be made within the time limit.
     #[error(
-        "{machine} cannot be reached ({}) within {} ms: check that it is switched on, its cable, and address and port in the cell file",
+        "{machine} cannot be reached ({}) within {} ms: check its power and its cable, and address and port in the \
+         cell file",
         kind_in_words(*.kind), .limit.as_millis()
     )]
     Unreachable { machine: Arc<str>, kind: std::io::ErrorKind, limit: Duration },
@@ -33,62 +34,67 @@ pub enum DeviceError {
     TimedOut { machine: Arc<str>, operation: &'static str, limit: Duration },
     /// The machine, or a device between, closed the connection.
     #[error(
-        "{machine} closed the connection ({operation}): another client may have taken its only place, or it was restarted"
+        "{machine} closed the connection ({operation}): another client may use its only connection, or it was \
+         restarted"
     )]
     Disconnected { machine: Arc<str>, operation: &'static str },
     /// The received data are inconsistent: wrong length, echo, checksum or page.
     #[error(
-        "{machine} sent a {data} that does not hold: expected {expected:#x}, found {found:#x}; nothing of it was used. If it happens \
-         again check cable, shielding and end resistors, and that no second client is on the line"
+        "{machine} sent an inconsistent {data}: expected {expected:#x}, found {found:#x}; it was not used. If this \
+         repeats, check cable, shielding and terminating resistors, and that no second client is on the line"
     )]
     Corrupt { machine: Arc<str>, data: &'static str, expected: u64, found: u64 },
     /// The connection works, but the machine's application has stopped.
     #[error(
-        "{machine} answers, but its application stands: its beat has been {beat} for {} ms (limit {} ms). Look at the machine; what it \
-         says cannot be relied on",
+        "{machine} answers, but its application has stopped: its beat has been {beat} for {} ms (limit {} ms). Check \
+         the machine; do not rely on its values",
         .unchanged_for.as_millis(), .limit.as_millis()
     )]
     Frozen { machine: Arc<str>, beat: u16, unchanged_for: Duration, limit: Duration },
     /// A command was written several times and never acknowledged. The driver knows that the machine did not act upon
     /// it later.
     #[error(
-        "{machine} did not acknowledge {command} number {sequence} (its last is {acknowledged}) after {tries} tries: its application may \
-         stand, or its program does not follow docs/modbus.md"
+        "{machine} did not acknowledge {command} number {sequence} (its last is {acknowledged}) after {tries} tries: \
+         its application may have stopped, or its program does not follow docs/modbus.md"
     )]
     NotAcknowledged { machine: Arc<str>, command: Command, sequence: u32, acknowledged: u32, tries: u32 },
     /// It is unknown whether the job was begun. The start is never repeated; see
     /// [`Machine::reconcile`](super::Machine::reconcile).
     #[error(
-        "{machine}: it is not known whether {job} was begun by START number {sequence} ({cause}). It is not sent again; the machine has to \
-         be asked, or looked at"
+        "{machine}: it is unknown whether START number {sequence} began {job} ({cause}). START is not sent again; \
+         ask the machine, or check it"
     )]
     StartUnknown { machine: Arc<str>, job: Job, sequence: u32, cause: Box<DeviceError> },
     /// The transfer was interrupted by its [`Interrupt`](super::Interrupt).
     #[error(
-        "{machine}: the transfer of the {payload} was broken off after {done} of {total} pages, as asked; nothing of it is in force"
+        "{machine}: the transfer of the {payload} was interrupted on request after {done} of {total} pages; nothing \
+         of it is in force"
     )]
     Interrupted { machine: Arc<str>, payload: &'static str, done: u32, total: u32 },
     /// The driver was used before [`Machine::connect`](super::Machine::connect).
-    #[error("{machine} was asked ({operation}) before it was connected")]
+    #[error("{machine} was used ({operation}) before it was connected")]
     NotConnected { machine: Arc<str>, operation: &'static str },
 
     /// The machine is of the right kind, but it is not the one that the cell file names.
     #[error(
-        "{machine} calls itself {found:?}, and the cell file expects {expected:?}: check address and port, or correct expected_name"
+        "{machine} has the name {found:?}, and the cell file expects {expected:?}: check address and port, or \
+         correct expected_name"
     )]
     WrongName { machine: Arc<str>, expected: String, found: String },
     /// The machine is a simulation and the cell file has a real machine, or the reverse.
     #[error(
-        "{machine} says that it is {}, and the cell file says simulated = {}: nothing was sent to it. Check address and port, or correct \
-         cell.simulated",
+        "{machine} reports that it is {}, and the cell file has simulated = {}: nothing was sent to it. Check \
+         address and port, or correct cell.simulated",
         if *.simulation { "a simulation" } else { "a real machine" }, !.simulation
     )]
     SimulationMismatch { machine: Arc<str>, simulation: bool },
     /// An operator confirmation was given for a machine that needs none.
-    #[error("{machine} tells itself when a job begins and ends; nothing is confirmed by hand")]
+    #[error("{machine} reports the begin and the end of a job itself; no confirmation is required")]
     ConfirmationNotNeeded { machine: Arc<str> },
     /// An operator confirmation did not name the map with which the machine works.
-    #[error("{machine} takes a word only with the map that it is about: --map and the first 8 digits of it, or more")]
+    #[error(
+        "{machine} accepts a confirmation only with its map: give --map with at least the first 8 digits of the map"
+    )]
     MapNotNamed { machine: Arc<str> },
     /// A file that the operator named is not the requested measurement, or it could not be stored.
     #[error("{machine}: {reason}")]
@@ -96,17 +102,21 @@ pub enum DeviceError {
 
     /// The machine sent a line that has no meaning, or that belongs to no request.
     #[error(
-        "{machine} sent a line that cannot be used ({reason}): {line:?}; nothing of it was used and the connection was given up. If it happens \
-         again compare the server's version of I++ DME with docs/ippdme.md"
+        "{machine} sent a line that cannot be used ({reason}): {line:?}; it was not used, and the connection was \
+         closed. If this repeats, compare the server's version of I++ DME with docs/ippdme.md"
     )]
     Unreadable { machine: Arc<str>, line: String, reason: &'static str },
 
     /// A line to send would not be one plain line of the protocol of the machine.
-    #[error("{machine}: {operation} would hold what is no plain character, and was not sent: correct the cell file")]
+    #[error(
+        "{machine}: {operation} would contain a character that is not plain text, and was not sent: correct the cell \
+         file"
+    )]
     Unsendable { machine: Arc<str>, operation: &'static str },
     /// Another client has taken control; the machine does not say which client.
     #[error(
-        "{machine} is controlled by another client now: find out who commands it, and have that one let it go. It is not taken back but by an          abort, or by a run that is taken up again"
+        "{machine} is now controlled by another client: find that client, and let it release the machine. Only an \
+         abort, or a run that is resumed, takes control back"
     )]
     ControlTaken { machine: Arc<str> },
 
@@ -127,14 +137,15 @@ pub enum DeviceError {
     PayloadRefused { machine: Arc<str>, payload: &'static str, answer: Answer },
     /// The machine answered with a Modbus exception. Addresses count from 0.
     #[error(
-        "{machine} is there and answered exception {code} ({}) to {operation} at register {address}: {}",
+        "{machine} answered exception {code} ({}) to {operation} at register {address}: {}",
         exception_in_words(*.code), exception_remedy(*.code)
     )]
     Exception { machine: Arc<str>, operation: &'static str, address: u16, code: u8 },
     /// The device that answers is not a machine of this kind. The register at this address, counted from 0, shows it.
     #[error(
-        "{machine} is not a {expected} of a Regrind cell: register {address} holds {found:#06x}, {required:#06x} was expected. Check \
-         address, port and unit number in the cell file, and the base of the identity block; nothing was written to it"
+        "{machine} is not a {expected} of a Regrind cell: register {address} has {found:#06x}, expected \
+         {required:#06x}. Check address, port and unit number in the cell file, and the base of the identity block; \
+         nothing was written to it"
     )]
     WrongDevice { machine: Arc<str>, expected: MachineKind, address: u16, required: u16, found: u16 },
     /// The identity block of the map has a wrong layout: exchanged bytes, or addresses off by one.
@@ -142,39 +153,51 @@ pub enum DeviceError {
     WrongLayout { machine: Arc<str>, description: std::borrow::Cow<'static, str> },
     /// The cell file names one kind of machine, and this is the other kind.
     #[error(
-        "{machine} is a {found}, and the cell file has it as the {expected}: the two addresses may be exchanged; nothing was written to it"
+        "{machine} is a {found}, and the cell file has it as the {expected}: check whether the two addresses are \
+         swapped; nothing was written to it"
     )]
     WrongKind { machine: Arc<str>, expected: MachineKind, found: MachineKind },
     /// The sentinels are correct in the other word order, or in none.
     #[error(
-        "{machine} sends its words in another order than the cell file says (word_order = \"{configured}\"): {}; nothing was written to it",
+        "{machine} sends its words in another order than the cell file has (word_order = \"{configured}\"): {}; \
+         nothing was written to it",
         match .matching { Some(order) => format!("write word_order = \"{order}\""), None => "neither \"big\" nor \"little\" fits its sentinels".into() }
     )]
     WrongWordOrder { machine: Arc<str>, configured: &'static str, matching: Option<&'static str> },
     /// The machine uses another version of the map.
-    #[error("{machine} speaks version {found} of the register map, this program version {required}: {}; nothing was written to it", version_in_words(*.found, *.required))]
+    #[error(
+        "{machine} has version {found} of the register map, this program has version {required}: {}; nothing was \
+         written to it",
+        version_in_words(*.found, *.required)
+    )]
     WrongVersion { machine: Arc<str>, required: u16, found: u16 },
     /// Another client than this one owns the machine, or no client does (0).
     #[error(
         "{machine} belongs to {}",
         match .owner {
-            0 => "nobody now: it has forgotten its client, as after a restart of its application; look at the machine before it goes on".to_owned(),
-            owner => format!("another client now (owner {owner:08x}, this client is {ours:08x}): find out who commands it; one of the two must let it go"),
+            0 => "no client now: it has lost its client, as after a restart of its application; check the machine \
+                  before it continues".to_owned(),
+            owner => format!("another client now (owner {owner:08x}, this client is {ours:08x}): find that client; \
+                              one of the two must release the machine"),
         }
     )]
     OwnedByOther { machine: Arc<str>, ours: u32, owner: u32 },
     /// The machine works in inches (unit code 2), or gives no known unit (1 is mm).
-    #[error("{machine} gives lengths in {}, and this program takes millimetres only: set the machine to millimetres", if *.unit == 2 { "inches" } else { "an unknown unit" })]
+    #[error(
+        "{machine} gives lengths in {}, and this program accepts only mm: set the machine to mm",
+        if *.unit == 2 { "inches" } else { "an unknown unit" }
+    )]
     WrongLengthUnit { machine: Arc<str>, unit: u16 },
     /// The machine was restarted without our knowledge.
     #[error(
-        "{machine} was restarted (boot id {old_boot_id:08x}, now {new_boot_id:08x}): what it was doing is not known; look at the machine, then connect anew"
+        "{machine} was restarted (boot id {old_boot_id:08x}, now {new_boot_id:08x}): its last action is unknown; \
+         check the machine, then connect again"
     )]
     Restarted { machine: Arc<str>, old_boot_id: u32, new_boot_id: u32 },
     /// A received value is not a finite number.
     #[error(
-        "{machine}: {field} is {value}, which is not a finite number; refused. The machine's program has not filled it in, or has put its words \
-         in another order than the one of its sentinels (docs/modbus.md)"
+        "{machine}: {field} is {value}, which is not a finite number; it was rejected. The machine's program has not \
+         set it, or its word order differs from that of its sentinels (docs/modbus.md)"
     )]
     NotFinite { machine: Arc<str>, field: String, value: f64 },
     /// A received value is outside its possible range.
@@ -183,47 +206,49 @@ pub enum DeviceError {
     )]
     OutOfRange { machine: Arc<str>, field: String, value: f64, min: f64, max: f64, unit: String },
     /// A received code is not in the contract.
-    #[error(
-        "{machine}: {field} is {found}, which docs/modbus.md does not list: the machine's program does not follow it"
-    )]
+    #[error("{machine}: {field} is {found}, which docs/modbus.md does not list: correct the machine's program")]
     Unlisted { machine: Arc<str>, field: &'static str, found: u32 },
     /// The number of elements is not the expected one.
-    #[error("{machine}: {found} {elements}, {expected} were expected; nothing of it was used")]
+    #[error("{machine}: {found} {elements}, expected {expected}; they were not used")]
     WrongCount { machine: Arc<str>, elements: &'static str, expected: u64, found: u64 },
     /// The machine holds something else than was sent, or something of another job.
     #[error(
-        "{machine}: {field} is {found:#x} at the machine, {sent:#x} here: it would work on something else than was meant. Load it again"
+        "{machine}: {field} is {found:#x} at the machine and {sent:#x} here: the machine would use other data. Load \
+         it again"
     )]
     Mismatch { machine: Arc<str>, field: &'static str, sent: u64, found: u64 },
     /// A result was requested, but there is none.
     #[error(
-        "{machine} is in {state} and has no finished result of {job}: a result stands from COMPLETE until it is acknowledged"
+        "{machine} is in {state} and has no finished result of {job}: a result is available from COMPLETE until it \
+         is acknowledged"
     )]
     NoResult { machine: Arc<str>, job: Job, state: State },
     /// An I++ DME server refused a method with an error number.
-    #[error("{machine} refused {method} with {error}; look at the machine's own panel, then clear")]
+    #[error("{machine} refused {method} with {error}; check the machine's own panel, then clear")]
     MethodRefused { machine: Arc<str>, method: &'static str, error: crate::ippdme::ServerError },
     /// An I++ DME server did not return the requested value.
-    #[error("{machine} was asked {method} and did not tell {missing}: nothing is taken in its place")]
+    #[error("{machine} answered {method} without {missing}: no other value is used instead")]
     ValueMissing { machine: Arc<str>, method: &'static str, missing: &'static str },
     /// An I++ DME server does not know the tool that the cell file names.
     #[error("{machine} has no tool {tool:?}; it has {known}: correct cmm.wire.tool")]
     NoTool { machine: Arc<str>, tool: String, known: String },
     /// The probe of the machine is not the probe of the plan.
     #[error(
-        "{machine} says that the tool {tool:?} has a radius of {reported_mm} mm, the plan is made for {plan_mm} mm; they may differ by {limit_mm} mm: \
-         qualify the probe, or correct the tool in the cell file or the radius in the recipe"
+        "{machine} reports a radius of {reported_mm} mm for the tool {tool:?}; the plan has {plan_mm} mm, and the \
+         limit of the difference is {limit_mm} mm: qualify the probe, or correct the tool in the cell file or the \
+         radius in the recipe"
     )]
     ProbeRadius { machine: Arc<str>, tool: String, reported_mm: f64, plan_mm: f64, limit_mm: f64 },
     /// A property was set, but another value is in force.
     #[error(
-        "{machine} was told to keep {property} at {requested} and says that it is {in_force}: correct the recipe or the cell file"
+        "{machine} was set to {property} = {requested} and reports {in_force}: correct the recipe or the cell file"
     )]
     NotSet { machine: Arc<str>, property: String, requested: f64, in_force: f64 },
     /// A plan moves the probe out of the volume of the machine. This is checked before anything moves.
     #[error(
-        "{machine}: the {motion} target {target} leads the probe's centre to {axis} = {value_mm} mm, and [cmm.travel] allows {min_mm} to {max_mm} \
-         mm; nothing was moved. Move the part in [cmm.fixture], lower measure.safe_height_mm, or correct [cmm.travel]"
+        "{machine}: the {motion} target {target} would move the probe's centre to {axis} = {value_mm} mm; \
+         [cmm.travel] allows {min_mm} to {max_mm} mm; nothing was moved. Move the part in [cmm.fixture], lower \
+         measure.safe_height_mm, or correct [cmm.travel]"
     )]
     OutOfVolume {
         machine: Arc<str>,
@@ -236,7 +261,8 @@ pub enum DeviceError {
     },
     /// A controller does not answer as linuxcncrsh does.
     #[error(
-        "{machine} does not answer as linuxcncrsh does: {reply:?} to {request}; nothing but questions was sent. Check host and port in the cell file"
+        "{machine} does not answer like linuxcncrsh: {reply:?} to {request}; only queries were sent. Check host and \
+         port in the cell file"
     )]
     NotLinuxcnc { machine: Arc<str>, request: &'static str, reply: String },
     /// A controller refused a password.
@@ -249,7 +275,7 @@ pub enum DeviceError {
     #[error("{machine} reports, when {occasion}: {errors}")]
     ControllerErrors { machine: Arc<str>, occasion: &'static str, errors: String },
     /// The driver was given a payload that no machine could accept.
-    #[error("{machine}: the {payload} cannot be sent: {field} is {value}, allowed is {limit}")]
+    #[error("{machine}: the {payload} cannot be sent: {field} is {value}; it must be {limit}")]
     BadPayload { machine: Arc<str>, payload: &'static str, field: String, value: f64, limit: &'static str },
 }
 
@@ -287,18 +313,17 @@ impl DeviceError {
 /// Returns in words which functions a machine of another version lacks, and how to correct it.
 fn version_in_words(found: u16, required: u16) -> String {
     if found > required {
-        return "this program is the older one: bring it up to date, for what the newer map means is not known here"
-            .to_owned();
+        return "this program is older and does not know the newer map: update this program".to_owned();
     }
     let lacks = [
-        "a beat that names its owner, so that a stranger's beat keeps it moving",
+        "a beat that names its owner, so the beat of another client keeps it moving",
         "a CLAIM with a higher number that makes it refuse a late START",
-        "an ABORT that it takes from anyone, whatever its number",
-        "a `done` that outlives CLEAR and names the START that ended",
-        "a plan that begins slowly where the part may lie elsewhere",
+        "an ABORT that it accepts from any client with any number",
+        "a `done` that remains after CLEAR and names the START that ended",
+        "a plan that begins slowly where the part may be displaced",
     ];
     format!(
-        "the machine's program lacks {}; bring it up to version {required} (docs/modbus.md, \"What version 2 changed\")",
+        "the machine's program lacks {}; update it to version {required} (docs/modbus.md, \"What version 2 changed\")",
         lacks.join("; ")
     )
 }
@@ -314,22 +339,22 @@ fn exception_remedy(code: u8) -> &'static str {
             "compare the register map of the cell file with the machine's: its base addresses, which count from 0 (40001 is register 0), and \
              the version that the machine's program follows (docs/modbus.md)"
         }
-        10 | 11 => "look at the gateway, and compare the unit number in the cell file",
-        _ => "look at the machine",
+        10 | 11 => "check the gateway, and the unit number in the cell file",
+        _ => "check the machine",
     }
 }
 
 fn exception_in_words(code: u8) -> &'static str {
     match code {
         1 => "unknown function",
-        2 => "no such register, or not to be written",
+        2 => "unknown or read-only register",
         3 => "content refused",
         4 => "failure of the device",
         5 => "accepted, not finished",
         6 => "busy",
         8 => "memory parity error",
         10 => "gateway: no path",
-        11 => "gateway: the device behind it does not answer",
+        11 => "gateway: its device does not answer",
         _ => "not in the standard",
     }
 }

@@ -177,11 +177,11 @@ mod tests {
         };
         let (kept_c, kept, flaw) = flaws(Some(327.67), (3, 7));
         assert_eq!((kept_c, kept), (None, Some((3, 7))));
-        assert_eq!(flaw, "the temperature is 327.67 degrees Celsius, and -40 to 120 degrees Celsius are wanted");
+        assert_eq!(flaw, "the temperature is 327.67 degrees Celsius, limits -40 to 120 degrees Celsius");
         let (kept_c, kept, flaw) = flaws(Some(20.0), (549, 1));
         assert_eq!((kept_c, kept), (Some(20.0), None));
-        assert_eq!(flaw, "its progress is 549 of its job, and 0 to 1 of its job are wanted");
-        assert_eq!(flaws(Some(f64::NAN), (1, 0)).2.matches("are wanted").count(), 2);
+        assert_eq!(flaw, "its progress is 549 of its job, limits 0 to 1 of its job");
+        assert_eq!(flaws(Some(f64::NAN), (1, 0)).2.matches(", limits").count(), 2);
         assert!(
             check_count_scale(&machine, 1e-6).is_ok()
                 && check_count_scale(&machine, 0.0).is_err()

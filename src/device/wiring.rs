@@ -145,7 +145,8 @@ pub trait DriverFactory {
 pub enum DriverError {
     /// A required folder does not exist.
     #[error(
-        "{key}: the folder {path} is not there; make it where the {machine} finds it (mkdir -p {path}), or correct the cell file"
+        "{key}: the folder {path} does not exist; create it where the {machine} finds it (mkdir -p {path}), or \
+         correct the cell file"
     )]
     Folder { key: String, path: PathBuf, machine: MachineKind },
     /// The file of reference points is not valid.
@@ -156,7 +157,8 @@ pub enum DriverError {
     NoPort { missing: String },
     /// The positions of the machine must be checked against its volume, but the cell file gives no volume.
     #[error(
-        "cmm.travel is missing: every position is held against it before {machine} moves; add the box that its probe must not leave"
+        "cmm.travel is missing: every position is checked against it before {machine} moves; add the box that its \
+         probe must not leave"
     )]
     NoVolume { machine: String },
     /// This wire has no driver for this machine.

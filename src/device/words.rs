@@ -298,15 +298,15 @@ impl fmt::Display for Answer {
             }
             Self::WrongState => "the machine does not allow it in its present state",
             Self::UnknownCommand => "the machine does not know the command: compare its program with docs/modbus.md",
-            Self::DeadToken => "the token of the prepared job is dead (30 s passed, or an interlock opened): prepare again",
-            Self::OtherJob => "job, cycle or payloads are not those that were prepared: load and prepare again",
-            Self::AlreadyBegun => "this job and cycle were begun before and are never begun twice",
-            Self::PayloadMissing => "a payload is missing, broken, or made for another part: load it again, check the part",
+            Self::DeadToken => "the token of the prepared job has expired (30 s passed, or an interlock opened): prepare again",
+            Self::OtherJob => "job, cycle or payloads differ from those that were prepared: load and prepare again",
+            Self::AlreadyBegun => "this job and cycle were already begun and are never begun twice",
+            Self::PayloadMissing => "a payload is missing, damaged, or for another part: load it again, and check the part",
             Self::InterlockOpen => {
                 "an interlock is open or the machine is not in automatic mode: close the guards, check clamping and supplies"
             }
             Self::OutsideLimits => "a value of the payload is outside the machine's limits",
-            Self::OtherResult => "the result is not the one that was acknowledged: collect it again",
+            Self::OtherResult => "the acknowledged result is not the present one: collect it again",
             Self::Unlisted(number) => return write!(f, "answer {number}, which docs/modbus.md does not list"),
         })
     }
@@ -368,12 +368,12 @@ impl fmt::Display for Fault {
         f.write_str(match self {
             Self::None => "no fault",
             Self::StopCircuit => "the stop circuit is open: close it at the machine, then clear",
-            Self::Collision => "collision or unexpected touch: look at the part and the probe or wheel before clearing",
+            Self::Collision => "collision or unexpected touch: check the part and the probe or wheel before clearing",
             Self::Supplies => "air, coolant or power is missing",
-            Self::TravelLimit => "a limit of travel was met: check where the part is clamped",
+            Self::TravelLimit => "a limit of travel was reached: check the position of the part",
             Self::Drive => "a drive has failed: see the machine's own panel",
             Self::Tool => "the probe or the spindle has failed: see the machine's own panel",
-            Self::ClientSilent => "the machine heard nothing from its client for too long and holds",
+            Self::ClientSilent => "the machine received nothing from its client for too long and holds",
             Self::Other(number) => return write!(f, "fault {number}: see the machine's own panel"),
         })
     }
@@ -415,9 +415,9 @@ impl SignalValue {
     pub fn problem(&self) -> Option<String> {
         let Self { name, value, unit, range: [least, most], cause } = self;
         let flaw = match value {
-            None => format!("{name}: the machine gives no number"),
+            None => format!("{name}: the machine gives no value"),
             Some(value) if (least..=most).contains(&value) => return None,
-            Some(value) => format!("{name} is {value} {unit}, and {least} to {most} {unit} are wanted"),
+            Some(value) => format!("{name} is {value} {unit}, limits {least} to {most} {unit}"),
         };
         Some(cause.iter().fold(flaw, |flaw, cause| format!("{flaw}: {cause}")))
     }

@@ -60,14 +60,14 @@ pub fn read_text(path: &Path) -> Result<String, Problems> {
 fn open(path: &Path) -> std::io::Result<File> {
     let found = std::fs::metadata(path)?;
     if !found.is_file() && !found.is_dir() && !path.starts_with("/dev") && !path.starts_with("/proc") {
-        return Err(std::io::Error::new(std::io::ErrorKind::InvalidInput, "it is a pipe or a device and no file"));
+        return Err(std::io::Error::new(std::io::ErrorKind::InvalidInput, "it is a pipe or a device, not a file"));
     }
     File::open(path)
 }
 
 fn too_large(path: &Path) -> Problems {
     let found = format!("the file is larger than {} KiB", MOST_BYTES >> 10);
-    Problems::whole(path, "", found, "is it a recipe or a cell file at all? put large data into files of their own")
+    Problems::whole(path, "", found, "check that it is a recipe or a cell file; put large data into separate files")
 }
 
 /// Returns the SHA-256 of a text.
@@ -109,7 +109,7 @@ impl<'t> Document<'t> {
             Some(b',') if after_digit => "is it a decimal comma? write a decimal point",
             _ => "correct the TOML here",
         };
-        self.push(start..end, String::new(), format!("no TOML: {}", error.message().trim()), "", remedy);
+        self.push(start..end, String::new(), format!("invalid TOML: {}", error.message().trim()), "", remedy);
     }
 
     /// Moves the values of old keys to their new names. Returns a note for each old key, with its line.
@@ -550,14 +550,14 @@ impl Shape<'_, '_> {
         let key = key_of(&self.path);
         let fits = |scaled: f64| scaled.is_finite() && (least..=most).contains(&scaled);
         if key.ends_with("_mm") && number > most && fits(number * 1e-3) {
-            return format!("if that is micrometres, write {} millimetres", number * 1e-3);
+            return format!("if the value is in µm, write {} (mm)", number * 1e-3);
         }
         if key.ends_with("_um") && number > 0.0 && number < least && fits(number * 1e3) {
-            return format!("if that is millimetres, write {} micrometres", number * 1e3);
+            return format!("if the value is in mm, write {} (µm)", number * 1e3);
         }
         let usual = schema.get("default").or_else(|| schema.get("examples").and_then(|examples| examples.get(0)));
         match usual {
-            Some(usual) => format!("{usual} is usual"),
+            Some(usual) => format!("the usual value is {usual}"),
             None => "correct it".into(),
         }
     }
@@ -573,9 +573,11 @@ impl Shape<'_, '_> {
             return self.wrong(value, "text of one line", "remove line breaks and control characters");
         }
         if let Some(hidden) = misleading(text) {
-            let found =
-                format!("has the character U+{:04X}, which is not seen or turns what is read", u32::from(hidden));
-            self.tell(found, "it must be text that reads as it is written", "remove it, or type the text anew");
+            let found = format!(
+                "has the character U+{:04X}, which is invisible or changes the direction of the text",
+                u32::from(hidden)
+            );
+            self.tell(found, "it must be text of visible characters", "remove it, or type the text again");
             return false;
         }
         if (least..=most).contains(&length) {
@@ -631,12 +633,13 @@ impl Shape<'_, '_> {
 
     fn unknown(&mut self, key: &str, properties: &serde_json::Map<String, Schema>) -> bool {
         let span = span_of_name(&self.document.places, &self.path);
-        let list =
-            || format!("known here are {}", properties.keys().map(String::as_str).collect::<Vec<_>>().join(", "));
+        let list = || {
+            format!("this table has the keys {}", properties.keys().map(String::as_str).collect::<Vec<_>>().join(", "))
+        };
         let (allowed, remedy) = if let Some(near) = nearest(key, properties.keys().map(String::as_str)) {
-            ("there is no such key here".into(), format!("did you mean `{near}`?"))
+            ("this table has no key with that name".into(), format!("did you mean `{near}`?"))
         } else if let Some(table) = home_of(self.root, key, &mut Vec::new()) {
-            (list(), format!("it belongs into {table}"))
+            (list(), format!("move it to {table}"))
         } else {
             (list(), "remove it".into())
         };
@@ -691,9 +694,9 @@ fn unit_of(key: &str) -> Option<&'static str> {
         ("_mm_min", "mm/min"),
         ("_mm_s", "mm/s"),
         ("_mm", "mm"),
-        ("_um", "um"),
+        ("_um", "µm"),
         ("_nm", "nm"),
-        ("_deg", "degrees"),
+        ("_deg", "°"),
         ("_ms", "ms"),
         ("_s", "s"),
     ];

@@ -135,7 +135,9 @@ impl Columns {
         for (place, column) in places.iter_mut().zip(&self.0) {
             *place = match (column, &column.among(names)[..]) {
                 (Column::Numbered(number), _) if *number < count => *number,
-                (Column::Numbered(number), _) => return Err(format!("has {count} columns, and none {}", number + 1)),
+                (Column::Numbered(number), _) => {
+                    return Err(format!("has {count} columns, and no column {}", number + 1));
+                }
                 (Column::Named(_), [place]) => *place,
                 (Column::Named(name), found) => return Err(format!("names {} columns `{name}`", found.len())),
             };
@@ -418,12 +420,12 @@ impl Axes {
         let group = match there[..] {
             [] if self.unknown.is_some() => {
                 let word = self.unknown.as_deref().unwrap_or_default();
-                return Err(format!("names x, y and z of `{word}`, and whether those were measured is not known"));
+                return Err(format!("names x, y and z of `{word}`, which may be measured or nominal"));
             }
             [] => return Err("names none of x, y and z".to_owned()),
             [group] => group,
             [first, second, ..] => {
-                return Err(format!("names {first} and {second} columns, and which are to be read is not said"));
+                return Err(format!("names {first} and {second} columns and does not show which to read"));
             }
         };
         for (axis, columns) in ["x", "y", "z"].iter().zip(self.group(group)) {
@@ -432,10 +434,10 @@ impl Axes {
             }
         }
         if let Some(word) = &self.unknown {
-            return Err(format!("names {group} columns and others of `{word}`, and which are to be read is not said"));
+            return Err(format!("names {group} columns and others of `{word}` and does not show which to read"));
         }
         if group == Group::Nominal && !of_nominal {
-            return Err("names nominal columns alone, which nobody measured".to_owned());
+            return Err("names only nominal columns, which are not measured".to_owned());
         }
         Ok(self.group(group).each_ref().map(|columns| columns[0]))
     }

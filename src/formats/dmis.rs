@@ -188,7 +188,7 @@ impl Reading {
         // The three numbers of a direction follow; they must not replace a missing coordinate.
         if !matches!(fields.len(), 3 | 6) {
             let found = format!("{} numbers", fields.len());
-            return Err(unexpected(path, statement, "3 numbers behind CART, or 6 with a direction", &found));
+            return Err(unexpected(path, statement, "3 numbers after CART, or 6 with a direction", &found));
         }
         let mut at_mm = [0.0; 3];
         for (value, field) in at_mm.iter_mut().zip(&fields) {
@@ -258,11 +258,11 @@ mod tests {
             ("ENDFIL\n", "", "expected ENDFIL at the end"),
             ("UNITS/MM, ANGDEC\n", "", "line 8: expected UNITS above the first point"),
             ("UNITS/MM", "UNITS/FURLONG", "line 3: expected a unit of length"),
-            ("4,5,6", "4,5", "line 12: expected 3 numbers behind CART, or 6 with a direction, found `5 numbers`"),
+            ("4,5,6", "4,5", "line 12: expected 3 numbers after CART, or 6 with a direction, found `5 numbers`"),
             ("4,5,6", "4,NaN,6", "line 12: expected a coordinate, found `NaN`"),
             ("4,5,6", "4,1e9,6", "found `1e9`"),
             ("POINT,CART,4", "POINT,POL,4", "line 12: expected cartesian"),
-            ("cycle: 2", "cycle: two", "`cycle` says `two`"),
+            ("cycle: 2", "cycle: two", "`cycle` is `two`"),
             ("OUTPUT/FA(P7)", "PRCOMP/ON", "one kind of coordinates"),
         ] {
             let text = file().replace(of, with);

@@ -182,7 +182,7 @@ impl<'a> RegistrationDocument<'a> {
             ("the covariance", finite(self.covariance.as_flattened())),
             ("the condition", self.condition.is_finite()),
             ("a figure of the deviations", finite(&[self.rms_mm, self.pv_mm, self.residual_sigma_mm, self.coverage])),
-            ("a deviation that was left out", self.left_out.iter().all(|of| of.deviation_mm.is_finite())),
+            ("the deviation of an outlier", self.left_out.iter().all(|of| of.deviation_mm.is_finite())),
             ("the trace", self.trace.iter().all(step)),
             ("a weak direction", self.weak_directions.iter().all(|w| w.sigma_mm.is_none_or(f64::is_finite))),
             (

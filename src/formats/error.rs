@@ -18,7 +18,7 @@ pub enum FormatError {
     #[error("{path}: cannot be read: {source}; check the name and the permissions")]
     Unreadable { path: PathBuf, source: io::Error },
     /// The file has more bytes, points or triangles (`unit` says which) than are read.
-    #[error("{path}: {found} is more than the limit of {limit} {unit}; thin the file out or split it")]
+    #[error("{path}: {found} is more than the limit of {limit} {unit}; thin out the file or split it")]
     TooLarge { path: PathBuf, found: u64, limit: u64, unit: &'static str },
     /// The file has no content at all.
     #[error("{path}: the file is empty, expected {expected}; export it again")]
@@ -28,27 +28,25 @@ pub enum FormatError {
     NoData { path: PathBuf, expected: &'static str },
     /// A byte that does not occur in a text file.
     #[error(
-        "{path}, line {line}: expected text, found byte 0x{value:02x}: the file is binary or damaged; export the points as \
-         text, one point a line, or as PLY"
+        "{path}, line {line}: expected text, found byte 0x{value:02x}: the file is binary or damaged; export the \
+         points as text, one point per line, or as PLY"
     )]
     NotText { path: PathBuf, line: u64, value: u8 },
     /// Text with two bytes per character.
     #[error("{path}: expected plain text, found UTF-16; save the file as UTF-8")]
     Utf16 { path: PathBuf },
     /// A line that is too long for a point.
-    #[error("{path}, line {line}: longer than {limit_bytes} bytes; expected one point a line")]
+    #[error("{path}, line {line}: longer than {limit_bytes} bytes; expected one point per line")]
     LineTooLong { path: PathBuf, line: u64, limit_bytes: usize },
     /// Text where a number should be.
     #[error(
-        "{path}, line {line}, column {column}: expected a number in millimetres, found {}; remove the text or give the \
-         column a header",
+        "{path}, line {line}, column {column}: expected a number in mm, found {}; remove the text or give the column \
+         a header",
         quoted(found)
     )]
     NotANumber { path: PathBuf, line: u64, column: usize, found: String },
     /// NaN or an infinity.
-    #[error(
-        "{path}, line {line}, column {column}: expected a finite number in millimetres, found `{found}`; remove the line"
-    )]
+    #[error("{path}, line {line}, column {column}: expected a finite number in mm, found `{found}`; remove the line")]
     NotFinite { path: PathBuf, line: u64, column: usize, found: String },
     /// A number that is too large for a coordinate of a part.
     #[error(
@@ -58,8 +56,8 @@ pub enum FormatError {
     OutOfRange { path: PathBuf, line: u64, column: usize, found: String },
     /// A comma that separates either decimals or thousands: ambiguous.
     #[error(
-        "{path}, line {line}, column {column}: `{found}` may have a decimal comma or a thousands comma; write all numbers with a \
-         decimal point and without thousands separators"
+        "{path}, line {line}, column {column}: `{found}` has either a decimal comma or a thousands comma; write all \
+         numbers with a decimal point and without thousands separators"
     )]
     AmbiguousComma { path: PathBuf, line: u64, column: usize, found: String },
     /// Decimal points and decimal commas in the same file.
@@ -89,18 +87,20 @@ pub enum FormatError {
     HeaderColumns { path: PathBuf, line: u64, found: usize, expected: usize, separator: &'static str },
     /// A header that does not identify the three coordinates.
     #[error(
-        "{path}, line {line}: the header {reason}; name exactly one column each x, y and z, or give --columns where a command takes it"
+        "{path}, line {line}: the header {reason}; name exactly one column each x, y and z, or give --columns if the \
+         command has it"
     )]
     HeaderNames { path: PathBuf, line: u64, reason: String },
     /// A table with more than three columns and no statement of which ones hold the coordinates.
     #[error(
-        "{path}, line {line}: {columns} columns without names, and x, y and z may be any of them; put a line above them that names \
-         them, or give --columns where a command takes it"
+        "{path}, line {line}: {columns} columns without names, so x, y and z are unknown; add a header line with the \
+         names, or give --columns if the command has it"
     )]
     UnnamedColumns { path: PathBuf, line: u64, columns: usize },
     /// A unit other than the one in which the table is read.
     #[error(
-        "{path}, line {line}: expected coordinates in {unit}, found the unit {}; convert the file to {unit}, or give --unit, or --height-unit for z alone, where a command takes it",
+        "{path}, line {line}: expected coordinates in {unit}, found the unit {}; convert the file to {unit}, or give \
+         --unit, or --height-unit for z alone, if the command has it",
         quoted(found)
     )]
     Unit { path: PathBuf, line: u64, found: String, unit: Unit },
@@ -137,47 +137,48 @@ pub enum FormatError {
     #[error("{path}: the container has no {expected}; export the file again")]
     Missing { path: PathBuf, expected: String },
     /// Text that is not well-formed XML.
-    #[error("{path}, {entry}: no readable XML: {source}; export the file again")]
+    #[error("{path}, {entry}: not readable as XML: {source}; export the file again")]
     Xml { path: PathBuf, entry: String, source: roxmltree::Error },
     /// Bytes whose checksum differs from the recorded one; the checksums are in lower case.
     #[error(
-        "{path}: {entry} was changed or damaged after it was written: its MD5 is {found}, sealed was {expected}; copy or export \
-         the file again"
+        "{path}: {entry} was changed or damaged after it was written: its MD5 is {found}, expected {expected}; copy \
+         or export the file again"
     )]
     Checksum { path: PathBuf, entry: String, expected: String, found: String },
     /// A map whose scale (lateral size) is unknown.
     #[error(
-        "{path}: the map has no lateral scale (the resolution in the file is {found} m a pixel), so that its size in x and y is \
-         not known; calibrate the lateral resolution in the instrument's program and save the map again"
+        "{path}: the map has no lateral scale (the resolution in the file is {found} m per pixel), so its size in x \
+         and y is unknown; calibrate the lateral resolution in the instrument's program and save the map again"
     )]
     NoLateralScale { path: PathBuf, found: f64 },
     /// A file could not be written; an existing file of that name is unchanged.
-    #[error("{path}: cannot be written, {action}: {source}; check the name, the permissions and the space left")]
+    #[error("{path}: cannot be written, {action}: {source}; check the name, the permissions and the free space")]
     Unwritable { path: PathBuf, action: &'static str, source: io::Error },
     /// A row to be written holds NaN or an infinity.
-    #[error("{path}: row {row} of the result holds {value}, which is not a finite number; nothing was written")]
+    #[error("{path}: row {row} of the result has {value}, which is not a finite number; nothing was written")]
     RowNotFinite { path: PathBuf, row: usize, value: f64 },
     /// A value that JSON cannot express.
     #[error("{path}: cannot be written as JSON: {source}")]
     Json { path: PathBuf, source: serde_json::Error },
     /// A statement such as `# cycle: 3` with an impossible value.
-    #[error("{path}, line {line}: `{key}` says `{found}`, expected {expected}; correct the line")]
+    #[error("{path}, line {line}: `{key}` is `{found}`, expected {expected}; correct the line")]
     Statement { path: PathBuf, line: u64, key: &'static str, found: String, expected: &'static str },
     /// The file contradicts another file: the cell file or the plan.
-    #[error("{path}: the file says that {key} is {found}, the {by} says {expected}; correct one of them")]
+    #[error("{path}: in the file {key} is {found}, in the {by} {expected}; correct one of them")]
     Contradiction { path: PathBuf, key: &'static str, found: String, by: &'static str, expected: String },
     /// A target number that the plan does not have, or that occurred before.
     #[error("{path}, line {line}: index `{found}` {why}; export the measurement of this plan")]
     Index { path: PathBuf, line: u64, found: String, why: &'static str },
     /// More than one probe in the same file.
-    #[error("{path}, line {line}: probe `{found}`, the lines above have `{first}`; export one file a probe")]
+    #[error("{path}, line {line}: probe `{found}`, the lines above have `{first}`; export one file per probe")]
     ProbeVaries { path: PathBuf, line: u64, found: String, first: String },
     /// A file of reference points that cannot be understood.
     #[error("{path}, line {line}: expected {expected}, found {found}; correct the file of reference points")]
     Reference { path: PathBuf, line: usize, expected: &'static str, found: String },
     /// A group of reference points that does not exist or is not unique.
     #[error(
-        "{path}: no single group `{wanted}` of reference points; there are {there}; name one of them in the cell file"
+        "{path}: there is not exactly one group `{wanted}` of reference points; there are {there}; name one of them \
+         in the cell file"
     )]
     Group { path: PathBuf, wanted: String, there: String },
 }

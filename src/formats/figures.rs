@@ -95,8 +95,8 @@ pub fn write_figures(
     }
     let found = figures.ok();
     match form {
-        None => missing.push("figures of the form: form and scatter could not be told apart".to_owned()),
-        Some(Form { slope: None, .. }) => missing.push("slopes of the form: the places are too few".to_owned()),
+        None => missing.push("figures of the form: form and noise cannot be separated".to_owned()),
+        Some(Form { slope: None, .. }) => missing.push("slopes of the form: there are too few places".to_owned()),
         Some(_) => {}
     }
     let wavelength_nm = found.map_or(FormOptions::default().wavelength_nm, |found| found.iso_10110.wavelength_nm);

@@ -102,7 +102,7 @@ impl ScratchFolder {
     pub fn at(path: PathBuf) -> Result<Self, FormatError> {
         match fs::remove_dir_all(&path) {
             Err(source) if source.kind() != io::ErrorKind::NotFound => {
-                Err(FormatError::Unwritable { path, action: "taking it away", source })
+                Err(FormatError::Unwritable { path, action: "deleting it", source })
             }
             _ => Ok(Self(path)),
         }

@@ -155,7 +155,8 @@ fn surface_data(head: &[u8]) -> Option<Foreign> {
     let version = head.get(1..8).filter(|_| matches!(head[0], b'a' | b'b' | b'A' | b'B'))?.to_ascii_uppercase();
     let found = match &version[..] {
         b"BCR-0.0" | b"BCR-1.0" => {
-            "SDF of 1993 (BCR-1.0), in which neither the mark of a height that was not measured nor the direction of the profiles is fixed"
+            "SDF of 1993 (BCR-1.0), which defines neither the mark of a height that was not measured nor the \
+             direction of the profiles"
         }
         b"ISO-2.0" => "SDF version 2.0",
         _ => return None,

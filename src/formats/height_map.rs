@@ -44,15 +44,11 @@ impl HeightMap {
         for (k, axis) in ["x", "y"].into_iter().enumerate() {
             if !(spacing_mm[k] > 0.0 && is_believable(spacing_mm[k] * (columns.max(rows) as f64))) {
                 let found = format!("{} mm", spacing_mm[k]);
-                return Err(unexpected(
-                    format!("spacing along {axis}"),
-                    "a length above 0 that a part may have",
-                    found,
-                ));
+                return Err(unexpected(format!("spacing along {axis}"), "a plausible length above 0", found));
             }
             if !is_believable(first_mm[k]) {
                 let found = format!("{} mm", first_mm[k]);
-                return Err(unexpected(format!("offset along {axis}"), "a place on a part", found));
+                return Err(unexpected(format!("offset along {axis}"), "a plausible place", found));
             }
         }
         let count = columns * rows;
@@ -71,7 +67,7 @@ impl HeightMap {
         }
         if heights_mm.len() != count {
             let found = if heights_mm.len() > count { "more".to_owned() } else { heights_mm.len().to_string() };
-            return Err(unexpected("samples".to_owned(), &format!("{columns} times {rows} of them"), found));
+            return Err(unexpected("samples".to_owned(), &format!("{columns} times {rows}"), found));
         }
         if !valid.contains(&true) {
             return Err(FormatError::NoData { path: path.to_owned(), expected: "sample that was measured" });
@@ -148,7 +144,7 @@ fn check_marks(path: &Path, heights_mm: impl Iterator<Item = f64> + Clone) -> Re
             return Err(FormatError::Unexpected {
                 path: path.to_owned(),
                 place: "heights".to_owned(),
-                expected: "a sample that was not measured to have the mark of the format".to_owned(),
+                expected: "samples that were not measured to have the mark of the format".to_owned(),
                 found: format!("{count} samples of exactly {mark} mm, {apart_mm} mm from all others"),
             });
         }

@@ -140,7 +140,7 @@ impl Learned {
                 return Ok(None);
             }
             Err(FormatError::TooLarge { found, .. }) => {
-                return Err(broken(format!("{found} bytes, more than the {MOST_BYTES} of any run")));
+                return Err(broken(format!("{found} bytes, more than the limit of {MOST_BYTES}")));
             }
             Err(error) => return Err(error.into()),
         };
@@ -164,7 +164,7 @@ impl Learned {
             && learned.taught_by.is_none();
         let broken = |why| Err(LearnedError::Broken { path: from.to_owned(), why });
         match learned.known.unfit_to_teach() {
-            _ if !is_meant => broken("it is of another kind of parts than it was given for".into()),
+            _ if !is_meant => broken("it is of another kind of parts than requested".into()),
             Some(why) => broken(why),
             None => Ok(learned),
         }
@@ -189,7 +189,7 @@ impl Learned {
         if !grid.is_sound() || values_mm.len() != grid.len() {
             let [dx, dy] = grid.spacing_mm;
             let found = format!(
-                "{} values on a grid of {} x {} nodes, {dx} x {dy} mm apart",
+                "{} values for a grid of {} x {} nodes, {dx} x {dy} mm apart",
                 values_mm.len(),
                 grid.columns,
                 grid.rows
@@ -200,12 +200,12 @@ impl Learned {
             return Some("a number of its correction is not finite".into());
         }
         if self.correction.set.as_ref().is_some_and(|set| !set.is_sound(grid.len())) {
-            return Some("a parameter of its correction cannot be, or is of another grid".into());
+            return Some("a parameter of its correction is impossible, or belongs to another grid".into());
         }
         if !self.fields.is_valid() {
-            return Some("a number of what it knows of the fields of errors cannot be".into());
+            return Some("a hyperparameter of its error fields is impossible".into());
         }
-        (!self.known.is_sound()).then(|| "a number of what it knows of the grinder cannot be".into())
+        (!self.known.is_sound()).then(|| "a number of its knowledge of the grinder is impossible".into())
     }
 
     /// Returns the correction of the first pass of another part: the error that repeated in every pass of this one, on
@@ -308,7 +308,7 @@ mod tests {
         assert_ne!(plain, old);
         assert_eq!(serde_json::to_string(&read(&old).unwrap().unwrap().0).unwrap(), plain);
         let error = read(&text.replace("\"range_mm\":[15.0", "\"range_mm\":[-15.0")).unwrap_err().to_string();
-        assert!(error.contains("fields of errors") && error.contains("archive"), "{error}");
+        assert!(error.contains("error fields") && error.contains("archive"), "{error}");
     }
 
     #[test]
@@ -337,15 +337,15 @@ mod tests {
                 error
             })
         };
-        assert!(broken("\"columns\":5", "\"columns\":6")[0].contains("20 values on a grid of 6 x 4 nodes"));
+        assert!(broken("\"columns\":5", "\"columns\":6")[0].contains("20 values for a grid of 6 x 4 nodes"));
         assert!(broken("\"columns\":5,\"rows\":4", "\"columns\":0,\"rows\":0")[0].contains("0 x 0"));
         assert!(broken("\"spacing_mm\":[1.0,1.0]", "\"spacing_mm\":[0.0,1.0]")[0].contains("0 x 1 mm apart"));
-        assert!(broken("\"response\":[1.0", "\"response\":[7.0")[0].contains("cannot be"));
+        assert!(broken("\"response\":[1.0", "\"response\":[7.0")[0].contains("impossible"));
         assert!(broken("\"run\"", "\"ran\"")[0].contains("run"));
         // The mean has a grid of its own.
         let at = text.rfind("\"columns\":5").unwrap();
         let of_mean = format!("{}{}", &text[..at], text[at..].replacen("\"columns\":5", "\"columns\":0", 1));
-        assert!(read(&of_mean).unwrap_err().to_string().contains("cannot be"));
+        assert!(read(&of_mean).unwrap_err().to_string().contains("impossible"));
         for text in ["", "{", &text[..text.len() / 2], "[]", "7"] {
             assert!(matches!(read(text), Err(LearnedError::Broken { .. })), "{text}");
         }

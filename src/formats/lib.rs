@@ -227,9 +227,9 @@ fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatE
     }
     Err(FormatError::WrongKind {
         path: path.to_owned(),
-        expected: "a table of points, of which columns and a unit can be given",
-        found: "a file that says both itself",
-        remedy: "leave columns and units out",
+        expected: "a table of points, for which columns and a unit can be given",
+        found: "a file that states both itself",
+        remedy: "remove columns and units",
     })
 }
 

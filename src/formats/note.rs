@@ -60,20 +60,21 @@ impl fmt::Display for PointNote {
                 match fewer_digits {
                     Some([here, above]) => write!(
                         f,
-                        "and its last number `{found}` has {here} digits where the lines above have {above} or more: the file is cut there, \
-                         most likely, and the point ({x}, {y}, {z}) mm wrong; copy or export it again",
+                        "and its last number `{found}` has {here} digits; the lines above have {above} or more: the \
+                         file is probably cut there, and the point ({x}, {y}, {z}) mm wrong; copy or export it \
+                         again",
                     ),
                     None => write!(
                         f,
-                        "so that a cut in its last number `{found}` would not show; it was read as the point ({x}, {y}, {z}) mm; see that \
-                         the file is whole"
+                        "so a cut in its last number `{found}` would not show; it was read as the point ({x}, {y}, \
+                         {z}) mm; check that the file is complete"
                     ),
                 }
             }
             Self::OneThousandsMark { path, line, found, value_mm } => write!(
                 f,
-                "{}, line {line}: `{found}` was read as {value_mm} mm, and no other number of the file has a mark between its thousands; \
-                 see that it is meant so",
+                "{}, line {line}: `{found}` was read as {value_mm} mm, and no other number of the file has a \
+                 thousands separator; check that this is intended",
                 path.display(),
             ),
         }

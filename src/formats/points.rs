@@ -343,7 +343,7 @@ impl<'p> Cloud<'p> {
         }
         let text = without_end_of_file(head);
         if text.contains(&b'\r') && !text.contains(&b'\n') {
-            let (expected, found) = ("lines that end with LF or CR LF", "lines that end with CR alone");
+            let (expected, found) = ("lines that end with LF or CR LF", "lines that end with CR only");
             let remedy = "save the file with one of those line ends";
             return Err(FormatError::WrongKind { path: self.path.to_owned(), expected, found, remedy });
         }

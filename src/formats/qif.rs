@@ -141,7 +141,7 @@ impl Qif<'_, '_, '_> {
     fn unit_mm(&self) -> Result<f64, FormatError> {
         let missing = || FormatError::Missing {
             path: self.path.to_owned(),
-            expected: "FileUnits/PrimaryUnits/LinearUnit, without which a length means nothing".to_owned(),
+            expected: "FileUnits/PrimaryUnits/LinearUnit, which lengths require".to_owned(),
         };
         let primary = self.named("PrimaryUnits").next().ok_or_else(missing)?;
         let unit = child(primary, "LinearUnit").ok_or_else(missing)?;
@@ -172,13 +172,14 @@ impl Qif<'_, '_, '_> {
                 return Err(unexpected(self.path, units, "points in the unit of the document", "units of their own"));
             }
             let points = child(*set, "Points");
-            let points = points.ok_or_else(|| unexpected(self.path, *set, "Points as text", "none, or binary ones"))?;
+            let points =
+                points.ok_or_else(|| unexpected(self.path, *set, "Points as text", "no points, or binary points"))?;
             let there = found.points.len();
             self.list(points, unit_mm, &mut found.points)?;
             let read = found.points.len() - there;
             if set.attribute("count").is_some_and(|count| count.trim().parse() != Ok(read)) {
                 let count = set.attribute("count").unwrap_or_default();
-                return Err(unexpected(self.path, *set, &format!("count to be the {read} that there are"), count));
+                return Err(unexpected(self.path, *set, &format!("a count of {read}, the number of points"), count));
             }
             self.what_they_are(*set, unit_mm, &mut found)?;
         }
@@ -191,7 +192,9 @@ impl Qif<'_, '_, '_> {
             let mut at_mm = [0.0; 3];
             for (k, value) in at_mm.iter_mut().enumerate() {
                 let text = if k == 0 { Some(first) } else { numbers.next() };
-                let text = text.ok_or_else(|| unexpected(self.path, node, "three numbers for each point", "a rest"))?;
+                let text = text.ok_or_else(|| {
+                    unexpected(self.path, node, "three numbers for each point", "an incomplete point")
+                })?;
                 let number = text.parse::<f64>().ok().map(|number| number * unit_mm).filter(|n| is_believable(*n));
                 *value = number.ok_or_else(|| unexpected(self.path, node, "a coordinate", text))?;
             }
@@ -209,7 +212,7 @@ impl Qif<'_, '_, '_> {
                 other => return Err(unexpected(self.path, compensated, "true or false", other)),
             };
             if found.coordinates.is_some_and(|before| before != says) {
-                return Err(unexpected(self.path, compensated, "the same of all point sets", "another one"));
+                return Err(unexpected(self.path, compensated, "the same value for all point sets", "another value"));
             }
             found.coordinates = Some(says);
         } else if let Some(each) = child(set, "Compensations").or(child(set, "BinaryCompensated")) {
@@ -239,7 +242,7 @@ impl Qif<'_, '_, '_> {
             let there = found.points.len();
             self.list(location, unit_mm, &mut found.points)?;
             if found.points.len() != there + 1 {
-                return Err(unexpected(self.path, location, "one point", "another number of them"));
+                return Err(unexpected(self.path, location, "one point", "another number of points"));
             }
             let item = child(feature, "FeatureItemId").and_then(|item| item.text()).unwrap_or_default().trim();
             names.push(items.get(item).cloned().unwrap_or_default());
@@ -325,10 +328,10 @@ mod tests {
             (
                 "count=\"2\"",
                 "count=\"3\"",
-                "element MeasuredPointSet: expected count to be the 2 that there are, found `3`",
+                "element MeasuredPointSet: expected a count of 2, the number of points, found `3`",
             ),
             (">false<", ">perhaps<", "expected true or false"),
-            ("<FileUnits>", "<FileUnits><!-- ", "no readable XML"),
+            ("<FileUnits>", "<FileUnits><!-- ", "not readable as XML"),
             ("SIUnitName>meter", "SIUnitName>feet", "expected the meter as SIUnitName, found `feet`"),
             ("0.001", "0", "expected the unit in metres, found `0`"),
             (

@@ -73,8 +73,8 @@ pub fn parse_references(path: &Path, bytes: &[u8], group: Option<&str>) -> Resul
     if let Some(twice) =
         (1..points.len()).find(|&k| points[k].name.is_some() && points[..k].iter().any(|p| p.name == points[k].name))
     {
-        let found = format!("`{}` a second time", points[twice].name.as_deref().unwrap_or_default());
-        return Err(reference(path, twice + 1, "every name once", found));
+        let found = format!("`{}` again", points[twice].name.as_deref().unwrap_or_default());
+        return Err(reference(path, twice + 1, "each name once", found));
     }
     Ok(References { path: path.to_owned(), points })
 }
@@ -99,8 +99,9 @@ enum Tree {
 }
 
 fn from_yaml(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<Vec<Reference>, FormatError> {
-    let text = std::str::from_utf8(bytes)
-        .map_err(|error| reference(path, 1, "UTF-8 text", format!("another code at byte {}", error.valid_up_to())))?;
+    let text = std::str::from_utf8(bytes).map_err(|error| {
+        reference(path, 1, "UTF-8 text", format!("another encoding at byte {}", error.valid_up_to()))
+    })?;
     let root = tree(path, text)?;
     let list = group_of(path, &root, group)?;
     let point = |node: &Node, name: Option<&Node>| -> Result<Reference, FormatError> {
@@ -223,7 +224,7 @@ mod tests {
             ("p: &a [1, 2, 3]\nq: [*a, *a]\n", "found an alias"),
             ("p: [1, 2\n", "expected YAML"),
             ("", "found nothing"),
-            ("p: {a: [1, 2, 3], a: [1, 2, 3]}", "a second time"),
+            ("p: {a: [1, 2, 3], a: [1, 2, 3]}", "again"),
         ] {
             let message = yaml(text, None).unwrap_err().to_string();
             assert!(message.contains(expected), "{text:?}: {message}");

@@ -240,10 +240,10 @@ impl<'p> Draft<'p> {
 
     /// Flushes the bytes to the disk, renames the file, then flushes the new name to the disk.
     pub(super) fn publish(mut self) -> Result<(), FormatError> {
-        let failed = self.failed("bringing it to the disk");
+        let failed = self.failed("flushing it to the disk");
         self.file.flush().map_err(&failed)?;
         self.file.get_ref().sync_all().map_err(&failed)?;
-        fs::rename(&self.temporary, self.path).map_err(self.failed("giving it its name"))?;
+        fs::rename(&self.temporary, self.path).map_err(self.failed("renaming it"))?;
         self.published = true;
         sync_folder(self.path).map_err(failed)
     }

@@ -219,13 +219,13 @@ impl Statements {
             "unit" | "units" => {
                 let word = value.trim_end_matches('.').parse();
                 self.unit =
-                    Some(word.map_err(|_| wrong("units", "`mm`, or another unit that the cell file says too"))?);
+                    Some(word.map_err(|_| wrong("units", "`mm`, or another unit that is also in the cell file"))?);
             }
             "probe radius mm" => {
                 self.probe_radius_mm = number("probe radius mm", 1e-3..=1e3, "a radius from 0.001 to 1000 mm")?;
             }
             "temperature c" => {
-                self.temperature_c = number("temperature c", -40.0..=120.0, "degrees Celsius from -40 to 120")?;
+                self.temperature_c = number("temperature c", -40.0..=120.0, "a temperature from -40 to 120 °C")?;
             }
             _ => {}
         }
@@ -421,7 +421,7 @@ fn probe_size_mm(path: &Path, layout: &Layout, text: &[u8]) -> Result<f64, Forma
         line: layout.first_line,
         key: "probe",
         found: excerpt(text),
-        expected: "a size in millimetres",
+        expected: "a size in mm",
     })
 }
 
@@ -500,13 +500,13 @@ mod tests {
         assert_eq!(found.indices.unwrap(), [4, 9]);
         let contacts = Content { coordinates: Some(Coordinates::Contacts), ..Content::default() };
         let message = parse(text, &contacts).unwrap_err().to_string();
-        assert!(message.contains("coordinates is centres, the cell file says contacts"), "{message}");
+        assert!(message.contains("coordinates is centres, in the cell file contacts"), "{message}");
         for (line, expected) in [
-            ("# cycle: two", "line 1: `cycle` says `two`"),
-            ("# coordinates: centres of contact", "`coordinates` says"),
-            ("# probe radius mm: NaN", "`probe radius mm` says `NaN`"),
+            ("# cycle: two", "line 1: `cycle` is `two`"),
+            ("# coordinates: centres of contact", "`coordinates` is"),
+            ("# probe radius mm: NaN", "`probe radius mm` is `NaN`"),
             ("# plan: abc", "64 hexadecimal digits"),
-            ("# units: furlong", "`units` says `furlong`"),
+            ("# units: furlong", "`units` is `furlong`"),
         ] {
             let message = parse(&format!("{line}\n1,2,3\n"), &Content::default()).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");
@@ -559,7 +559,7 @@ mod tests {
             assert_eq!(read(text).unwrap(), expected, "{text}");
         }
         let ambiguous = read("1,234;5,678;9,012\n").unwrap_err().to_string();
-        assert!(ambiguous.contains("line 1, column 1: `1,234` may have"), "{ambiguous}");
+        assert!(ambiguous.contains("line 1, column 1: `1,234` has either"), "{ambiguous}");
         let stated = Content { decimal: DecimalMark::Comma, ..Content::default() };
         assert_eq!(parse("1,234;5,678;9,012\n", &stated).unwrap().points, [Point::new(1.234, 5.678, 9.012)]);
         assert!(parse("1.5;2.5;3.5\n", &stated).unwrap_err().to_string().contains("decimal comma"));

@@ -113,6 +113,6 @@ pub(super) fn describe(path: &Path, name: &str) -> Result<Artefact, JournalError
 
 /// Syncs to the disk a file that another part of the program wrote, and its folder.
 pub(super) fn sync_file(path: &Path) -> Result<(), JournalError> {
-    system::sync_file(path).map_err(JournalError::file(path, "bringing it to the disk"))?;
+    system::sync_file(path).map_err(JournalError::file(path, "flushing it to the disk"))?;
     path.parent().map_or(Ok(()), sync_folder)
 }

@@ -12,18 +12,20 @@ use thiserror::Error;
 pub enum JournalError {
     /// The run folder is in use by an earlier run.
     #[error(
-        "{path}: a run folder must be new or empty, and this one is not; give the run another name, or resume the run that is there"
+        "{path}: a run folder must be new or empty, and this one is not; give the run another name, or resume the \
+         run in it"
     )]
     Exists { path: PathBuf },
     /// The folder has no journal.
     #[error("{path}: there is no journal.sqlite in this folder; give the folder of a run")]
     Absent { path: PathBuf },
     /// The file is not a journal.
-    #[error("{path}: this is no journal of Regrind: {what}; give the folder of a run")]
+    #[error("{path}: this is not a journal of Regrind: {what}; give the folder of a run")]
     Foreign { path: PathBuf, what: &'static str },
     /// The journal was made by a later version.
     #[error(
-        "{path}: the journal has layout {found}, and this program knows {limit}; use the version of Regrind that wrote it or a later one"
+        "{path}: the journal has layout {found}, and this program reads at most {limit}; use the version of Regrind \
+         that wrote it or a later one"
     )]
     Newer { path: PathBuf, found: u32, limit: u32 },
     /// Another process drives the run.
@@ -31,18 +33,20 @@ pub enum JournalError {
     Busy { path: PathBuf },
     /// Another run has the machine.
     #[error(
-        "{address}: another run has this machine: {holder}; wait for it, or stop it with `regrind stop` and its folder"
+        "{address}: another run uses this machine: {holder}; wait for it, or stop it with `regrind stop` and its \
+         folder"
     )]
     MachineTaken { address: String, holder: String },
     /// The folder for the locks of machines is not safe to use: another user could have created it.
-    #[error("{path}: the locks of machines cannot lie in it: {what}; {remedy}")]
+    #[error("{path}: this folder is not safe for the locks of machines: {what}; {remedy}")]
     LockFolder { path: PathBuf, what: String, remedy: String },
     /// The run is over.
-    #[error("{path}: the journal is closed, its run is over; begin another run")]
+    #[error("{path}: the journal is closed, because its run is over; begin another run")]
     Closed { path: PathBuf },
     /// The folder or a file in it cannot be written or read.
     #[error(
-        "{path}: {action} failed: {source}; check that the folder exists, is yours to write and its disk is in order"
+        "{path}: {action} failed: {source}; check that the folder exists, that you have the right to write in it, \
+         and that its disk works"
     )]
     File { path: PathBuf, action: &'static str, source: io::Error },
     /// The disk is full.
@@ -50,11 +54,15 @@ pub enum JournalError {
     DiskFull { path: PathBuf },
     /// The database did not accept a setting that the guarantees depend on.
     #[error(
-        "{path}: the database did not take {setting} = {wanted} (it says {found}); put the run folder on a local disk"
+        "{path}: the database did not accept {setting} = {wanted} (it has {found}); put the run folder on a local \
+         disk"
     )]
     Setting { path: PathBuf, setting: &'static str, wanted: &'static str, found: String },
     /// The database reported an error.
-    #[error("{path}: the database failed: {source}; check that the folder is yours to write and its disk is in order")]
+    #[error(
+        "{path}: the database failed: {source}; check that you have the right to write in the folder, and that its \
+         disk works"
+    )]
     Database { path: PathBuf, source: rusqlite::Error },
     /// The journal was changed, or the disk has damaged it.
     #[error(
@@ -63,41 +71,45 @@ pub enum JournalError {
     Broken { path: PathBuf, seq: u64, what: String },
     /// The record is intact, but it is not signed with one of the given keys.
     #[error(
-        "{path}: the record is whole, and who wrote it is not proven: {what}; give the keys of all who drove the run, or leave --key out, \
-         which proves no author"
+        "{path}: the record is complete, but its author is not proven: {what}; give the keys of all users of the \
+         run, or omit --key, which proves no author"
     )]
     NoAuthor { path: PathBuf, what: String },
     /// The content of a recorded file differs from the record.
     #[error(
-        "{path}: it is not the file that is on record: nothing of it was used; put that one back, from a copy of the run"
+        "{path}: this file differs from the recorded one, and was not used; restore the recorded file from a copy of \
+         the run"
     )]
     OtherFile { path: PathBuf },
     /// A file of the record is no longer at its path: everything written to it now would be lost.
     #[error(
-        "{path}: this file of the record was deleted, renamed or exchanged while the run is on; put it back where it was, or stop the run"
+        "{path}: this file of the record was deleted, renamed or replaced during the run; put it back, or stop the \
+         run"
     )]
     Gone { path: PathBuf },
     /// The file of an audit key contains no valid key.
     #[error(
-        "{path}: this is no audit key: {what}; bring it back from a copy, or put it away and make another with `regrind audit key`"
+        "{path}: this is not an audit key: {what}; restore it from a copy, or move it away and make another with \
+         `regrind audit key`"
     )]
     Key { path: PathBuf, what: &'static str },
     /// Other users can read or exchange the audit key.
     #[error(
-        "{path}: others may read or exchange this audit key ({how}): {remedy}, and make another if somebody may have it"
+        "{path}: others can read or replace this audit key ({how}): {remedy}, and make another key if others may \
+         have this one"
     )]
     KeyIsOpen { path: PathBuf, how: String, remedy: String },
     /// The name could lead out of the run folder.
     #[error("`{name}` cannot be the name of a file in a run folder; give a relative path of plain names")]
     Name { name: String },
     /// The file is already on record with a different content.
-    #[error("{path}: this file is on record with another content; what is on record is never written over")]
+    #[error("{path}: this file is on record with another content; recorded files are never overwritten")]
     Recorded { path: PathBuf },
     /// The entry is not allowed at this place of the journal.
-    #[error("a record of kind {kind} {what}; this is a fault of the program itself, please report it")]
+    #[error("a record of kind {kind} {what}; this is a fault of the program: report it")]
     Entry { kind: &'static str, what: &'static str },
     /// All command numbers are used up.
-    #[error("no command number is left after {limit}; begin another run")]
+    #[error("all command numbers up to {limit} are used; begin another run")]
     CommandNumbers { limit: u32 },
 }
 

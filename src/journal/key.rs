@@ -127,11 +127,11 @@ impl AuditKey {
         let failed = JournalError::file(path, "reading it");
         let broken = |what| JournalError::Key { path: path.to_owned(), what };
         let found = fs::metadata(path).map_err(|error| match error.kind() {
-            io::ErrorKind::NotFound => broken("there is no such file"),
+            io::ErrorKind::NotFound => broken("the file does not exist"),
             _ => failed(error),
         })?;
         if !found.is_file() || found.len() > MOST_BYTES {
-            return Err(broken("it is no small file"));
+            return Err(broken("it is not a small file"));
         }
         if let Some(system::OpenToOthers { how, remedy }) = system::readable_by_others(path).map_err(&failed)? {
             return Err(JournalError::KeyIsOpen { path: path.to_owned(), how, remedy });
@@ -140,7 +140,7 @@ impl AuditKey {
         if let Some(system::OpenToOthers { how, remedy }) = system::changeable_by_others(folder).map_err(&failed)? {
             return Err(JournalError::KeyIsOpen { path: path.to_owned(), how, remedy });
         }
-        let text = String::from_utf8(fs::read(path).map_err(&failed)?).map_err(|_| broken("it is no text"))?;
+        let text = String::from_utf8(fs::read(path).map_err(&failed)?).map_err(|_| broken("it is not text"))?;
         let value = |name: &str| {
             let line = text.lines().find_map(|line| line.strip_prefix(name)?.trim_start().strip_prefix('='))?;
             unhex::<32>(line.trim().trim_matches('"'))
@@ -149,7 +149,7 @@ impl AuditKey {
         let key = Self::from_seed(seed);
         match value("public") {
             Some(public) if public == key.public().0 => Ok(key),
-            _ => Err(broken("its line `public` does not belong to its line `secret`")),
+            _ => Err(broken("its line `public` does not match its line `secret`")),
         }
     }
 

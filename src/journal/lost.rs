@@ -29,13 +29,13 @@ const MOST_OF_LOG: u64 = 256 << 20;
 /// A file cannot be read, or the anchor is invalid.
 pub fn may_be_lost(folder: &Path) -> Result<Option<String>, JournalError> {
     if read_anchor(folder)?.is_none() {
-        return Ok(Some(format!("{ANCHOR} is missing, which is written as a run begins")));
+        return Ok(Some(format!("{ANCHOR} is missing; every run writes it at its begin")));
     }
     let log = folder.join(format!("{DATABASE}-wal"));
     // A reader that opens a database without a log creates an empty log.
     if !fs::metadata(&log).is_ok_and(|found| found.is_file() && found.len() > 0) {
         return Ok(Some(format!(
-            "{DATABASE}-wal is missing or empty, which a program that ends in the middle of a run leaves behind"
+            "{DATABASE}-wal is missing or empty; a program that ends during a run leaves it in the folder"
         )));
     }
     let mut bytes = Vec::new();
@@ -75,7 +75,7 @@ fn damage(log: &[u8]) -> Option<String> {
     let mut so_far = sum([0, 0], &log[..24]);
     // SQLite syncs the header before it writes the first frame.
     if !is_header || so_far != [word(24), word(28)] {
-        return Some("its first bytes do not hold, and nothing behind them is read".to_owned());
+        return Some("its header is invalid, and nothing after it can be read".to_owned());
     }
     let (mut holds, mut committed, mut synced) = (true, 0, 0);
     for frame in log[LOG_HEADER..].chunks_exact(FRAME_HEADER + page) {
@@ -95,8 +95,7 @@ fn damage(log: &[u8]) -> Option<String> {
             committed += usize::from(frame[4..8] != [0; 4]);
         }
     }
-    (synced > 0)
-        .then(|| format!("{synced} changes or more that were on the disk stand behind a place that does not hold"))
+    (synced > 0).then(|| format!("at least {synced} changes that were on the disk follow an invalid part"))
 }
 
 #[cfg(test)]

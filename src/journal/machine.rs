@@ -136,7 +136,7 @@ impl MachineLock {
                 Err(what) => lock.note(&path.join(&name), &what),
             }
         }
-        let remedy = format!("have root take away the files in {} that no process holds", path.display());
+        let remedy = format!("as root, remove the files in {} that no process holds", path.display());
         Err(JournalError::LockFolder { path, what: lock.notes.join("; "), remedy })
     }
 
@@ -171,7 +171,7 @@ impl MachineLock {
                 continue;
             }
             if file.is_spoiled {
-                self.note(&path, "others have given it more names or bytes than a lock has");
+                self.note(&path, "it has more names or bytes than a lock can have");
             } else {
                 self.believe(&text_of(told), &path);
             }
@@ -179,7 +179,7 @@ impl MachineLock {
             self.told.extend(file.told);
             return Ok(Ok(()));
         }
-        Ok(Err("it is taken away again and again".to_owned()))
+        Ok(Err("it is removed repeatedly".to_owned()))
     }
 
     /// Reads the stored epoch. Rejects a value that no client of this computer can have used.
@@ -187,13 +187,13 @@ impl MachineLock {
         for text in kept.lines().filter_map(|line| line.strip_prefix(EPOCH)) {
             match text.trim().parse::<u32>() {
                 Ok(epoch) if epoch < (1 << EPOCH_BITS) - 1 => self.last_epoch = self.last_epoch.max(epoch),
-                _ => self.note(path, &format!("its epoch `{text}` is none that a client of this computer had")),
+                _ => self.note(path, &format!("its epoch `{text}` is not one of a client of this computer")),
             }
         }
     }
 
     fn note(&mut self, path: &Path, what: &str) {
-        self.notes.push(format!("{}: {what}; it was left alone", path.display()));
+        self.notes.push(format!("{}: {what}; it was ignored", path.display()));
     }
 
     /// Writes the holder and the epoch. Ignores write errors: the holder is information for people, the machine itself
@@ -318,7 +318,7 @@ mod strangers {
         let lays: [(&str, Lays); 5] = [
             ("it is a link", |lock, precious| symlink(precious, lock).unwrap()),
             ("it is a link", |lock, _| symlink("/nowhere/at all", lock).unwrap()),
-            ("it is no file", |lock, _| {
+            ("it is not a file", |lock, _| {
                 assert!(std::process::Command::new("mkfifo").arg(lock).status().unwrap().success());
             }),
             ("more names or bytes", |lock, precious| fs::hard_link(precious, lock).unwrap()),

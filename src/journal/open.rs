@@ -103,7 +103,7 @@ fn check_schema(connection: &Connection, path: &Path) -> Result<(), JournalError
         // SQLite creates an index of its own for each UNIQUE column.
         let is_automatic = sql.is_none() && kind == "index" && name.starts_with("sqlite_autoindex_record_");
         if !is_automatic && !sql.is_some_and(|sql| statements().any(|known| known == words(&sql))) {
-            return Err(foreign("it has a table, view, index or trigger that a record has not"));
+            return Err(foreign("it has a table, view, index or trigger that does not belong to a record"));
         }
         has_table |= kind == "table" && name == "record";
     }
@@ -136,7 +136,7 @@ pub(super) fn read_only(folder: &Path) -> Result<Connection, JournalError> {
         Err(error) if is_unopenable(&error) && is_beside("journal") => {
             return Err(JournalError::Foreign {
                 path,
-                what: "its making was cut off, and nothing in it was committed",
+                what: "its creation was interrupted, and nothing in it was committed",
             });
         }
         Err(error) if is_unopenable(&error) && !is_beside("wal") => {
@@ -186,7 +186,7 @@ fn recognise(folder: &Path, path: &Path) -> Result<u32, JournalError> {
     for beside in ["-wal", "-shm", "-journal"] {
         let beside = folder.join(format!("{DATABASE}{beside}"));
         if fs::symlink_metadata(&beside).is_ok_and(|found| !found.is_file()) {
-            return Err(JournalError::Foreign { path: beside, what: "it is no file" });
+            return Err(JournalError::Foreign { path: beside, what: "it is not a file" });
         }
     }
     let failed = JournalError::file(path, "reading it");
@@ -250,7 +250,7 @@ fn text_of(value: rusqlite::types::ValueRef<'_>) -> String {
 /// Syncs the names in a folder to the disk.
 pub(super) fn sync_folder(folder: &Path) -> Result<(), JournalError> {
     let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
-    system::sync_folder(folder).map_err(JournalError::file(folder, "bringing it to the disk"))
+    system::sync_folder(folder).map_err(JournalError::file(folder, "flushing it to the disk"))
 }
 
 /// Returns true if a folder is absent or empty.
@@ -258,7 +258,7 @@ pub(super) fn is_free(folder: &Path) -> Result<bool, JournalError> {
     match fs::read_dir(folder) {
         Ok(mut entries) => Ok(entries.next().is_none()),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(true),
-        Err(error) => Err(JournalError::file(folder, "looking into it")(error)),
+        Err(error) => Err(JournalError::file(folder, "inspecting it")(error)),
     }
 }
 
@@ -275,5 +275,5 @@ pub fn is_open_to_all(folder: &Path) -> bool {
 pub fn free_bytes(folder: &Path) -> Result<u64, JournalError> {
     let whole = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
     let there = whole.ancestors().find(|folder| folder.is_dir()).unwrap_or(&whole);
-    system::free_bytes(there).map_err(JournalError::file(there, "asking for its free space"))
+    system::free_bytes(there).map_err(JournalError::file(there, "reading its free space"))
 }

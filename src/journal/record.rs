@@ -247,12 +247,9 @@ impl Record {
         if self.seq != due {
             Some(format!("it is missing: record {} follows {records}", self.seq))
         } else if self.prev_hash != head {
-            Some(
-                "it does not follow the record before it: one of them was changed, moved, inserted or taken away"
-                    .into(),
-            )
+            Some("it does not follow the record before it: one of them was changed, moved, inserted or removed".into())
         } else if self.hash != self.hash_due() {
-            Some("its content is not what was written".into())
+            Some("its content was changed".into())
         } else {
             None
         }

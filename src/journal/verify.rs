@@ -128,9 +128,9 @@ pub fn anchor_of(folder: &Path) -> Result<Option<Anchor>, JournalError> {
 pub(super) fn read_anchor(folder: &Path) -> Result<Option<Anchor>, JournalError> {
     let path = folder.join(ANCHOR);
     match read_few(&path) {
-        Ok(bytes) => {
-            serde_json::from_slice(&bytes).map(Some).map_err(|_| broken(folder, 0, "journal.anchor is no anchor"))
-        }
+        Ok(bytes) => serde_json::from_slice(&bytes)
+            .map(Some)
+            .map_err(|_| broken(folder, 0, "journal.anchor is not a valid anchor")),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
         Err(error) => Err(JournalError::file(&path, "reading it")(error)),
     }
@@ -143,7 +143,7 @@ const MOST_OF_ANCHOR: u64 = 4096;
 /// end.
 fn read_few(path: &Path) -> io::Result<Vec<u8>> {
     if !fs::metadata(path)?.is_file() {
-        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no file"));
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is not a file"));
     }
     let mut bytes = Vec::new();
     fs::File::open(path)?.take(MOST_OF_ANCHOR).read_to_end(&mut bytes)?;
@@ -197,11 +197,11 @@ fn examine(folder: &Path, anchors: &[&Anchor], trusted: &[PublicKey]) -> Result<
     }
     if let Some(anchor) = anchors.iter().find(|anchor| anchor.records > seen.records) {
         let what =
-            format!("{} records were written, and {} are there: the end was cut off", anchor.records, seen.records);
+            format!("{} records were written, and {} are present: the end was cut off", anchor.records, seen.records);
         return Err(broken(folder, seen.records + 1, what));
     }
     if let Some(number) = reader.number_before_the_first()? {
-        return Err(broken(folder, 0, format!("a record with the number {number} stands before the first")));
+        return Err(broken(folder, 0, format!("a record with the number {number} precedes the first")));
     }
     if let Some(what) = seen.no_author {
         return Err(JournalError::NoAuthor { path: folder.to_owned(), what });
@@ -245,10 +245,10 @@ fn unrecorded(folder: &Path, recorded: &BTreeSet<String>) -> Result<Vec<String>,
 /// that is not a regular file.
 fn files_below(folder: &Path, below: &str, found: &mut Vec<String>) -> Result<(), JournalError> {
     let at = folder.join(below);
-    for entry in fs::read_dir(&at).map_err(JournalError::file(&at, "looking into it"))? {
-        let entry = entry.map_err(JournalError::file(&at, "looking into it"))?;
+    for entry in fs::read_dir(&at).map_err(JournalError::file(&at, "inspecting it"))? {
+        let entry = entry.map_err(JournalError::file(&at, "inspecting it"))?;
         let name = format!("{below}{}", entry.file_name().to_string_lossy());
-        match entry.file_type().map_err(JournalError::file(&at, "looking into it"))? {
+        match entry.file_type().map_err(JournalError::file(&at, "inspecting it"))? {
             kind if kind.is_dir() => files_below(folder, &format!("{name}/"), found)?,
             kind if kind.is_file() && !is_own(&name) => found.push(name),
             _ => {}
@@ -291,14 +291,14 @@ impl<'a> Seen<'a> {
             return wrong(&flaw);
         }
         if (record.kind == Kind::Begin) != (due == 1) {
-            return wrong("a run begins with its first record, and only there");
+            return wrong("only the first record can begin a run, and it must");
         }
         // Only one seal can follow the end.
         if self.ended.is_some_and(|end| record.kind != Kind::Seal || end < self.records) {
-            return wrong("it stands behind the end of the run");
+            return wrong("it follows the end of the run");
         }
         if serde_json::from_str::<serde::de::IgnoredAny>(&record.payload).is_err() {
-            return wrong("its payload is no JSON");
+            return wrong("its payload is not JSON");
         }
         match record.kind {
             Kind::Begin | Kind::Reopen => self.take_key(record)?,
@@ -325,15 +325,15 @@ impl<'a> Seen<'a> {
             Value::Null => None,
             key => match key.as_str().and_then(|key| key.parse().ok()) {
                 Some(key) => Some(key),
-                None => return wrong("it names a key that is none".to_owned()),
+                None => return wrong("it names an invalid key".to_owned()),
             },
         };
         let no_author = match self.key {
             _ if self.trusted.is_empty() => None,
             Some(key) if self.trusted.contains(&key) => None,
-            Some(key) => Some(format!("record {} names the key {key}, which is none of those given", record.seq)),
+            Some(key) => Some(format!("record {} names the key {key}, which is not one of the given keys", record.seq)),
             None if record.kind == Kind::Begin => Some("the run is not signed".to_owned()),
-            None => Some(format!("it was gone on with at record {} without a key", record.seq)),
+            None => Some(format!("it was resumed at record {} without a key", record.seq)),
         };
         self.no_author = self.no_author.take().or(no_author);
         self.keys.extend(self.key.filter(|key| !self.keys.contains(key)));
@@ -342,15 +342,15 @@ impl<'a> Seen<'a> {
 
     fn take_seal(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: &str| Err(broken(self.folder, record.seq, what));
-        let Ok(seal) = serde_json::from_str::<Seal>(&record.payload) else { return wrong("it is no seal") };
+        let Ok(seal) = serde_json::from_str::<Seal>(&record.payload) else { return wrong("it is not a valid seal") };
         let Some(key) = self.key.filter(|key| key.to_string() == seal.key) else {
-            return wrong("it is sealed with another key than the one that the run names");
+            return wrong("its key is not the one that the run names");
         };
         if (seal.records, &seal.head) != (self.records, &self.head) {
-            return wrong("it seals another record than the one before it");
+            return wrong("it does not seal the record before it");
         }
         if !is_signed(&key, &self.run, seal.records, &seal.head, &seal.signature) {
-            return wrong("its signature is wrong: who wrote it or what stands before it did not have the key");
+            return wrong("its signature is wrong: the author of it or of the records before it did not have the key");
         }
         self.seals += 1;
         self.signed = self.records;
@@ -364,7 +364,7 @@ impl<'a> Seen<'a> {
             return wrong("the anchor is of another run");
         }
         if anchor.head != self.head {
-            return wrong("its hash is not the one of the anchor: the journal was rewritten");
+            return wrong("its hash differs from that of the anchor: the journal was rewritten");
         }
         let Some(key) = &self.key else { return Ok(()) };
         match (&anchor.key, &anchor.signature) {
@@ -384,7 +384,7 @@ impl<'a> Seen<'a> {
             (Kind::Intent, None) => return wrong("a command has no number"),
             (Kind::Intent, Some(id)) => {
                 if self.last_intent.is_some_and(|last| id <= last) {
-                    return wrong("its command number was used before");
+                    return wrong("its command number was already used");
                 }
                 self.last_intent = Some(id);
                 self.open.insert(id);
@@ -411,7 +411,7 @@ impl<'a> Seen<'a> {
         // A file of another length is not read: it could have no end.
         let length = fs::metadata(&path).map(|found| found.len()).unwrap_or_default();
         if length != known.bytes || describe(&path, &known.name)? != known {
-            return wrong(format!("the file {} is not what was written", known.name));
+            return wrong(format!("the file {} was changed", known.name));
         }
         self.artefacts += 1;
         self.names.insert(known.name);

@@ -205,7 +205,7 @@ impl Journal {
                 // The log is created with the first record.
                 (Err(error), None) if error.kind() == std::io::ErrorKind::NotFound => {}
                 (Err(error), _) if error.kind() != std::io::ErrorKind::NotFound => {
-                    return Err(JournalError::file(&path, "looking for it")(error));
+                    return Err(JournalError::file(&path, "finding it")(error));
                 }
                 _ => return Err(JournalError::Gone { path }),
             }
@@ -233,8 +233,8 @@ impl Journal {
         let wrong = |what| Err(JournalError::Entry { kind: entry.kind.as_str(), what });
         match (entry.kind, entry.command_id) {
             (Kind::Intent, _) => wrong("gets its command number from `intend`"),
-            (Kind::Outcome, None) => wrong("needs the command number of its intent"),
-            (Kind::Begin, _) if self.tail.seq > 0 => wrong("stands first only"),
+            (Kind::Outcome, None) => wrong("requires the command number of its intent"),
+            (Kind::Begin, _) if self.tail.seq > 0 => wrong("must be the first"),
             (Kind::Seal, _) => wrong("is written by the journal itself"),
             _ => self.insert(entry).map(|record| record.seq),
         }
@@ -464,14 +464,14 @@ impl Journal {
         let (mut records, mut head) = (0, Tail::of_nothing().hash);
         if let Some(anchor) = read_anchor(&self.folder)? {
             if anchor.records > self.tail.seq {
-                let what = format!("{} records were written, and {} are there", anchor.records, self.tail.seq);
+                let what = format!("{} records were written, and {} are present", anchor.records, self.tail.seq);
                 return broken(self.tail.seq + 1, what);
             }
             let last = self.records(anchor.records).next().transpose()?.filter(|r| r.seq == anchor.records);
             if last.is_none_or(|record| record.hash != anchor.head) {
                 return broken(
                     anchor.records,
-                    "its hash is not the one of the anchor: the journal was rewritten".into(),
+                    "its hash differs from that of the anchor: the journal was rewritten".into(),
                 );
             }
             (records, head) = (anchor.records, anchor.head);

@@ -70,10 +70,10 @@ impl PlantRun {
             _ if last < self.records => {
                 let had = self.records;
                 format!(
-                    "the plant has {had} records, and the journal has {last}: its end was cut off after it was shipped"
+                    "the plant has {had} records, and the journal has {last}: its end was cut off after replication"
                 )
             }
-            _ => format!("record {} is not the one that was shipped: the journal was rewritten", self.records),
+            _ => format!("record {} differs from the replicated one: the journal was rewritten", self.records),
         };
         Err(PlantError::Differs { run: self.name.clone(), what })
     }
@@ -118,10 +118,10 @@ impl PlantRun {
                 let seq = u64::try_from(seq).unwrap_or(0);
                 let broken = |what: &str| JournalError::Broken { path: folder.to_owned(), seq, what: what.into() };
                 if seq != records.len() as u64 + 1 {
-                    return Err(broken("it does not follow the one before it: the plant lacks some").into());
+                    return Err(broken("it does not follow the record before it: the plant lacks records").into());
                 }
                 let record = Record::of_text(text, &head, &hash);
-                records.push(record.ok_or_else(|| broken("the plant has a text of it that no journal writes"))?);
+                records.push(record.ok_or_else(|| broken("its text in the plant is not that of a journal"))?);
                 head = hash;
             }
             if rows.len() < PAGE as usize {
@@ -142,7 +142,7 @@ impl PlantRun {
             true => Ok(verified),
             false => {
                 let [has, says] = [verified.records, self.records];
-                let what = format!("the plant has {has} records of it and counts {says}, or its last one is another");
+                let what = format!("the plant has {has} records of it and counts {says}, or the last record differs");
                 Err(PlantError::Differs { run: self.name.clone(), what })
             }
         }

@@ -24,11 +24,12 @@ pub enum PlantError {
     #[error("the database has the layout of Regrind {found}, and this program knows {known}; {remedy}")]
     Layout { found: i32, known: i32, remedy: &'static str },
     #[error(
-        "the layout of the database is not what was put there: migration {version} has another text; bring the database back from its backup"
+        "the layout of the database was changed: migration {version} has another text; restore the database from its \
+         backup"
     )]
     ForeignLayout { version: i32 },
     /// The records in the plant and those at the cell disagree.
-    #[error("{run}: {what}; keep both as they are, and compare: regrind audit verify --plant")]
+    #[error("{run}: {what}; change neither, and compare: regrind audit verify --plant")]
     Differs { run: String, what: String },
     #[error("the plant has no run {name:?} of {cell:?}; `regrind plant runs` lists them")]
     NoRun { cell: String, name: String },
@@ -36,7 +37,8 @@ pub enum PlantError {
     Recipe(String),
     #[error("part {work} of the queue: {why}; take another: regrind work")]
     Work { work: i64, why: String },
-    #[error("{}: the folder for large files cannot be used: {source}; check that it is there, and yours to write", .path.display())]
+    #[error("{}: the folder for large files cannot be used: {source}; check that it exists, and that you have the \
+             right to write in it", .path.display())]
     Folder { path: PathBuf, source: io::Error },
     #[error(transparent)]
     Journal(#[from] JournalError),
@@ -57,13 +59,13 @@ impl PlantError {
 pub(crate) fn refused(what: &'static str) -> impl Fn(tokio_postgres::Error) -> PlantError {
     move |error| {
         let Some(said) = error.as_db_error() else {
-            return PlantError::Unreachable { place: "the other end".into(), what: in_words(&error) };
+            return PlantError::Unreachable { place: "the server".into(), what: in_words(&error) };
         };
         // Errors that can pass: classes 57 (the server shuts down or starts), 53 (no space, too many connections), 08,
         // and 40 (a lost race).
         let passes = ["57", "53", "40", "08"].iter().any(|class| said.code().code().starts_with(class));
         if passes {
-            return PlantError::Unreachable { place: "the other end".into(), what: said.message().to_owned() };
+            return PlantError::Unreachable { place: "the server".into(), what: said.message().to_owned() };
         }
         let hint = said.hint().map_or(String::new(), |hint| format!("; {hint}"));
         PlantError::Refused { what, why: said.message().to_owned(), hint }

@@ -56,7 +56,7 @@ impl Knowledge {
         artefacts: Option<&ArtefactSettings>,
         (kind, simulation): (&str, bool),
     ) -> Result<Self, PlantError> {
-        let failed = refused("what other cells have learned");
+        let failed = refused("the learned errors of other cells");
         let mut knowledge = Self::default();
         let text = "SELECT $1::text, false, cell, run, sha256, content, place FROM lessons($1, $2)";
         let rows = link.client().query(text, &[&kind, &simulation]).await.map_err(&failed)?;
@@ -90,10 +90,10 @@ impl Knowledge {
             match given(&row, artefacts, simulation) {
                 Ok(given) => believed.push(given),
                 Err(why) => {
-                    let words = format!("what {run} of {cell} is said to have learned is left alone: {why}");
+                    let words = format!("the learned error of {run} of {cell} is ignored: {why}");
                     let values: [&(dyn ToSql + Sync); 3] = [&run, &"a lesson refused", &words];
                     let told = link.client().query_one("SELECT complain($1, $2, $3)", &values).await;
-                    told.map_err(refused("to be told what is wrong"))?;
+                    told.map_err(refused("the report of a problem"))?;
                     self.left_alone.push(words);
                 }
             }
@@ -113,10 +113,10 @@ fn given(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> R
             let name = digits(sha256);
             bounded(&kept.folder.join(&name[..2]).join(&name)).map_err(|error| error.to_string())?
         }
-        (None, None) => return Err("its file is in a folder that this plant file does not name by [artefacts]".into()),
+        (None, None) => return Err("its file is in a folder that [artefacts] of this plant file does not name".into()),
     };
     if sha256_hex(&content) != digits(sha256) {
-        return Err("it is not what was on record".into());
+        return Err("it differs from the record".into());
     }
     let place: PathBuf = [&from.cell, &from.run, LEARNED].iter().collect();
     let learned = Learned::of_another(&place, &content, &kind, simulation).map_err(|error| error.to_string())?;
@@ -129,14 +129,14 @@ fn bounded(path: &Path) -> io::Result<Vec<u8>> {
     fs::File::open(path)?.take(MOST_BYTES + 1).read_to_end(&mut content)?;
     match content.len() as u64 {
         0..=MOST_BYTES => Ok(content),
-        _ => Err(io::Error::other(format!("it is larger than the {MOST_BYTES} bytes of any lesson"))),
+        _ => Err(io::Error::other(format!("it is larger than the limit of {MOST_BYTES} bytes"))),
     }
 }
 
 /// Registers in the plant what a finished run of this cell has learned; all files of the run have arrived. Returns the
 /// reason if the plant refuses.
 pub(crate) async fn teach(link: &Link, folder: &Path, id: i32) -> Result<Option<String>, PlantError> {
-    let failed = refused("what a run has learned");
+    let failed = refused("the learned error of a run");
     let text = "SELECT a.sha256 FROM run_artefact a WHERE a.run = $1 AND a.name = $2 AND NOT EXISTS (SELECT FROM lesson l WHERE l.run = $1)";
     let Some(row) = link.client().query_opt(text, &[&id, &LEARNED]).await.map_err(&failed)? else { return Ok(None) };
     let sha256: &[u8] = row.get(0);

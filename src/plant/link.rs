@@ -35,7 +35,7 @@ impl Link {
         let proof = regrind_trust::proof(&settings.host, settings.certificates.as_deref(), "[database]")?;
         let config = config(settings, proof.is_some())?;
         let unreached = |what: String| PlantError::Unreachable { place: place.clone(), what };
-        let late = |_| unreached(format!("nothing came within {} s", PATIENCE.as_secs()));
+        let late = |_| unreached(format!("no answer within {} s", PATIENCE.as_secs()));
         let client = match proof {
             Some(proof) => {
                 let opened = tokio::time::timeout(PATIENCE, config.connect(MakeRustlsConnect::new(proof)))
@@ -70,7 +70,7 @@ impl Link {
     /// # Errors
     /// The database cannot be reached, or refuses the query.
     pub async fn ask(&self, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<Vec<Row>, PlantError> {
-        self.client.query(text, values).await.map_err(refused("what it was asked"))
+        self.client.query(text, values).await.map_err(refused("the query"))
     }
 
     /// Reports the state of the cell, in the run of this name.
@@ -79,7 +79,7 @@ impl Link {
     /// The database cannot be reached, or refuses the report.
     pub async fn tell_state(&self, run: Option<&str>, snapshot: &Value) -> Result<(), PlantError> {
         let told = self.client.execute("SELECT tell_state($1, $2::text::jsonb)", &[&run, &snapshot.to_string()]).await;
-        told.map(drop).map_err(refused("how the cell is"))
+        told.map(drop).map_err(refused("the state of the cell"))
     }
 
     /// Returns true if the connection is closed.
@@ -100,7 +100,7 @@ fn unopened(place: &str, error: &tokio_postgres::Error) -> PlantError {
         // Classes 28 (invalid authorisation), 3D and 42 (no such database or role).
         Some(said) if ["28", "3D", "42"].iter().any(|class| said.code().code().starts_with(class)) => {
             PlantError::Refused {
-                what: "to let this computer in",
+                what: "the login of this computer",
                 why: said.message().to_owned(),
                 hint: "; check name, user and password of [database]".into(),
             }

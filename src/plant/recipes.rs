@@ -69,7 +69,7 @@ impl PlantRecipe {
         let text = "SELECT sha256, refused FROM propose_recipe($1, $2, $3, $4, $5)";
         let row = link.client().query_one(text, &values).await.map_err(&failed)?;
         if let Some(why) = row.get::<_, Option<String>>(1) {
-            return Err(PlantError::Recipe(format!("{why}; nothing was brought")));
+            return Err(PlantError::Recipe(format!("{why}; nothing was stored")));
         }
         Ok(digits(row.get(0)))
     }
@@ -111,7 +111,8 @@ impl PlantRecipe {
             Err(error) if error.code() == Some(&tokio_postgres::error::SqlState::UNIQUE_VIOLATION) => {
                 let Self { name, version, .. } = self;
                 let what = format!(
-                    "version {version} of {name} is signed by {person} or by this key already; another person signs it"
+                    "version {version} of {name} is already signed by {person} or with this key; another person must \
+                     sign it"
                 );
                 Err(PlantError::Recipe(what))
             }
@@ -151,7 +152,7 @@ impl PlantRecipe {
             Err(what) => {
                 let values: [&(dyn ToSql + Sync); 2] = [&"recipe refused", &what];
                 let told = link.client().query_one("SELECT complain(NULL, $1, $2)", &values).await;
-                told.map_err(refused("to be told what is wrong"))?;
+                told.map_err(refused("the report of a problem"))?;
                 Err(PlantError::Recipe(what))
             }
         }
@@ -173,7 +174,8 @@ fn proven(
     let PlantRecipe { name, version, .. } = &recipe;
     if recipe.sha256() != sha256 {
         return Err(format!(
-            "what the plant gives as version {version} of {name} is not what has the hash {sha256}: name, version, text or a file was changed"
+            "version {version} of {name} from the plant does not have the hash {sha256}: name, version, text or a \
+             file was changed"
         ));
     }
     let has_signed = |approver: &&Approver| {
@@ -192,9 +194,10 @@ fn proven(
     signed.dedup_by(|a, b| a.name == b.name);
     if signed.len() < SIGNERS {
         let by = signed.iter().map(|of| of.name.as_str()).collect::<Vec<_>>().join(", ");
-        let by = if by.is_empty() { "nobody".to_owned() } else { by };
+        let by = if by.is_empty() { "none".to_owned() } else { by };
         return Err(format!(
-            "version {version} of {name} is signed by {by} of those in this cell's plant file, and two must have signed it: regrind plant approve"
+            "version {version} of {name} is signed by {by} of the persons in this cell's plant file; two signatures \
+             are required: regrind plant approve"
         ));
     }
     let signed = signed.into_iter().map(|of| of.name.clone()).collect();
@@ -251,7 +254,7 @@ mod tests {
             assert!(of(&other, &both, &known).unwrap_err().contains("was changed"));
             // With its own hash it is consistent, but nobody has signed it.
             let own = proven(other.clone(), &other.sha256(), &both, &known).unwrap_err();
-            assert!(own.contains("signed by nobody"), "{own}");
+            assert!(own.contains("signed by none"), "{own}");
         }
         let too_few = [
             (signed(&good, &[("Ada", &ada)]), known.to_vec()),
@@ -269,7 +272,10 @@ mod tests {
             (both.clone(), Vec::new()),
         ];
         for (approvals, approvers) in too_few {
-            assert!(of(&good, &approvals, &approvers).unwrap_err().contains("two must have signed"), "{approvals:?}");
+            assert!(
+                of(&good, &approvals, &approvers).unwrap_err().contains("two signatures are required"),
+                "{approvals:?}"
+            );
         }
     }
 }

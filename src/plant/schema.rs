@@ -27,7 +27,7 @@ const LOCK: i64 = 0x5267_7264_506c_616e;
 /// # Errors
 /// The role may not, a later program has laid out the database, or its layout was changed by hand.
 pub async fn migrate(link: &mut Link) -> Result<[i32; 2], PlantError> {
-    let failed = refused("to be laid out");
+    let failed = refused("its layout");
     let client = link.client_mut();
     let step = client.transaction().await.map_err(&failed)?;
     step.execute("SELECT pg_advisory_xact_lock($1)", &[&LOCK]).await.map_err(&failed)?;
@@ -67,14 +67,14 @@ pub async fn migrate(link: &mut Link) -> Result<[i32; 2], PlantError> {
 /// The layout is older, later or different.
 pub async fn is_known(client: &Client) -> Result<(), PlantError> {
     let layout = |found, remedy| PlantError::Layout { found, known: known(), remedy };
-    let older = "bring it up as its owner: regrind plant init";
+    let older = "update it as its owner: regrind plant init";
     let rows = match client.query("SELECT version, sha256 FROM regrind.migration ORDER BY version", &[]).await {
         Ok(rows) => rows,
         // The table or the schema does not exist.
         Err(error) if error.code().is_some_and(|code| ["42P01", "3F000"].contains(&code.code())) => {
             return Err(layout(0, older));
         }
-        Err(error) => return Err(refused("to tell its layout")(error)),
+        Err(error) => return Err(refused("the query of its layout")(error)),
     };
     let applied: Vec<(i32, String)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
     match held_against_ours(&applied)? {
@@ -92,7 +92,7 @@ fn held_against_ours(applied: &[(i32, String)]) -> Result<i32, PlantError> {
     for (k, (version, sha256)) in applied.iter().enumerate() {
         match MIGRATIONS.get(k) {
             None => {
-                let remedy = "use the version of Regrind that laid it out, or a later one";
+                let remedy = "use the version of Regrind that made this layout, or a later one";
                 return Err(PlantError::Layout { found: applied[applied.len() - 1].0, known: known(), remedy });
             }
             Some((ours, text)) if ours == version && regrind_journal::sha256_hex(text.as_bytes()) == *sha256 => {}

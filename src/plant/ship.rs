@@ -169,7 +169,7 @@ impl Shipper {
         id: i32,
         shipped: &mut Shipped,
     ) -> Result<[u64; 2], PlantError> {
-        let failed = refused("to tell which files it lacks");
+        let failed = refused("the query of missing files");
         let rows = link.client().query("SELECT name, sha256, bytes FROM missing_artefacts($1)", &[&id]).await;
         let mut files = [0; 2];
         for row in rows.map_err(failed)? {
@@ -198,7 +198,7 @@ impl Shipper {
     ) -> Result<Option<String>, PlantError> {
         let read = match fs::metadata(path) {
             Ok(found) if found.len() == bytes => fs::read(path),
-            Ok(_) => return Ok(Some("is not what was written".into())),
+            Ok(_) => return Ok(Some("was changed".into())),
             Err(error) => Err(error),
         };
         let content = match read {
@@ -206,7 +206,7 @@ impl Shipper {
             Err(error) => return Ok(Some(format!("cannot be read: {error}"))),
         };
         if sha256_hex(&content) != digits(sha256) {
-            return Ok(Some("is not what was written".into()));
+            return Ok(Some("was changed".into()));
         }
         let failed = refused("the content of a file");
         if let Some(kept) = self.artefacts.as_ref().filter(|kept| bytes as f64 >= kept.from_mb * 1e6) {
@@ -219,7 +219,7 @@ impl Shipper {
         if bytes > LARGEST_BYTES {
             let most = LARGEST_BYTES >> 20;
             return Ok(Some(format!(
-                "has {} MB, and the database takes {most}: name a folder by [artefacts]",
+                "has {} MB, and the database accepts at most {most} MB: name a folder in [artefacts]",
                 bytes >> 20
             )));
         } else {
@@ -309,13 +309,13 @@ fn has_end(folder: &Path, last: &Record) -> Result<bool, PlantError> {
 
 async fn complain(link: &Link, run: &str, what: &str, words: &str) -> Result<(), PlantError> {
     let told = link.client().query_one("SELECT complain($1, $2, $3)", &[&run, &what, &words]).await;
-    told.map(drop).map_err(refused("to be told what is wrong"))
+    told.map(drop).map_err(refused("the report of a problem"))
 }
 
 async fn tell_run(link: &Link, id: i32, told: &Value) -> Result<(), PlantError> {
     let text = told.to_string();
     let asked = link.client().execute("SELECT tell_run($1, $2::text::jsonb)", &[&id, &text]).await;
-    asked.map(drop).map_err(refused("what a glance shows of a run"))
+    asked.map(drop).map_err(refused("the status of a run"))
 }
 
 /// Returns the summary of a run from its record: result, limits, machines, and the figures of each cycle in µm.

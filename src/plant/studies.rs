@@ -54,7 +54,7 @@ impl Study {
         let asked = "SELECT new_study($1, $2, $3, $4, $5, $6::text[]::jsonb[], $7)";
         match link.client().query_one(asked, &values).await {
             Err(error) if error.code() == Some(&tokio_postgres::error::SqlState::UNIQUE_VIOLATION) => {
-                let what = format!("there is a study {name:?}; give this one another name");
+                let what = format!("a study {name:?} already exists; give this one another name");
                 Err(PlantError::Recipe(what))
             }
             other => other.map(|_| seeds.len() * variations.len()).map_err(refused("the study")),

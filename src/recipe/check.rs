@@ -60,14 +60,19 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
             ("height_unit", written.height_unit.is_some()),
         ];
         for (key, _) in of_points.into_iter().filter(|(_, there)| *there) {
-            document.report(&format!("nominal.{key}"), "is for points of a file", "", "leave it out");
+            document.report(&format!("nominal.{key}"), "is only for a file of points", "", "remove it");
         }
         return formula(written, document);
     };
     for (key, there) in [("surface", written.surface.is_some()), ("sampling", written.sampling.is_some())] {
         if there {
             let key = format!("nominal.{key}");
-            document.report(&key, "stands beside `nominal.file`", "the nominal surface has one source", from_formula);
+            document.report(
+                &key,
+                "is given together with `nominal.file`",
+                "the nominal surface has one source",
+                from_formula,
+            );
         }
     }
     let aperture = written.aperture.clone().and_then(|table| aperture(table, document));
@@ -146,8 +151,13 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
     let risk = written.measure.accepted_risk;
     if written.measure.mode == Mode::Fixed {
         if risk.is_some() {
-            let remedy = "leave it out, or write `mode = \"adaptive\"`";
-            document.report("measure.accepted_risk", "is for mode adaptive", "all targets are touched", remedy);
+            let remedy = "remove it, or write `mode = \"adaptive\"`";
+            document.report(
+                "measure.accepted_risk",
+                "is only for mode adaptive",
+                "mode fixed touches all targets",
+                remedy,
+            );
         }
         return;
     }
@@ -155,8 +165,8 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "measure.accepted_risk",
             "is missing",
-            "a part of which only some targets are touched may be accepted though it is not in tolerance",
-            "consent to a probability for that: `accepted_risk = 0.025`",
+            "mode adaptive touches only some targets, so it can accept a part that is out of tolerance",
+            "state the probability that you accept: `accepted_risk = 0.025`",
         );
     }
     if let (Some(risk), Some(probability)) = (risk, written.acceptance.probability)
@@ -165,19 +175,19 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "measure.accepted_risk",
             format!(
-                "is {risk}, less than the {:.3} that `acceptance.probability`, {probability}, leaves",
+                "is {risk}, less than {:.3}, the risk that `acceptance.probability`, {probability}, leaves",
                 1.0 - probability
             ),
-            "who judges may not err more often than the whole measurement",
+            "the risk of the verdict must not exceed the risk of the whole measurement",
             &format!("raise it to {:.3}, or the probability to {:.3}", 1.0 - probability, 1.0 - risk),
         );
     }
     if written.measure.pattern == PatternWord::Free {
-        let remedy = "lay a pattern, or write `mode = \"fixed\"`";
+        let remedy = "choose another pattern, or write `mode = \"fixed\"`";
         document.report(
             "measure.mode",
             "is adaptive",
-            "targets are chosen from a pattern, and this one is free",
+            "it chooses targets from a pattern, and the pattern \"free\" has none",
             remedy,
         );
     }
@@ -185,16 +195,17 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "acceptance.expanded_uncertainty",
             "is false",
-            "figures told from some of the targets are no figures without their uncertainty",
-            "make it true, or write `mode = \"fixed\"`",
+            "figures of some of the targets require their uncertainty",
+            "write `expanded_uncertainty = true`, or `mode = \"fixed\"`",
         );
     }
     if !written.measure.qualify {
         document.report(
             "measure.qualify",
             "is false",
-            "in mode adaptive the reference sphere tells how far the probe scatters: the rest is form between the touches",
-            "let it be touched, or write `mode = \"fixed\"`",
+            "mode adaptive measures the noise of the probe on the reference sphere, to separate it from form between \
+             the touches",
+            "write `qualify = true`, or `mode = \"fixed\"`",
         );
     }
 }
@@ -205,14 +216,14 @@ fn measure(written: &Measure, document: &mut Document) {
             "measure.safe_height_mm",
             format!("is {} mm, less than `approach_mm`, {} mm", written.safe_height_mm, written.approach_mm),
             "the probe must travel above the points it approaches from",
-            "raise it, or approach from nearer",
+            "raise it, or lower `approach_mm`",
         );
     }
     if let Some([least, most]) = written.temperature_c
         && least >= most
     {
         let found = format!("is [{least}, {most}]");
-        document.report("measure.temperature_c", found, "the first must be less than the second", "interchange them");
+        document.report("measure.temperature_c", found, "the first must be less than the second", "swap them");
     }
 }
 
@@ -231,15 +242,15 @@ fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<
         PatternWord::Grid => ("grid", &["spacing_mm", "columns", "rows"][..], "`spacing_mm`, or `columns` and `rows`"),
         PatternWord::Spiral => ("spiral", &["spacing_mm", "points"][..], "`spacing_mm` or `points`"),
         PatternWord::File => ("file", &["file", "file_columns", "file_unit", "file_height_unit"][..], "`file`"),
-        PatternWord::Free => ("free", &["points"][..], "`points`, the least number of them"),
+        PatternWord::Free => ("free", &["points"][..], "`points`, the minimum number of points"),
     };
-    let allowed = format!("the pattern \"{name}\" takes {needs}");
+    let allowed = format!("the pattern \"{name}\" requires {needs}");
     for (key, _) in keys.iter().filter(|(key, there)| *there && !takes.contains(key)) {
         document.report(
             &format!("measure.{key}"),
             "is not for this pattern",
             &allowed,
-            "leave it out, or change `pattern`",
+            "remove it, or change `pattern`",
         );
     }
     let found = match (written.pattern, written.spacing_mm, (written.columns, written.rows), written.points) {
@@ -268,11 +279,11 @@ fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<
         let given: Vec<&str> =
             keys.iter().filter(|(key, there)| *there && takes.contains(key)).map(|(key, _)| *key).collect();
         let found = if given.is_empty() {
-            "has no density or place of its points".into()
+            "has no spacing, number or file of points".into()
         } else {
             format!("has {}", given.join(", "))
         };
-        document.report("measure", found, &allowed, "give just these");
+        document.report("measure", found, &allowed, "give exactly these keys");
     }
     found
 }
@@ -281,13 +292,13 @@ fn registration(written: &RegistrationSettings, document: &mut Document) {
     if !written.lock.is_empty() && written.start == StartAt::Search {
         document.report(
             "registration.lock",
-            "holds coordinates while `start` is \"search\"",
-            "a held coordinate stays where the fixture has it",
-            "write `start = \"fixture\"`, or hold nothing",
+            "locks directions while `start` is \"search\"",
+            "a locked direction keeps the value of the fixture",
+            "write `start = \"fixture\"`, or lock no direction",
         );
     }
     if Coordinate::locked(&written.lock) == [true; 6] {
-        document.report("registration.lock", "holds all six coordinates", "at least one must be free", "leave one out");
+        document.report("registration.lock", "locks all six directions", "at least one must be free", "remove one");
     }
 }
 
@@ -296,13 +307,13 @@ fn acceptance(written: &Acceptance, document: &mut Document) {
     match (written.pv_um, written.rms_um) {
         (None, None) if !broken && document.is_there("acceptance") => {
             let remedy = "add `rms_um = 1.0`, or `pv_um = 7.0`, or both";
-            document.report("acceptance", "has no limit", "at least one of `pv_um` and `rms_um` must be given", remedy);
+            document.report("acceptance", "has no limit", "at least one of `pv_um` and `rms_um` is required", remedy);
         }
         (Some(pv), Some(rms)) if pv < rms => document.report(
             "acceptance.pv_um",
-            format!("is {} um, less than `rms_um`, {} um", pv.0, rms.0),
-            "a peak to valley is never less than the rms",
-            "raise it, or are the two interchanged?",
+            format!("is {} µm, less than `rms_um`, {} µm", pv.0, rms.0),
+            "PV is never less than RMS",
+            "raise it, or check whether the two are swapped",
         ),
         _ => {}
     }
@@ -310,8 +321,8 @@ fn acceptance(written: &Acceptance, document: &mut Document) {
         document.report(
             "acceptance.probability",
             format!("is {probability}, and `expanded_uncertainty` is false"),
-            "without its uncertainty a figure has no probability of being within its limit",
-            "leave one of the two out",
+            "the probability requires the uncertainty of the figure",
+            "remove one of the two",
         );
     }
 }
@@ -322,8 +333,8 @@ fn compensation(written: &Compensation, document: &mut Document) {
         if um > budget {
             document.report(
                 &format!("compensation.{key}"),
-                format!("is {} um, more than `removal_budget_um`, {} um", um.0, budget.0),
-                "nothing may take off more than the budget",
+                format!("is {} µm, more than `removal_budget_um`, {} µm", um.0, budget.0),
+                "no pass may remove more than the budget",
                 "lower it, or raise the budget",
             );
         }
@@ -332,8 +343,8 @@ fn compensation(written: &Compensation, document: &mut Document) {
     if cutoff < least {
         document.report(
             "compensation.cutoff_mm",
-            format!("is {cutoff} mm, less than two nodes of the map, {least} mm"),
-            "a wavelength takes two nodes at least",
+            format!("is {cutoff} mm, less than two spacings of the map, {least} mm"),
+            "a wavelength requires at least two nodes",
             "raise it, or lower `compensation.spacing_mm`",
         );
     }
@@ -341,8 +352,8 @@ fn compensation(written: &Compensation, document: &mut Document) {
         document.report(
             "compensation.gain",
             format!("is {gain}, and `gain_by` is {by:?}"),
-            "the share is fixed or chosen, not both",
-            "leave one of the two out",
+            "the gain is either fixed or chosen",
+            "remove one of the two",
         );
     }
 }
@@ -353,40 +364,39 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
     let Some(parameters) = written.compensation.parameters else { return };
     let tolerances = parameters.tolerances();
     if tolerances.iter().all(Option::is_none) && !document.has_problem(KEY) {
-        let remedy =
-            "add `wheel_radius_um = 100.0`, the uncertainty with which the wheel is known, or leave the table out";
-        document.report(KEY, "has no parameter", "one that is to be taken back must stand", remedy);
+        let remedy = "add `wheel_radius_um = 100.0`, the uncertainty of the wheel's radius, or remove the table";
+        document.report(KEY, "has no parameter", "at least one parameter to compensate is required", remedy);
     }
     if written.cycle.begin_with == Beginning::Measure {
         document.report(
             KEY,
-            "stands in a recipe that begins with a measurement",
-            "parameters are told by what the first pass leaves, and this part was not left by a pass of ours",
-            "write `begin_with = \"grind\"`, or leave the table out",
+            "is set in a recipe that begins with a measurement",
+            "parameters are estimated from the error after the first pass, and this part has had no pass of this run",
+            "write `begin_with = \"grind\"`, or remove the table",
         );
     }
     if written.measure.side == ProbeSide::Below {
         document.report(
             KEY,
-            "stands in a recipe whose part is worked on from below",
-            "parameters are told of a wheel that comes from +z",
-            "leave the table out: the map takes them back",
+            "is set in a recipe whose part is ground from below",
+            "the estimate requires a wheel that comes from +z",
+            "remove the table: the map then corrects these errors",
         );
     }
     if written.grinding.tilt.is_some() {
         document.report(
             KEY,
-            "stands beside grinding.tilt",
-            "parameters are told of a wheel that stays upright",
-            "leave one of the two out: the map takes them back",
+            "is set together with grinding.tilt",
+            "the estimate requires a wheel that stays upright",
+            "remove one of the two: without the table the map corrects these errors",
         );
     }
     if parameters.wheel_radius_um.is_some() && !matches!(written.grinding.wheel, Wheel::Sphere { .. }) {
         document.report(
             "compensation.parameters.wheel_radius_um",
-            "stands beside a wheel that is no ball",
-            "only of a ball it is known what another radius leaves",
-            "leave it out: the map takes it back",
+            "requires a spherical wheel",
+            "the error that another radius leaves is known only for a sphere",
+            "remove it: the map then corrects this error",
         );
     }
     let registration = &written.registration;
@@ -402,16 +412,16 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
         if !held[k] {
             document.report(
                 &format!("{KEY}.{key}"),
-                format!("stands while `registration.lock` does not hold {coordinate}"),
-                "what moves with the registration looks the same as a part that lies elsewhere",
-                &format!("leave it out, or hold \"{coordinate}\" where the fixture does"),
+                format!("is set while `registration.lock` does not lock {coordinate}"),
+                "in a free direction this error looks the same as another position of the part",
+                &format!("remove it, or lock \"{coordinate}\" if the fixture holds it"),
             );
         } else if registration.lock_uncertainty_um.is_none() {
             document.report(
                 &format!("{KEY}.{key}"),
-                "stands without `registration.lock_uncertainty_um`",
-                "it is told no better than the fixture holds the part",
-                "add it: `lock_uncertainty_um = 0.5` in [registration]",
+                "requires `registration.lock_uncertainty_um`",
+                "the estimate is no better than the fixture holds the part",
+                "add `lock_uncertainty_um = 0.5` to [registration]",
             );
         }
     }
@@ -429,16 +439,16 @@ fn grinding(written: &Grinding, document: &mut Document) {
         document.report(
             "grinding.wheel.minor_radius_mm",
             format!("is {minor_radius_mm} mm, more than `radius_mm`, {radius_mm} mm"),
-            "the rim's own curve is inside the wheel",
-            "are the two interchanged?",
+            "the curve of the rim must be inside the wheel",
+            "check whether the two are swapped",
         );
     }
     if written.one_way && written.pattern == TrackPattern::Spiral {
         document.report(
             "grinding.one_way",
             "is set for a spiral",
-            "only a raster has tracks that could alternate",
-            "leave it out",
+            "only the tracks of a raster can alternate",
+            "remove it",
         );
     }
     if let Some(tilt) = written.tilt
@@ -448,9 +458,9 @@ fn grinding(written: &Grinding, document: &mut Document) {
     {
         document.report(
             "grinding.tilt.angle_deg",
-            format!("is {} for a ball that follows the surface", tilt.angle_deg),
-            "its pole would touch, which stands still",
-            "lean it by 2 degrees or more, 15 to 45 as a rule, to either side",
+            format!("is {}° for a spherical wheel that follows the surface", tilt.angle_deg),
+            "the wheel would touch at its pole, which has no cutting speed",
+            "tilt it by at least 2° to either side, usually 15° to 45°",
         );
     }
     if let Some(track_mm) = written.track_mm.filter(|track_mm| *track_mm > wheel.radius_mm()) {
@@ -470,17 +480,17 @@ fn compare_tables(written: &RecipeFile, document: &mut Document) {
     {
         document.report(
             "registration.max_rms_um",
-            format!("is {} um, less than `acceptance.rms_um`, {} um", most.0, rms.0),
-            "a good part would be refused",
-            "raise it well above the first cycle's rms, or leave it out",
+            format!("is {} µm, less than `acceptance.rms_um`, {} µm", most.0, rms.0),
+            "the registration would reject a good part",
+            "raise it well above the RMS of the first cycle, or remove it",
         );
     }
     if written.compensation.learn && written.cycle.begin_with == Beginning::Measure {
         document.report(
             "compensation.learn",
             "is true, and `cycle.begin_with` is \"measure\"".to_owned(),
-            "what was learned is ground in with the first pass, and a part that is measured first has had its pass already",
-            "leave one of the two out",
+            "learning acts in the first pass, and a part that is measured first has already had that pass",
+            "remove one of the two",
         );
     }
     let (Um(allowance), Um(depth)) = (written.grinding.allowance_um, written.compensation.depth_of_cut_um);
@@ -488,7 +498,7 @@ fn compare_tables(written: &RecipeFile, document: &mut Document) {
     if allowance > depth * f64::from(cycles.saturating_sub(1)) {
         document.report(
             "grinding.allowance_um",
-            format!("is {allowance} um, which {cycles} cycles of {depth} um never take off"),
+            format!("is {allowance} µm, which {cycles} cycles of {depth} µm cannot remove"),
             "the last pass must reach the nominal surface",
             "lower it, or raise `cycle.max_cycles` or `compensation.depth_of_cut_um`",
         );
@@ -519,7 +529,7 @@ fn compare_with_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Doc
         document.report(
             "measure.edge_margin_mm",
             format!("is {} mm on a part of {:.4} x {:.4} mm", measure.edge_margin_mm, size_mm[0], size_mm[1]),
-            "nothing would be left to measure",
+            "no area would remain to measure",
             "lower it",
         );
     } else if let Some(spacing) = measure.spacing_mm {
@@ -554,7 +564,7 @@ fn compare_spacing(spacing_mm: f64, left_mm: [f64; 2], document: &mut Document) 
         let allowed = format!("that makes {points:.1e} points; at most {MOST_POINTS:.0e} are allowed");
         document.report("measure.spacing_mm", found, &allowed, "choose a coarser spacing");
     } else if spacing_mm > left_mm[0].min(left_mm[1]) {
-        let allowed = "it must be less than the part is wide";
+        let allowed = "it must be at most the smaller side";
         document.report("measure.spacing_mm", found, allowed, "choose a finer spacing");
     }
 }
@@ -563,8 +573,8 @@ fn compare_cutoff(cutoff_mm: f64, apart_mm: f64, document: &mut Document) {
     if cutoff_mm < 2.0 * apart_mm {
         document.report(
             "compensation.cutoff_mm",
-            format!("is {cutoff_mm} mm where points are measured {apart_mm:.4} mm apart"),
-            &format!("a wavelength takes two points; it must be at least {:.4} mm", 2.0 * apart_mm),
+            format!("is {cutoff_mm} mm, with measured points {apart_mm:.4} mm apart"),
+            &format!("a wavelength requires two points: it must be at least {:.4} mm", 2.0 * apart_mm),
             "raise it, or measure more points",
         );
     }
@@ -593,11 +603,11 @@ fn compare_with_curvature(written: &RecipeFile, surface: &DefinedSurface, docume
             document.report(
                 key,
                 format!(
-                    "is {ball_mm} mm where the surface is hollow with {radius_mm:.4} mm at ({:.3}, {:.3}) mm",
+                    "is {ball_mm} mm; the surface is concave with a radius of {radius_mm:.4} mm at ({:.3}, {:.3}) mm",
                     place[0], place[1]
                 ),
-                "a ball must be smaller than the hollow it works in",
-                "take a smaller one, or check the formula",
+                "the radius must be less than the concave radius",
+                "choose a smaller one, or check the formula",
             );
         }
     }

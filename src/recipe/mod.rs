@@ -165,7 +165,7 @@ impl Recipe {
         let made = written.as_ref().map(|written| check::check(written, path, &mut document));
         document.finish()?;
         let (Some(written), Some((Some(nominal), Some(pattern)))) = (written, made) else {
-            let found = "something is missing".into();
+            let found = "a required value is missing".into();
             return Err(Problems::whole(path, text, found, "compare it with a shipped recipe"));
         };
         let RecipeFile { part, measure, registration, acceptance, compensation, grinding, cycle, simulation, .. } =

@@ -473,12 +473,12 @@ fn what_is_doubtful_is_said_as_a_warning() {
     bench.write("unended.csv", lines.trim_end());
     let told = warned("unended.csv", &[]);
     assert!(
-        told.len() == 1 && told[0].starts_with("unended.csv, line 1500: ") && told[0].contains("see that"),
+        told.len() == 1 && told[0].starts_with("unended.csv, line 1500: ") && told[0].contains("check that"),
         "{told:?}"
     );
     bench.write("cut.csv", &lines[..lines.len() - 3]);
     let told = warned("cut.csv", &[]);
-    assert!(told.len() == 1 && told[0].contains("has 4 digits where the lines above have 6"), "{told:?}");
+    assert!(told.len() == 1 && told[0].contains("has 4 digits; the lines above have 6"), "{told:?}");
 }
 
 #[test]

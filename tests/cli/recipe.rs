@@ -270,11 +270,11 @@ fn registers_and_signals_are_read() {
 type BadValue = (&'static str, &'static str, &'static str, &'static str);
 
 const BAD_RECIPE_VALUES: &[BadValue] = &[
-    (RECIPE, "measure.probe_radius_mm", "1500", "write 1.5 millimetres"),
+    (RECIPE, "measure.probe_radius_mm", "1500", "write 1.5 (mm)"),
     (RECIPE, "measure.probe_radius_mm", "'1.5'", "remove the quotes: 1.5"),
     (RECIPE, "measure.probe_radius_mm", "'1,5'", "decimal point"),
     (RECIPE, "measure.probe_radius_mm", "nan", "0.05 to 50 mm"),
-    (RECIPE, "measure.probe_radius_mm", "-inf", "1.5 is usual"),
+    (RECIPE, "measure.probe_radius_mm", "-inf", "the usual value is 1.5"),
     (RECIPE, "measure.probe_radius_mm", "'1.5 mm'", "without its unit"),
     (RECIPE, "measure.columns", "60.5", "without a decimal point"),
     (RECIPE, "measure.pattern", "\"gird\"", "did you mean \"grid\""),
@@ -283,11 +283,11 @@ const BAD_RECIPE_VALUES: &[BadValue] = &[
     (RECIPE, "measure.safe_height_mm", "1.0", "raise it"),
     (RECIPE, "measure.min_coverage", "95", "0.1 to 1"),
     (RECIPE, "measure.qualify", "\"yes\"", "true or false"),
-    (RECIPE, "acceptance.pv_um", "0.5", "interchanged"),
+    (RECIPE, "acceptance.pv_um", "0.5", "swapped"),
     (RECIPE, "compensation.depth_of_cut_um", "500.0", "budget"),
     (RECIPE, "compensation.max_correction_um", "600", "budget"),
     (RECIPE, "compensation.cutoff_mm", "3.0", "measure more points"),
-    (BICONIC, "compensation.cutoff_mm", "1.5", "two nodes"),
+    (BICONIC, "compensation.cutoff_mm", "1.5", "two spacings"),
     (RECIPE, "grinding.feed_mm_min", "0", "mm/min"),
     (RECIPE, "grinding.track_mm", "13.0", "lower it"),
     (RECIPE, "grinding.allowance_um", "90.0", "max_cycles"),
@@ -300,7 +300,7 @@ const BAD_RECIPE_VALUES: &[BadValue] = &[
     (RECIPE, "part.name", "\"two\\nlines\"", "line breaks"),
     (RECIPE, "nominal.aperture.width_mm", "-102.0", "-102"),
     (BICONIC, "nominal.projection", "\"yx\"", "best-fit"),
-    (RECIPE, "measure.points", "1800", "leave it out"),
+    (RECIPE, "measure.points", "1800", "remove it"),
     (RECIPE, "compensation.gain", "1.5", "1.2"),
     (RECIPE, "registration.lock", "[\"x\"]", "fixture"),
 ];
@@ -310,22 +310,22 @@ const BAD_CELL_VALUES: &[BadValue] = &[
     (TCP, "cmm.wire.port", "70000", "0 to 65535"),
     (TCP, "cmm.wire.kind", "\"modbus\"", "modbus-rtu"),
     (TCP, "cmm.wire.host", "\"192.168.0.5\"", "simulated = false"),
-    (TCP, "cmm.wire.host", "\"http://a\"", "the port has a key"),
+    (TCP, "cmm.wire.host", "\"http://a\"", "into its own key"),
     (TCP, "cmm.timing.heartbeat_ms", "900", "20 to 500"),
     (TCP, "cmm.timing.lost_after_ms", "1500", "retries"),
-    (TCP, "cmm.travel.min_mm", "[600.0, -500.0, -300.0]", "interchanged"),
+    (TCP, "cmm.travel.min_mm", "[600.0, -500.0, -300.0]", "swapped"),
     (TCP, "cmm.reference_sphere.centre_mm", "[0.0, 1200.0, 20.0]", "outside"),
     (TCP, "grinder.limits.min_wheel_radius_mm", "200", "no wheel"),
     (RTU, "cmm.wire.parity", "\"evn\"", "did you mean \"even\""),
     (RTU, "cmm.wire.stop_bits", "3", "1 to 2"),
     (FILES, "cell.simulated", "true", "simulated = false"),
-    (FILES, "cmm.wire.inbox", "\"../exchange/cmm/out\"", "told apart"),
+    (FILES, "cmm.wire.inbox", "\"../exchange/cmm/out\"", "different folders"),
     (FILES, "cmm.wire.reference_limit_mm", "0", "100"),
     (FILES, "cmm.wire.unit", "\"furlong\"", "inch"),
     (TCP, "cmm.registers.status", "50", "overlaps"),
     (TCP, "cmm.registers.in_force", "65500", "65535"),
     (TCP, "cmm.registers.word_order", "\"middle\"", "little"),
-    (FILES, "cmm.wire.result", "\"{part}/{cycle}.csv\"", "is usual"),
+    (FILES, "cmm.wire.result", "\"{part}/{cycle}.csv\"", "the usual name"),
     (FILES, "cmm.fixture.rotation_deg", "[0.0, 0.0]", "there must be 3"),
 ];
 
@@ -344,7 +344,7 @@ const BAD_RECIPES: &[BadText] = &[
     ),
     (RECIPE, "probe_radius_mm = 1.5\n", "", "measure.probe_radius_mm", "measure]", "add `probe_radius_mm = 1.5`"),
     (RECIPE, "rows = 30", "spacing_mm = 2.0", "measure", "measure]", "`columns` and `rows`"),
-    (RECIPE, "rows = 30", "rows = 30\nspacing_mm = 2.0", "measure", "measure]", "just these"),
+    (RECIPE, "rows = 30", "rows = 30\nspacing_mm = 2.0", "measure", "measure]", "exactly these"),
     (SPIRAL, "points = 1500", "spacing_mm = 0.008", "measure.spacing_mm", "0.008", "coarser"),
     (SPIRAL, "points = 1500", "spacing_mm = 80", "measure.spacing_mm", "80", "finer"),
     (
@@ -361,7 +361,7 @@ const BAD_RECIPES: &[BadText] = &[
         "probe_radius_mm = 1.5\naccepted_risk = 0.025\n",
         "measure.accepted_risk",
         "0.025",
-        "leave it out",
+        "remove it",
     ),
     (
         RECIPE,
@@ -393,7 +393,7 @@ const BAD_RECIPES: &[BadText] = &[
         "expanded_uncertainty = false\nprobability = 0.99",
         "acceptance.probability",
         "0.99",
-        "leave one of the two out",
+        "remove one of the two",
     ),
     (RECIPE, "expanded_uncertainty = true", "probability = 0.3", "acceptance.probability", "0.3", "0.5"),
     (RECIPE, "expanded_uncertainty = true", "probability = nan", "acceptance.probability", "nan", "0.995"),
@@ -423,7 +423,7 @@ const BAD_RECIPES: &[BadText] = &[
         "shape = \"torus\"\nminor_radius_mm = 20",
         "grinding.wheel.minor_radius_mm",
         "20\nradius",
-        "interchanged",
+        "swapped",
     ),
     (
         RECIPE,
@@ -439,7 +439,7 @@ const BAD_RECIPES: &[BadText] = &[
         "max_rms_um = 100.0\npv_um = 1",
         "registration.pv_um",
         "pv_um",
-        "belongs into [acceptance]",
+        "move it to [acceptance]",
     ),
     (RECIPE, "[part]", "[part]\nnominal = 1", "part.nominal", "nominal", "the top of the file"),
     (
@@ -514,7 +514,7 @@ const BAD_CELLS: &[BadText] = &[
         "reference_sphere_mm",
         "did you mean",
     ),
-    (TILTING, "min_deg = -60.0", "min_deg = 70.0", "grinder.rotary.min_deg", "70.0", "interchanged"),
+    (TILTING, "min_deg = -60.0", "min_deg = 70.0", "grinder.rotary.min_deg", "70.0", "swapped"),
     (TILTING, "axis = \"B\"", "axis = \"C\"", "grinder.rotary.axis", "\"C\"", "one of"),
     (TILTING, "reversed = false", "turns = \"table\"", "grinder.rotary.turns", "\"table\"", "stays upright"),
     (TILTING, "max_rate_deg_min = 3600.0\n", "", "grinder.rotary.max_rate_deg_min", "rotary]", "add `max"),
@@ -544,7 +544,7 @@ const BAD_CELLS: &[BadText] = &[
         "[[cmm.signals]]\nname = 'a'\naddress = 1\ntype = 'u16'\nrange = [1, 0]\n#",
         "cmm.signals[0].range",
         "[1, 0]",
-        "interchange",
+        "swap",
     ),
     (TCP, "max_depth_mm = 0.5\n", "", "grinder.limits.max_depth_mm", "limits]", "add `max_depth_mm"),
     (
@@ -736,7 +736,7 @@ fn what_is_no_text_is_told() {
     assert!(Recipe::read(folder.path()).unwrap_err().to_string().contains("cannot be read"));
     assert!(CellConfig::read(&folder.path().join("none")).unwrap_err().to_string().contains("cannot be read"));
     let utf16: Vec<u8> = RECIPE.encode_utf16().flat_map(u16::to_le_bytes).collect();
-    assert!(read(&utf16).contains("no TOML"));
+    assert!(read(&utf16).contains("invalid TOML"));
     fs::write(&path, format!("\u{feff}{RECIPE}").replace('\n', "\r\n")).unwrap();
     assert!(Recipe::read(&path).is_ok(), "a mark of the byte order and Windows line ends are no fault");
 }

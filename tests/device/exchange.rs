@@ -235,8 +235,8 @@ fn a_dmis_program_is_handed_over_and_what_a_machine_makes_of_it_is_taken() {
     let output = dmis_result(&program);
     // A result of another plan, cycle or part is not accepted, whatever its name.
     for (from, to, expected) in [
-        ("'cycle: 2'", "'cycle: 1'", "is of cycle 1, not 2; left alone"),
-        ("'part: SN 7'", "'part: SN 8'", "is of part SN 8, not SN 7; left alone"),
+        ("'cycle: 2'", "'cycle: 1'", "is of cycle 1, not 2; ignored"),
+        ("'part: SN 7'", "'part: SN 8'", "is of part SN 8, not SN 7; ignored"),
         ("PRCOMP/OFF", "PRCOMP/ON", "contacts"),
         ("ENDFIL", "", "ENDFIL"),
     ] {
@@ -288,19 +288,19 @@ fn what_is_not_for_this_part_and_cycle_is_left_alone_and_said() {
     let shop = Shop::new();
     shop.put("SN_7_c2.csv", &three());
     let mut bench = Bench::new(shop.cmm());
-    bench.refused("SN_7_c2.csv lay there before the plan was handed over; left alone");
+    bench.refused("SN_7_c2.csv was there before the plan was handed over; ignored");
     for (text, expected) in [
-        (format!("# part: SN 8\n{}", three()), "is of part SN 8, not SN 7; left alone"),
-        (format!("# cycle: 1\n{}", three()), "is of cycle 1, not 2; left alone"),
-        (format!("# plan: {}\n{}", "0".repeat(64), three()), "was measured by another plan; left alone"),
-        (format!("# cycle: second\n{}", three()), "`cycle` says `second`"),
+        (format!("# part: SN 8\n{}", three()), "is of part SN 8, not SN 7; ignored"),
+        (format!("# cycle: 1\n{}", three()), "is of cycle 1, not 2; ignored"),
+        (format!("# plan: {}\n{}", "0".repeat(64), three()), "was measured with another plan; ignored"),
+        (format!("# cycle: second\n{}", three()), "`cycle` is `second`"),
     ] {
         shop.put("SN_7_c2.csv", &text);
         bench.refused(expected);
     }
     fs::remove_file(shop.inbox.join("SN_7_c2.csv")).unwrap();
     shop.put("notes.txt", &three());
-    bench.refused("notes.txt does not say that it belongs here and its name does not fit SN_7_c2.*");
+    bench.refused("notes.txt does not state that it belongs here, and its name does not match SN_7_c2.*");
     // A file that identifies its part and cycle can have any name.
     shop.put("export 0815.txt", &format!("# part: SN 7\n# cycle: 2\n{}", three()));
     assert!(bench.settled().answer.is_some());
@@ -317,17 +317,17 @@ fn what_is_wrong_with_a_result_is_said_with_the_remedy() {
         (with("1,2,3\n4,5,6\n7,8\n"), "line 4: expected 3 columns"),
         (
             with("1,234;5,678;9,012\n1,234;5,678;9,012\n1,234;5,678;9,012\n"),
-            "line 2, column 1: `1,234` may have a decimal comma",
+            "line 2, column 1: `1,234` has either a decimal comma",
         ),
         (with("1,5;2;3\n4.5;5;6\n7;8;9\n"), "line 3, column 1: expected a number with a decimal comma"),
         (
             THREE.to_owned(),
-            "neither the file nor the cell says whether the coordinates are probe centres or contact points",
+            "neither the file nor the cell file states whether the coordinates are probe centres or contact points",
         ),
-        (format!("# units: inch\n{}", three()), "the file says that the unit is inch, the cell file says mm"),
-        (format!("# probe radius mm: 1.49\n{}", three()), "probe radius of 1.49 mm, the recipe says 1.5 mm"),
+        (format!("# units: inch\n{}", three()), "in the file the unit is inch, in the cell file mm"),
+        (format!("# probe radius mm: 1.49\n{}", three()), "probe radius of 1.49 mm; the recipe has 1.5 mm"),
         (with("index,x,y,z\n10,1,2,3\n99,4,5,6\n"), "index `99` is not a target of the plan"),
-        (with("index,x,y,z\n10,1,2,3\n10,4,5,6\n"), "index `10` came before"),
+        (with("index,x,y,z\n10,1,2,3\n10,4,5,6\n"), "index `10` occurs twice"),
         (String::new(), "cut in the middle of a line"),
     ] {
         shop.put("SN_7_c2.csv", &text);
@@ -347,7 +347,7 @@ fn two_files_at_once_are_neither_taken() {
     let mut bench = Bench::new(shop.cmm());
     shop.put("SN_7_c2.csv", &three());
     shop.put("SN_7_c2.txt", &three());
-    bench.refused("2 files fit `SN_7_c2.*`: SN_7_c2.csv, SN_7_c2.txt; leave only the right one there");
+    bench.refused("2 files match `SN_7_c2.*`: SN_7_c2.csv, SN_7_c2.txt; leave only the right one there");
     fs::remove_file(shop.inbox.join("SN_7_c2.txt")).unwrap();
     assert!(bench.settled().answer.is_some());
 }
@@ -395,7 +395,7 @@ fn a_job_and_cycle_is_handed_over_once_and_its_bytes_answer_no_other_cycle() {
     other.publish(next, 2, &order, &Permit::new()).unwrap();
     let mut bench = Bench { folders: other, job: next, now_s: 0 };
     shop.put("SN_7_c3.csv", &three());
-    bench.refused("the same bytes were the result of job 3 cycle 2");
+    bench.refused("the same bytes were already the result of job 3 cycle 2");
 }
 
 #[test]
@@ -412,7 +412,7 @@ fn a_restart_finds_what_is_open() {
     bench.folders.mark(job, HandOverStatus::Open).unwrap();
     fs::rename(shop.outbox.join("SN_7_j3_c2"), shop.outbox.join("mine")).unwrap();
     let why = bench.folders.open().unwrap_err().to_string();
-    assert!(why.contains("expected a folder with the name that was given to it"), "{why}");
+    assert!(why.contains("expected a folder with its original name"), "{why}");
 }
 
 // ---- stations ------------------------------------------------------------------------------------------------------------------
@@ -455,14 +455,14 @@ fn stations_are_merged_by_their_reference_points() {
     bench.refused("waiting for the first station");
     shop.put("ref_1.yaml", &references([0, 1, 2, 3], 1));
     shop.put("ref_9.yaml", &references([0, 1, 2, 3], 9));
-    bench.refused("2 points of 1 stations; at least 4 are needed, waiting for further stations");
+    bench.refused("2 points of 1 stations; at least 4 are required; waiting for further stations");
     shop.put("P_2.txt", &points(2));
     shop.put("ref_2.yaml", &references([0, 2, 1, 3], 2));
     bench.refused("station 2 (ref_2.yaml): reference point right is off by");
-    assert_says(&bench.poll(), &["right and upper seem exchanged"]);
+    assert_says(&bench.poll(), &["right and upper are probably swapped"]);
     shop.put("ref_2.yaml", &references([0, 1, 2, 3], 2));
     let look = bench.settled();
-    assert_says(&look, &["left alone, no station's: ref_9.yaml"]);
+    assert_says(&look, &["ignored, because they belong to no station: ref_9.yaml"]);
     assert_says(&look, &["station 1 (ref_1.yaml): reference points fit to 0.000 mm rms (left 0.000, right 0.000"]);
     let found = look.answer.unwrap();
     for (k, expected) in [[10.0, 20.0, 30.0], [40.0, 50.0, 61.0]].iter().cycle().take(4).enumerate() {
@@ -498,18 +498,18 @@ fn a_pass_is_confirmed_by_files_that_name_its_map() {
         grinder.poll(Duration::from_secs(now), job).unwrap();
         grinder.poll(Duration::from_secs(now + 2), job).unwrap()
     };
-    assert_says(&settled(&mut grinder), &["done.json lay there before", "waiting for the start to be confirmed"]);
+    assert_says(&settled(&mut grinder), &["done.json was there before", "waiting for the confirmation of the start"]);
     shop.put("started.json", r#"{"map": "0123456789abcdef"}"#);
     let look = settled(&mut grinder);
     assert!(!look.start_confirmed);
-    assert_says(&look, &["confirms map `0123456789abcdef`, handed over was map"]);
+    assert_says(&look, &["confirms map `0123456789abcdef`, expected map"]);
     fs::copy(folder.join("started.json"), shop.inbox.join("started.json")).unwrap();
     let look = settled(&mut grinder);
     assert!(look.start_confirmed && look.answer.is_none());
-    assert_says(&look, &["waiting for the end"]);
+    assert_says(&look, &["waiting for the confirmation of the end"]);
     let done = fs::read_to_string(folder.join("done.json")).unwrap();
     shop.put("done.json", &done.replace("\"cycle\": 2", "\"cycle\": 1"));
-    assert_says(&settled(&mut grinder), &["confirms job 3 cycle 1, handed over was job 3 cycle 2"]);
+    assert_says(&settled(&mut grinder), &["confirms job 3 cycle 1, expected job 3 cycle 2"]);
     shop.put("done.json", "{\"map\"");
     assert_says(&settled(&mut grinder), &["expected JSON"]);
     fs::copy(folder.join("done.json"), shop.inbox.join("done.json")).unwrap();
@@ -616,7 +616,7 @@ async fn while_a_large_file_is_read_the_job_is_held_and_let_go_on_and_then_it_is
     assert_eq!(cmm.hold().await.unwrap().state, State::Held);
     assert_eq!(cmm.resume().await.unwrap().state, State::Execute);
     let started = Instant::now();
-    while !cmm.notes().iter().any(|note| note.contains("not taken")) {
+    while !cmm.notes().iter().any(|note| note.contains("not accepted")) {
         assert!(started.elapsed() < Duration::from_secs(300), "{:?}", cmm.notes());
         tokio::task::yield_now().await;
         assert_eq!(cmm.status().await.unwrap().state, State::Execute);
@@ -828,6 +828,6 @@ async fn every_combination_of_wires_makes_two_machines() {
     let cell = cell_of([true, true], &shops);
     fs::remove_dir(&shops[0].outbox).unwrap();
     let told = setup::machines(&recipe, &cell, "SN 7", Path::new("run"), [1, 1]).unwrap_err().to_string();
-    assert!(told.contains("cmm.wire.outbox") && told.contains("is not there"), "{told}");
+    assert!(told.contains("cmm.wire.outbox") && told.contains("does not exist"), "{told}");
     assert!(!shops[0].outbox.exists(), "no folder is made");
 }

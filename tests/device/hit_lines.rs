@@ -172,10 +172,10 @@ async fn a_line_that_is_not_whole_becomes_no_point_and_what_it_told_is_touched_a
     // Fault, number of the four targets that are touched anyway, and the words of the message.
     for (fault, touched, why) in [
         (Fault::Lost(4), 3, "not a number with 3 digits"),
-        (Fault::Lost(0), 3, "50.000 mm from target 7, the nearest"),
+        (Fault::Lost(0), 3, "50.000 mm from the nearest target, 7"),
         (Fault::Garbled(1), 3, "REFUSED line 2 of the measurement, \"1u0.000,200.000,300.000\": its value 1"),
-        (Fault::Merged, 2, "two lines have run together"),
-        (Fault::Stranger("SN 00412".into()), 4, "it has 1 values where 3 belong"),
+        (Fault::Merged, 2, "two lines are joined"),
+        (Fault::Stranger("SN 00412".into()), 4, "it has 1 values instead of 3"),
     ] {
         let mut bench = Bench::on_serial(4, |_| {}).await;
         let lines = with_fault(&fault);
@@ -209,7 +209,7 @@ async fn a_line_sent_twice_is_one_touch_and_a_header_is_passed_over() {
     bench.serving.send(b"PROBE 1\r\n").await;
     bench.serving.send(&with_fault(&Fault::Twice)).await;
     bench.until(4, State::Execute).await;
-    assert!(bench.notes().contains("1 lines came twice and were taken once"), "{}", bench.notes());
+    assert!(bench.notes().contains("1 lines arrived twice and were used once"), "{}", bench.notes());
     bench.done().await;
 }
 
@@ -219,7 +219,7 @@ async fn a_line_that_was_lost_leaves_its_target_open_and_a_person_may_end_withou
     bench.serving.send(&with_fault(&Fault::Dropped)).await;
     bench.until(3, State::Execute).await;
     let named = OperatorConfirmation::Done { map_identity: None, file: Some("x.csv".into()) };
-    assert!(bench.cmm.confirm(named).await.unwrap_err().to_string().contains("leave --file out"));
+    assert!(bench.cmm.confirm(named).await.unwrap_err().to_string().contains("remove --file"));
     let measured = bench.done().await;
     let status: Vec<PointStatus> = measured.points.iter().map(|point| point.status).collect();
     assert_eq!((status[0], status[1]), (PointStatus::Touched, PointStatus::NotFound));
@@ -256,9 +256,7 @@ async fn a_line_of_a_terminal_server_that_breaks_off_loses_no_point_that_there_i
     bench.until(1, State::Holding).await;
     let notes = bench.notes();
     assert!(
-        notes.contains("cut short")
-            && notes.contains("the connection was lost")
-            && notes.contains("2 targets are left"),
+        notes.contains("incomplete") && notes.contains("the connection was lost") && notes.contains("2 targets remain"),
         "{notes}"
     );
     bench.cmm.confirm(OperatorConfirmation::Still).await.unwrap();
@@ -291,7 +289,7 @@ async fn hold_stop_and_abort_are_asked_of_the_person() {
     assert_eq!(bench.cmm.hold().await.unwrap().state, State::Holding);
     bench.serving.send(b"100.000,200.000,300.000\r\n").await;
     bench.until(1, State::Holding).await;
-    assert!(bench.notes().contains("HOLD it at its own panel; 1 targets are left: 8"), "{}", bench.notes());
+    assert!(bench.notes().contains("HOLD it at its own panel; 1 targets remain: 8"), "{}", bench.notes());
     bench.cmm.confirm(OperatorConfirmation::Still).await.unwrap();
     assert_eq!(bench.cmm.stop().await.unwrap().outcome, Outcome::Stopped);
     let mut bench = Bench::on_serial(2, |_| {}).await;

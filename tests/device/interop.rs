@@ -266,7 +266,7 @@ fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
         crate::program::run(&["run", recipe, "--cell", "other.toml", "--runs", "other"], home.path());
     assert_eq!(code, 3, "{said}\n{errors}");
     let all = format!("{said}{errors}");
-    assert!(all.contains("calls itself \"pymodbus CMM 1\"") && all.contains("expects \"CMM 8\""), "{all}");
+    assert!(all.contains("has the name \"pymodbus CMM 1\"") && all.contains("expects \"CMM 8\""), "{all}");
     // A cell file that declares these machines as real.
     write(
         "real.toml",
@@ -278,7 +278,7 @@ fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
     let (code, said, errors) =
         crate::program::run(&["run", recipe, "--cell", "real.toml", "--runs", "real", "--loaded"], home.path());
     assert_eq!(code, 3, "{said}\n{errors}");
-    assert!(format!("{said}{errors}").contains("says that it is a simulation"), "{said}\n{errors}");
+    assert!(format!("{said}{errors}").contains("reports that it is a simulation"), "{said}\n{errors}");
 }
 
 // ---- their client, our machine ------------------------------------------------------------------------------------------------------

@@ -399,7 +399,7 @@ async fn further_signals_are_read_scaled_and_held_against_their_range() {
     // A bad signal hides no other part of the status.
     let status = cmm.status().await.unwrap();
     let flaw = status.signals[0].problem().unwrap();
-    assert_eq!(flaw, "part_temperature is 20.25 C, and 15 to 19 C are wanted");
+    assert_eq!(flaw, "part_temperature is 20.25 C, limits 15 to 19 C");
     assert_eq!((status.state, status.temperature_c), (State::Idle, Some(20.25)));
     // A register that does not exist, and one that holds no number.
     let cases = [
@@ -407,7 +407,7 @@ async fn further_signals_are_read_scaled_and_held_against_their_range() {
             60_000,
             SignalType::I16,
             0.01,
-            "answered exception 2 (no such register, or not to be written) to signal at register 60000: compare",
+            "answered exception 2 (unknown or read-only register) to signal at register 60000: compare",
         ),
         (97, SignalType::I16, f64::NAN, "register 97 reads as NaN: compare address, type, scale and word_order"),
     ];
@@ -500,14 +500,18 @@ async fn what_is_not_the_machine_is_told_apart_and_never_written_to() {
     let e = refusal(|image| image[2] = 1).await;
     assert!(matches!(e, DeviceError::WrongVersion { required: 2, found: 1, .. }), "{e}");
     let said = e.to_string();
-    for lacked in
-        ["a beat that names its owner", "refuse a late START", "an ABORT", "outlives CLEAR", "bring it up to version 2"]
-    {
+    for lacked in [
+        "a beat that names its owner",
+        "refuse a late START",
+        "an ABORT",
+        "remains after CLEAR",
+        "update it to version 2",
+    ] {
         assert!(said.contains(lacked), "{said}");
     }
     let e = refusal(|image| image[2] = 3).await;
     assert!(matches!(e, DeviceError::WrongVersion { required: 2, found: 3, .. }), "{e}");
-    assert!(e.to_string().contains("this program is the older one"), "{e}");
+    assert!(e.to_string().contains("this program is older"), "{e}");
     let e = refusal(|image| image[3] = 2).await;
     assert!(matches!(e, DeviceError::WrongKind { found: MachineKind::Grinder, .. }), "{e}");
     let e = refusal(|image| image[13] = 2).await;

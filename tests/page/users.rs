@@ -50,9 +50,11 @@ fn a_list_of_users_is_kept_and_says_what_is_wrong_with_it() {
     let (code, told, _) = run(&["users", "list"], home.path());
     assert_eq!((code, told.as_str()), (0, "engineer   A. Smith\noperator   王 芳\n"));
     // An invalid name or password changes nothing.
-    for (name, password, expected) in
-        [("A. Smith", "short", "10 to 256"), ("", PASSWORD, "1 to 64"), ("A\u{202e}B", PASSWORD, "turns what is read")]
-    {
+    for (name, password, expected) in [
+        ("A. Smith", "short", "10 to 256"),
+        ("", PASSWORD, "1 to 64"),
+        ("A\u{202e}B", PASSWORD, "direction of the text"),
+    ] {
         let (code, errors) = add(home.path(), name, "viewer", password);
         assert!(code == 2 && errors.contains(expected), "{name}: {errors}");
     }

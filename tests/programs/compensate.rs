@@ -169,26 +169,26 @@ fn what_moves_the_tool_and_is_not_told_is_refused_with_its_line() {
         ("G1 X[1+1]", "variable"),
         ("G41 D1", "radius"),
         ("G92 X0", "zero"),
-        ("G93", "times"),
+        ("G93", "time of a move"),
         ("G5.2 X1", "zero"),
         ("G1 X1 A5", "turns the part"),
         ("M98 P1", "subprogram"),
-        ("/G1 X1", "stroke"),
+        ("/G1 X1", "slash"),
         ("G2 X1 Y1", "centre"),
         ("G2 X1 Y1 I9 J9", "radius"),
         ("G1 X1 X2", "twice"),
         ("G80\nX5", "no G0"),
         ("G53 G2 X1 Y1 I1", "G53"),
         ("G1 X1\nG55 G1 X1", "zero"),
-        ("G53 G0 Z0\nG1 X2", "not known where Z"),
+        ("G53 G0 Z0\nG1 X2", "position of Z is unknown"),
         ("G91\nG53 G0 Z0", "G53"),
-        ("G1 X1e3", "not known"),
-        ("E5", "not known"),
-        ("G91\nG0 X1000000000\nX1000000000", "farther"),
-        ("G43 H1\nG1 X2", "not known where Z"),
-        ("G49\nG1 X2", "not known where Z"),
-        ("M6 T2\nG1 X2", "not known where XYZ"),
-        ("G91\nG28 Z0\nG1 X2", "not known where Z"),
+        ("G1 X1e3", "is unknown"),
+        ("E5", "is unknown"),
+        ("G91\nG0 X1000000000\nX1000000000", "the limit is"),
+        ("G43 H1\nG1 X2", "position of Z is unknown"),
+        ("G49\nG1 X2", "position of Z is unknown"),
+        ("M6 T2\nG1 X2", "position of XYZ is unknown"),
+        ("G91\nG28 Z0\nG1 X2", "position of Z is unknown"),
         ("G1 X1 R5", "R5 has no meaning"),
         ("G1 X1 I5", "I5 has no meaning"),
         ("I5 J5", "I5 has no meaning"),
@@ -199,10 +199,10 @@ fn what_moves_the_tool_and_is_not_told_is_refused_with_its_line() {
         ("G1 X2 G90 G91", "only one"),
         ("G2 X9 I4 P2", "P lets"),
         ("M3 M5", "only one"),
-        ("G1 X1 F100 F200", "F stands twice"),
+        ("G1 X1 F100 F200", "F occurs twice"),
         ("G1 X1\nA0", "turns the part"),
         ("G0 A90", "turns the part"),
-        ("G10 L2 P1 X5", "may move the tool or the zero"),
+        ("G10 L2 P1 X5", "can move the tool or the zero"),
         ("G52 X1", "zero"),
     ] {
         let bench = Shop::new(error_mm, &format!("G21 G90\nG0 X0 Y0 Z1\nG1 Z0 F100\n{line}\nM2\n"));
@@ -337,7 +337,7 @@ fn a_foreign_map_is_used_where_it_is_valid_and_within_reason() {
     map(&|_| "0.004,0".into());
     assert!(bench.compensate(&[]).unwrap_err().contains("valid"));
     map(&|_| "0.004,x".into());
-    assert!(bench.compensate(&[]).unwrap_err().contains("neither 1 nor 0"));
+    assert!(bench.compensate(&[]).unwrap_err().contains("instead of 1 or 0"));
 }
 
 #[test]
@@ -346,13 +346,13 @@ fn the_corrected_program_takes_the_place_of_nothing_else() {
     let bench = Shop::new(error_mm, program);
     for out in ["base.ngc", "./base.ngc", "map.csv"] {
         let said = bench.correct("base.ngc", out, &[]).unwrap_err();
-        assert!(said.contains("take the place"), "{out}: {said}");
+        assert!(said.contains("overwrite"), "{out}: {said}");
     }
     assert_eq!(fs::read_to_string(bench.path("base.ngc")).unwrap(), program);
     #[cfg(unix)]
     {
         fs::hard_link(bench.path("base.ngc"), bench.path("other.ngc")).unwrap();
-        assert!(bench.correct("base.ngc", "other.ngc", &[]).unwrap_err().contains("take the place"));
+        assert!(bench.correct("base.ngc", "other.ngc", &[]).unwrap_err().contains("overwrite"));
         let said = bench.correct("base.ngc", "/dev/null", &[]).unwrap_err();
         assert!(said.contains("device"), "{said}");
     }
@@ -401,7 +401,7 @@ fn a_map_goes_only_onto_the_program_that_it_was_made_for() {
     after(&has(&one)).unwrap();
     for comments in [has(&other), String::new(), has(&one) + "(map: 0 everywhere)\n"] {
         let said = after(&comments).unwrap_err();
-        assert!(said.contains("another correction than the program has"), "{said}");
+        assert!(said.contains("another correction than the one in the program"), "{said}");
     }
     // A correction is absolute: it does not add to another.
     bench.save_correction([3; 32]);
@@ -423,9 +423,9 @@ fn maps_that_are_none_are_refused() {
     for (text, words) in [
         (String::new(), "empty"),
         (without(whole.lines().position(|line| line.starts_with("x_mm")).unwrap()), "columns"),
-        (without(50), "no whole grid"),
-        (whole.replace("0.5,0.5,", "0.5,0.5,x"), "no node"),
-        (whole.replace("0.5,0.5,", "0.5,0.5,NaN;"), "no node"),
+        (without(50), "not a complete grid"),
+        (whole.replace("0.5,0.5,", "0.5,0.5,x"), "is not a node"),
+        (whole.replace("0.5,0.5,", "0.5,0.5,NaN;"), "is not a node"),
     ] {
         fs::write(bench.path("map.csv"), text).unwrap();
         let said = bench.compensate(&[]).unwrap_err();

@@ -408,7 +408,7 @@ fn a_run_does_not_begin_with_a_key_that_cannot_be_used() {
     fs::set_permissions(&key, fs::Permissions::from_mode(0o644)).unwrap();
     fs::write(home.path().join("broken.key"), "x").unwrap();
     fs::set_permissions(home.path().join("broken.key"), fs::Permissions::from_mode(0o600)).unwrap();
-    for (file, says) in [("audit.key", "chmod 600"), ("broken.key", "no audit key"), ("absent.key", "absent.key")] {
+    for (file, says) in [("audit.key", "chmod 600"), ("broken.key", "not an audit key"), ("absent.key", "absent.key")] {
         let arguments = ["run", recipe.to_str().unwrap(), "--cell", cell.to_str().unwrap(), "--runs", "runs"];
         let (code, said, errors) = with_key(home.path(), &home.path().join(file), &arguments);
         assert_eq!(code, 2, "{file}: {said}");

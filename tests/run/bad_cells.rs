@@ -52,7 +52,7 @@ fn a_recipe_that_needs_the_temperature_is_refused_over_a_wire_that_tells_none() 
         let (code, _, errors) = in_time(&["check", recipe.to_str().unwrap(), &cell], home.path());
         let (run_code, _, run_errors) = in_time(&["run", recipe.to_str().unwrap(), "--cell", &cell], home.path());
         assert_eq!(run_code, 2, "{run_errors}");
-        assert!(run_errors.contains(key) && run_errors.contains("tells none"), "{run_errors}");
+        assert!(run_errors.contains(key) && run_errors.contains("reports none"), "{run_errors}");
         println!("check alone: {code} {errors}");
     }
 }
@@ -167,7 +167,7 @@ fn a_disk_that_fills_up_without_room_for_a_cycle_begins_none() {
     let disk = SmallDisk::at(home.path().join("small"), 400);
     let arguments = ["run", &recipe, "--cell", &sim_cell(), "--runs", "small"];
     let (code, _, errors) = in_time(&arguments, home.path());
-    assert!(code == 2 && errors.contains("small: the disk has 0 MB left") && errors.contains("--runs"), "{errors}");
+    assert!(code == 2 && errors.contains("small: the disk has 0 MB free") && errors.contains("--runs"), "{errors}");
     drop(disk);
     // A disk that fills up while the first part is ground holds the cell before the measurement. The record still fits.
     let disk = SmallDisk::at(home.path().join("other"), 40_000);
@@ -313,7 +313,7 @@ fn a_recipe_for_another_cell() {
             "config/modbus-tcp.toml",
             "[grinder.limits]",
             "[grinder.travel]\nmin_mm = [-10.0, -500.0, -400.0]\nmax_mm = [10.0, 500.0, 400.0]\n\n[grinder.limits]",
-            "beyond the travel of -10 to 10 mm",
+            "outside the travel of -10 to 10 mm",
         ),
     ];
     for (name, file, from, to, named) in cells {
@@ -340,7 +340,7 @@ fn a_part_that_is_measured_first_is_judged_and_a_pass_that_cannot_be_ground_is_n
     fs::write(home.path().join("narrow.toml"), changed("config/sim.toml", &[("[grinder.limits]", narrow)])).unwrap();
     let (code, said, errors) = in_time(&["run", "first.toml", "--cell", "narrow.toml"], home.path());
     assert_eq!(code, 1, "{said}\n{errors}");
-    assert!(said.contains("ALARM") && said.contains("beyond the travel of -10 to 10 mm"), "{said}");
+    assert!(said.contains("ALARM") && said.contains("outside the travel of -10 to 10 mm"), "{said}");
     let cycle = only_run(&home.path().join("runs")).join("cycle-1");
     assert!(cycle.join("error_map.csv").is_file());
     for file in ["correction.csv", "toolpath.ngc", "toolpath_z.csv"] {

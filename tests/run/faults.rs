@@ -55,9 +55,9 @@ fn each_is_caught<const N: usize>(cases: [Case; N], passes: usize) {
 #[test]
 fn machines_that_answer_wrongly_are_told_before_anything_is_written() {
     let (other_order, exchanged) = (Setup { other_word_order: true, ..usual() }, Setup { exchanged: true, ..usual() });
-    let order_words = &["word order", "Nothing was written", "word_order in the cell file"];
-    let older = &["version 1 of the register map", "lacks a beat that names its owner", "bring it up to version 2"];
-    let newer = &["version 3 of the register map", "this program is the older one"];
+    let order_words = &["word order", "othing was written", "word_order in the cell file"];
+    let older = &["version 1 of the register map", "lacks a beat that names its owner", "update it to version 2"];
+    let newer = &["version 3 of the register map", "this program is older"];
     let cases: [(&str, Setup, AlarmId, &[&str]); 4] = [
         ("an older map", Setup { version: 1, ..usual() }, AlarmId::WrongDevice, older),
         ("a newer map", Setup { version: 3, ..usual() }, AlarmId::WrongDevice, newer),

@@ -111,7 +111,7 @@ fn a_wrong_or_short_result_uses_up_no_cycle() {
     let (head, rows) = right.split_once("index,x,y,z\n").unwrap();
     for (what, make) in wrong {
         hand_in(home, &format!("{head}index,x,y,z\n{}", make(&plan, rows)));
-        running.line(what, |line| line.contains("not taken: ") && line.contains("result.csv"));
+        running.line(what, |line| line.contains("not accepted: ") && line.contains("result.csv"));
         assert_eq!(open_plan(&mut running, home), plan, "{what}");
     }
     hand_in(home, &right);

@@ -25,7 +25,7 @@ fn a_record_that_is_moved_away_holds_what_moves_and_is_gone_on_with_when_it_is_b
         fs::rename(&there, &away).unwrap();
         // Another file of that name is not the record.
         fs::write(&there, "").unwrap();
-        running.line("the alarm", |line| line.contains("was deleted, renamed or exchanged"));
+        running.line("the alarm", |line| line.contains("was deleted, renamed or replaced"));
         let path = folder.display().to_string();
         let state = || run(&["status", &path], home.path()).1;
         let held = "SIMULATION  Held";
@@ -55,7 +55,7 @@ fn a_record_that_is_deleted_ends_with_the_run_and_no_further_pass_is_started() {
     for name in ["journal.sqlite", "journal.sqlite-wal", "journal.sqlite-shm"] {
         fs::remove_file(folder.join(name)).unwrap();
     }
-    running.line("the alarm", |line| line.contains("was deleted, renamed or exchanged"));
+    running.line("the alarm", |line| line.contains("was deleted, renamed or replaced"));
     let path = folder.display().to_string();
     running.until("a held cell", |_| run(&["status", &path], home.path()).1.contains("Held").then_some(()));
     // The safety order is carried out, and the person learns that it is not on record.

@@ -12,7 +12,7 @@ fn a_part_is_made_with_a_probe_that_is_led_touch_by_touch() {
     let typed = ["run", recipe.to_str().unwrap(), "--cell", cell.to_str().unwrap(), "--runs", "runs"];
     let (code, told, error) = run(&typed, home.path());
     assert_eq!(code, 0, "{told}\n{error}");
-    assert!(told.contains("the way across is") && told.contains("ACCEPTED"), "{told}");
+    assert!(told.contains("the travel between targets is") && told.contains("ACCEPTED"), "{told}");
     let (code, told, _) = run(&["audit", "verify"], home.path());
     assert_eq!(code, 0, "{told}");
 }

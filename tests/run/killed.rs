@@ -271,7 +271,7 @@ async fn what_cannot_be_taken_up_again_is_refused_before_anything_is_commanded()
     let text = fs::read_to_string(&recipe).unwrap();
     fs::write(&recipe, text.replacen("rows = 8", "rows = 9", 1)).unwrap();
     let (code, _, said) = resumed(&[run]);
-    assert!(code == 1 && said.contains("recipe.toml is not what was written"), "{said}");
+    assert!(code == 1 && said.contains("recipe.toml was changed"), "{said}");
     fs::write(&recipe, text).unwrap();
     let (code, _, said) = resumed(&["nowhere"]);
     assert!(code == 2 && said.contains("nowhere"), "{said}");
@@ -287,5 +287,5 @@ async fn what_cannot_be_taken_up_again_is_refused_before_anything_is_commanded()
     running.end();
     let own = only_run(&home.join("own"));
     let (code, _, said) = resumed(&[own.to_str().unwrap()]);
-    assert!(code == 2 && said.contains("ended with the program"), "{said}");
+    assert!(code == 2 && said.contains("ended with its program"), "{said}");
 }

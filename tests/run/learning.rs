@@ -98,9 +98,9 @@ fn what_cannot_be_begun_with_is_refused() {
         assert_eq!(shop.folders().len(), runs, "a refused run leaves no folder");
     };
     let small = replaced(&shop.recipe, "max_correction_um = 60.0", "max_correction_um = 0.5");
-    refused(&small, &["more than the 0.50 um", "raise max_correction_um", "learn = false"]);
+    refused(&small, &["the recipe allows 0.50 µm", "raise max_correction_um", "learn = false"]);
     let measured_first = replaced(&shop.recipe, "max_cycles = 2", "max_cycles = 2\nbegin_with = \"measure\"");
-    refused(&measured_first, &["compensation.learn", "leave one of the two out"]);
+    refused(&measured_first, &["compensation.learn", "remove one of the two"]);
     // A damaged file is reported, and blocks nothing.
     fs::write(first.join("learned.json"), "{").unwrap();
     let (_, said) = shop.ran(&shop.recipe);

@@ -201,7 +201,7 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
             "confirm started" => {
                 // A step that has not started cannot end, and a confirmation that names another map is refused.
                 let (code, told) = person.types("confirm done");
-                assert!(code == 3 && told.contains("confirm first that it has begun"), "{told}");
+                assert!(code == 3 && told.contains("confirm first that the pass has begun"), "{told}");
                 let (code, told) = person.types("confirm started --map 0123456789abcdef");
                 assert!(code == 3 && told.contains("the confirmation names"), "{told}");
                 let ngc = file(": by ", " (map");
@@ -232,7 +232,7 @@ fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
                     let refused = [
                         ("confirm done --file half.csv", "half.csv"),
                         ("confirm done", "--file"),
-                        (&given_back, "the plan itself"),
+                        (&given_back, "identical to the plan"),
                         ("confirm done --file turned.csv", "order of the plan"),
                     ];
                     for (command, why) in refused {

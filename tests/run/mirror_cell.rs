@@ -137,9 +137,9 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
         println!("{lateral:?}\n{}", why.as_deref().unwrap_or("a map may be made"));
         let why = why.expect("refused");
         assert!(
-            why.contains("x and y shift: found again to 3.")
-                && why.contains("rotation about z: found again to")
-                && why.contains("Hold the directions in the recipe"),
+            why.contains("x and y position repeats only to 3.")
+                && why.contains("rotation about z repeats only to")
+                && why.contains("Lock these directions in the recipe"),
             "{why}"
         );
         let held = registered(&nominal, &cloud, [true, true, false, false, false, true]);
@@ -159,7 +159,7 @@ fn another_reflector_than_the_recipes_is_refused() {
     let home = tempfile::tempdir().unwrap();
     let (found, said) = measured(cell(&data, "20250825_M1", home.path()), 6.35);
     let said = said.join("\n");
-    assert!(found.is_none() && said.contains("a probe radius of 19.05 mm, the recipe says 6.35 mm"), "{said}");
+    assert!(found.is_none() && said.contains("a probe radius of 19.05 mm; the recipe has 6.35 mm"), "{said}");
     // A reference point whose deviation exceeds the limit is named.
     let mut strict = cell(&data, "20250825_M1", home.path());
     strict.part = "strict".into();

@@ -137,7 +137,8 @@ fn a_real_mirror_is_measured_and_judged_and_its_correction_refused_in_words() {
     let alarm = notices(&said, "alarm").into_iter().find(|a| a["id"] == "weak_directions").expect("an alarm");
     let what = alarm["what"].as_str().unwrap();
     println!("{what}");
-    for words in ["x and y shift: found again to 3.", "rotation about z", "registration.lock", "beside its place"] {
+    for words in ["x and y position repeats only to 3.", "rotation about z", "registration.lock", "may be displaced by"]
+    {
         assert!(what.contains(words), "{words}: {what}");
     }
     let folder = shop.run_folder();
@@ -192,7 +193,7 @@ fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confir
     program.until("the pass to be over", |_| shop.handed_over("grinder/out", "_c2.done"));
     // The next plan. The old files are not an answer to it.
     program.until("the next plan", |_| shop.handed_over("cmm/out", "_c2"));
-    let left_alone = |line: &String| line.contains("lay there before the plan");
+    let left_alone = |line: &String| line.contains("was there before the plan");
     program.until("the old files to be left alone", |said| said.iter().any(left_alone).then_some(()));
     assert_eq!(run(&["stop", folder.to_str().unwrap()], shop.home.path()).0, 0);
     let (code, _) = program.end();
@@ -201,7 +202,7 @@ fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confir
     assert_eq!(notices(&said, "figures").len(), 1, "one measurement");
     let notes: Vec<String> = notices(&said, "note").iter().map(|note| note["words"].to_string()).collect();
     let how = format!("regrind confirm started --map {}", &map[..8]);
-    for words in [how.as_str(), "lay there before the plan", "stop it at its own panel"] {
+    for words in [how.as_str(), "was there before the plan", "stop the machine at its own panel"] {
         assert!(notes.iter().any(|note| note.contains(words)), "{words}: {notes:#?}");
     }
     assert!(shop.handed_over("cmm/out", "_c2.stopped").is_some());

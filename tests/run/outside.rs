@@ -201,7 +201,7 @@ fn two_runs_that_go_on_are_named_and_none_is_taken() {
     let (mut second, _) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
     let (code, _, errors) = run(&["abort"], home.path());
     assert_eq!(code, 2, "{errors}");
-    assert!(errors.contains("2 runs go on") && errors.matches("SIMULATION").count() == 2, "{errors}");
+    assert!(errors.contains("2 runs are active") && errors.matches("SIMULATION").count() == 2, "{errors}");
     for running in [&mut first, &mut second] {
         running.signal("TERM");
         assert_eq!(running.end().0, 1);
@@ -225,7 +225,7 @@ fn a_second_run_does_not_take_the_machines_of_the_first() {
     first.line("grinding", |line| line.contains("grinding"));
     let (code, _, errors) = run(&begin, home.path());
     let name = folder.file_name().unwrap().to_str().unwrap();
-    assert!(code == 3 && errors.contains("another run has this machine") && errors.contains(name), "{code} {errors}");
+    assert!(code == 3 && errors.contains("another run uses this machine") && errors.contains(name), "{code} {errors}");
     // The first run still decides when it ends.
     let (code, _, errors) = run(&["abort"], home.path());
     assert_eq!(code, 0, "{errors}");
@@ -257,7 +257,7 @@ fn what_a_new_folder_says_to_type_makes_a_part() {
     let (_, listed, _) = run(&["runs"], &shop);
     assert!(listed.contains("ACCEPTED  SN-0001"), "{listed}");
     let (code, _, errors) = run(&["init", "shop"], home.path());
-    assert!(code == 2 && errors.contains("is there already"), "{errors}");
+    assert!(code == 2 && errors.contains("already exists"), "{errors}");
 }
 
 #[test]
@@ -280,7 +280,7 @@ fn every_kind_of_new_folder_has_a_good_recipe_and_a_good_cell() {
 fn without_a_folder_and_without_a_person_to_ask_nothing_is_made() {
     let home = tempfile::tempdir().unwrap();
     let (code, _, errors) = run(&["init"], home.path());
-    assert!(code == 2 && errors.contains("no folder to make is named"), "{errors}");
+    assert!(code == 2 && errors.contains("the folder to create is missing"), "{errors}");
     assert_eq!(fs::read_dir(home.path()).unwrap().count(), 0);
 }
 
@@ -312,7 +312,7 @@ fn the_doctor_misses_the_folders_in_which_machines_give_and_take() {
     assert_eq!(code, 1, "{said}");
     assert!(
         said.matches("OBSTACLE").count() == 2
-            && said.contains("is not there; make it where the measuring machine finds it"),
+            && said.contains("does not exist; create it where the measuring machine finds it"),
         "{said}"
     );
     for folder in ["cmm/in", "cmm/out", "grinder/in", "grinder/out"] {

@@ -15,32 +15,33 @@ pub enum MapError {
     Grid(#[from] GridError),
     #[error(transparent)]
     Spline(#[from] SplineError),
-    #[error("a cut-off of {cutoff_mm} mm is asked for; it must be above 0")]
+    #[error("the cut-off is {cutoff_mm} mm; it must be above 0")]
     Cutoff { cutoff_mm: f64 },
-    #[error("{name} of {value} is asked for; it must be {wanted}")]
+    #[error("{name} is {value}; it must be {wanted}")]
     Option { name: &'static str, value: f64, wanted: &'static str },
-    #[error("deviation {} is not finite; the measurement must not be used", index + 1)]
+    #[error("deviation {} is not finite; do not use this measurement", index + 1)]
     NotFinite { index: usize },
     #[error(
-        "only {valid} of {nodes} nodes have {LEAST_READINGS} measured points around them within the cut-off of {cutoff_mm} mm; measure more \
-         densely or choose a longer cut-off"
+        "only {valid} of {nodes} nodes have {LEAST_READINGS} measured points within the cut-off of {cutoff_mm} mm; \
+         measure more densely or choose a longer cut-off"
     )]
     TooSparse { valid: usize, nodes: usize, cutoff_mm: f64 },
     #[error(
-        "a cut-off of {cutoff_mm} mm on a grid of {width_mm:.1} x {depth_mm:.1} mm needs {nodes:.0} nodes to filter on, more than \
-         {MOST_WORKED:.0}; choose a longer cut-off"
+        "a cut-off of {cutoff_mm} mm on a grid of {width_mm:.1} x {depth_mm:.1} mm requires {nodes:.0} nodes for the \
+         filter, more than {MOST_WORKED:.0}; choose a longer cut-off"
     )]
     CutoffTooShort { cutoff_mm: f64, width_mm: f64, depth_mm: f64, nodes: f64 },
     #[error(
-        "a cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the width of {contact_width_mm:.3} mm over which the wheel touches: \
-         shorter waves cannot be ground; choose a longer cut-off or a smaller wheel"
+        "the cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the contact width of the wheel, \
+         {contact_width_mm:.3} mm: the wheel cannot grind shorter waves; choose a longer cut-off or a smaller wheel"
     )]
     CutoffBelowContact { cutoff_mm: f64, least_mm: f64, contact_width_mm: f64 },
     #[error(
-        "a cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the distance of {point_spacing_mm:.3} mm between measured points: \
-         shorter waves are not seen; choose a longer cut-off or measure more densely"
+        "the cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the distance between measured points, \
+         {point_spacing_mm:.3} mm: the points do not show shorter waves; choose a longer cut-off or measure more \
+         densely"
     )]
     CutoffBelowSpacing { cutoff_mm: f64, least_mm: f64, point_spacing_mm: f64 },
-    #[error("{found} values are given for a grid of {nodes} nodes; there must be one for each")]
+    #[error("{found} values are given for a grid of {nodes} nodes; give one for each node")]
     Shape { found: usize, nodes: usize },
 }

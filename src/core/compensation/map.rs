@@ -125,8 +125,7 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
         let all = wide.robust(&kept);
         let far = all.far((&kept.places, &kept.values), limit, apart_mm).unwrap_or_else(|| {
             advice.push(
-                "more than a tenth of the points stand out, so none was left out; clean the part and the probe"
-                    .to_owned(),
+                "more than 10 % of the points stand out, so none is rejected; clean the part and the probe".to_owned(),
             );
             Far::default()
         });
@@ -255,7 +254,11 @@ fn check(readings: &[Sample], options: &MapOptions) -> Result<(), MapError> {
         }
     }
     if let Some(value) = outlier_limit.filter(|limit| limit.is_nan() || *limit < 3.0) {
-        return Err(MapError::Option { name: "outlier_limit", value, wanted: "3 or more, or good points are lost" });
+        return Err(MapError::Option {
+            name: "outlier_limit",
+            value,
+            wanted: "3 or more, so that good points are not rejected",
+        });
     }
     match readings.iter().position(|r| !r.is_finite()) {
         Some(index) => Err(MapError::NotFinite { index }),
@@ -367,7 +370,7 @@ impl ErrorMap {
         let left_out = self.outliers.len();
         if left_out * 50 > readings {
             let advice =
-                format!("{left_out} of {readings} points were left out as outliers; clean the part and the probe");
+                format!("{left_out} of {readings} points are rejected as outliers; clean the part and the probe");
             self.advice.push(advice);
         }
         self

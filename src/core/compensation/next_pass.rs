@@ -43,26 +43,26 @@ pub struct NextPass {
 #[non_exhaustive]
 pub enum NextPassError {
     #[error(
-        "the correction would reach {found_um:.2} um at x {x_mm:.2}, y {y_mm:.2} mm, more than the {limit_um:.2} um that the recipe allows; find \
-         the cause of so large an error, or raise max_correction_um",
+        "the correction would reach {found_um:.2} µm at x {x_mm:.2}, y {y_mm:.2} mm; the recipe allows {limit_um:.2} \
+         µm; find the cause of this large error, or raise max_correction_um",
         found_um = 1e3 * found_mm, limit_um = 1e3 * limit_mm
     )]
     TooLarge { found_mm: f64, x_mm: f64, y_mm: f64, limit_mm: f64 },
     #[error(
-        "the next pass would bring the removal to {removed_um:.2} um, more than the budget of {budget_um:.2} um; the part has no more material to \
-         give: accept it as it is, or scrap it",
+        "the next pass would bring the removal to {removed_um:.2} µm, more than the budget of {budget_um:.2} µm; the \
+         part has no more material to remove: accept it as it is, or scrap it",
         removed_um = 1e3 * removed_mm, budget_um = 1e3 * budget_mm
     )]
     BudgetSpent { removed_mm: f64, budget_mm: f64 },
     #[error(
-        "the first pass would take {removed_um:.2} um off where it takes off most, more than the budget of {budget_um:.2} um; raise \
+        "the first pass would remove up to {removed_um:.2} µm, more than the budget of {budget_um:.2} µm; raise \
          removal_budget_um",
         removed_um = 1e3 * removed_mm, budget_um = 1e3 * budget_mm
     )]
     BudgetAtOnce { removed_mm: f64, budget_mm: f64 },
     #[error(
-        "the next pass would take {found_um:.2} um off where it takes off most, more than the {limit_um:.2} um of grinder.limits.max_depth_mm; \
-         lower the error by another way, or raise the limit if the machine allows it",
+        "the next pass would remove up to {found_um:.2} µm; grinder.limits.max_depth_mm allows {limit_um:.2} µm; \
+         reduce the error in another way, or raise the limit if the machine allows it",
         found_um = 1e3 * found_mm, limit_um = 1e3 * limit_mm
     )]
     TooDeep { found_mm: f64, limit_mm: f64 },

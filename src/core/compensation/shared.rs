@@ -150,19 +150,17 @@ impl LearningState {
     /// The state can be unfit even if [`LearningState::is_sound`] returns true.
     pub fn unfit_to_teach(&self) -> Option<String> {
         if self.bands.iter().any(|band| band.belief.is_some_and(|belief| belief <= 0.0)) {
-            return Some("a mean is said to be known without any doubt".into());
+            return Some("a mean has no uncertainty".into());
         }
         let Mean { grid, values_mm } = self.mean.as_ref()?;
         let most_mm = values_mm.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
         if most_mm > MOST_MEAN_MM {
-            return Some(format!(
-                "a mean of {most_mm:.3e} mm, more than the {MOST_MEAN_MM} mm that come back in any pass"
-            ));
+            return Some(format!("a mean of {most_mm:.3e} mm, limit {MOST_MEAN_MM} mm"));
         }
         let steps = grid.len() as f64 * (grid.columns + grid.rows) as f64 * self.bands.len() as f64;
         let (columns, rows, bands) = (grid.columns, grid.rows, self.bands.len());
         let why =
-            || format!("{columns} x {rows} nodes in {bands} bands, {steps:.0e} steps where {MOST_STEPS:.0e} are taken");
+            || format!("{columns} x {rows} nodes in {bands} bands make {steps:.0e} steps, limit {MOST_STEPS:.0e}");
         (steps > MOST_STEPS).then(why)
     }
 

@@ -9,27 +9,27 @@ use crate::geometry::Sample;
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum FormError {
-    #[error("{points} points, and at least {least} are needed; measure more of them or ask for fewer terms")]
+    #[error("there are {points} points; at least {least} are required; measure more points or request fewer terms")]
     TooFewPoints { points: usize, least: usize },
-    #[error("point {} has a place or a deviation that is not a finite number; leave it out", index + 1)]
+    #[error("point {} has a place or a deviation that is not a finite number; remove it", index + 1)]
     NotFinite { index: usize },
-    #[error("the points lie at one place or on a line, and a figure of an area needs an area; measure across the part")]
+    #[error("the points lie at one place or on a line, and the figure requires an area; measure across the part")]
     NoArea,
     #[error(
-        "the term {term} cannot be told from those before it by {points} points as they lie; measure more densely or ask for \
-         fewer terms"
+        "the places of the {points} points do not separate the term {term} from those before it; measure more \
+         densely or request fewer terms"
     )]
     Undetermined { term: String, points: usize },
-    #[error("{terms} terms are asked for, and {basis} has 1 to {most}; ask for fewer")]
+    #[error("{terms} terms are requested, and {basis} has 1 to {most}; request fewer")]
     Terms { terms: usize, basis: &'static str, most: usize },
     #[error(
-        "point {} lies {distance_mm} mm from the middle of polynomials with a radius of {radius_mm} mm, beyond one and a half times it; \
-         correct the aperture or leave the point out", index + 1
+        "point {} lies {distance_mm} mm from the middle of polynomials with a radius of {radius_mm} mm; the limit is \
+         1.5 times the radius; correct the aperture or remove the point", index + 1
     )]
     FarOut { index: usize, distance_mm: f64, radius_mm: f64 },
     #[error("the wavelength is {wavelength_nm} nm; it must be a finite number above 0")]
     Wavelength { wavelength_nm: f64 },
-    #[error("an integration length of {integration_mm} mm is asked for; it must be a finite number above 0")]
+    #[error("the integration length is {integration_mm} mm; it must be a finite number above 0")]
     Integration { integration_mm: f64 },
     #[error(
         "no node of the map has measured neighbours {integration_mm} mm apart along both axes; choose a shorter integration length or \

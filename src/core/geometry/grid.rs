@@ -24,14 +24,14 @@ pub struct Grid {
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum GridError {
-    #[error("a map with nodes every {spacing_mm} mm is asked for; the spacing must be above 0")]
+    #[error("the spacing of the map is {spacing_mm} mm; it must be above 0")]
     Spacing { spacing_mm: f64 },
     #[error(
         "a map with nodes every {spacing_mm} mm over {width_mm:.1} x {depth_mm:.1} mm has {nodes:.0} nodes, more than \
          {MOST_NODES:.0}; choose a wider spacing"
     )]
     TooFine { spacing_mm: f64, width_mm: f64, depth_mm: f64, nodes: f64 },
-    #[error("there is no point to lay a map over")]
+    #[error("there are no points for a map; check the measurement")]
     NoPoints,
 }
 

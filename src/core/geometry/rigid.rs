@@ -44,24 +44,24 @@ impl RigidFit {
 #[non_exhaustive]
 pub enum RigidError {
     /// The sets have different lengths.
-    #[error("{from} points cannot be laid on {to}; give every point its partner")]
+    #[error("{from} points cannot be fitted to {to}; give every point its partner")]
     Counts { from: usize, to: usize },
     /// Too few points to fix a pose.
-    #[error("{points} pairs of points do not fix a pose, at least 3 are needed; measure more reference points")]
+    #[error("{points} pairs of points do not determine a pose; at least 3 are required; measure more reference points")]
     TooFew { points: usize },
     /// A coordinate is NaN or infinite.
-    #[error("pair {} of the points holds a coordinate that is not finite; remove it", index + 1)]
+    #[error("pair {} of the points has a coordinate that is not finite; remove it", index + 1)]
     NotFinite { index: usize },
     /// All points lie on a line.
     #[error(
-        "the points lie on one line: their width is {share:.1e} of their length, at least {LEAST_WIDTH_SHARE:.0e} is needed to fix \
-         the rotation about it; add a reference point off the line"
+        "the points lie on one line: their width is {share:.1e} of their length; at least {LEAST_WIDTH_SHARE:.0e} is \
+         required to determine the rotation about it; add a reference point off the line"
     )]
     Collinear { share: f64 },
     /// One set is a mirror image of the other.
     #[error(
-        "one set of points is a mirror image of the other: as given they fit to {rms_mm:.4} mm, mirrored to {mirrored_rms_mm:.4} mm \
-         rms; an axis is reversed or two points are exchanged"
+        "one set of points is a mirror image of the other: as given they fit to {rms_mm:.4} mm rms, mirrored to \
+         {mirrored_rms_mm:.4} mm; correct a reversed axis or two swapped points"
     )]
     Mirrored { rms_mm: f64, mirrored_rms_mm: f64 },
 }

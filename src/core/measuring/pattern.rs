@@ -48,8 +48,8 @@ pub enum PatternError {
     #[error("the measuring pattern has {count:.0} points, more than {MOST_TARGETS:.0}; choose a wider spacing")]
     TooMany { count: f64 },
     #[error(
-        "none of the {asked} places of the measuring pattern lies on the part, {margin_mm} mm inside its edge; reduce edge_margin_mm \
-         or the spacing"
+        "none of the {asked} places of the measuring pattern lies on the part at least {margin_mm} mm inside its \
+         edge; reduce edge_margin_mm or the spacing"
     )]
     NoneOnPart { asked: usize, margin_mm: f64 },
 }

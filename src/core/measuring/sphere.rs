@@ -24,11 +24,13 @@ pub struct SphereFit {
 #[non_exhaustive]
 pub enum SphereFitError {
     #[error(
-        "{points} points were touched on the reference sphere and at least {LEAST} are needed; look at the sphere and its place in the cell file"
+        "{points} points were touched on the reference sphere; at least {LEAST} are required; check the sphere and \
+         its position in the cell file"
     )]
     TooFew { points: usize },
     #[error(
-        "the points touched on the reference sphere are not finite or lie on a plane; look at the sphere and its place in the cell file"
+        "the points touched on the reference sphere are not finite or lie on a plane; check the sphere and its \
+         position in the cell file"
     )]
     Degenerate,
 }

@@ -304,24 +304,24 @@ mod tests {
             DensePosterior::fit(observed, hyperparameters).err().unwrap().to_string()
         };
         let two = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0, f64::NAN]);
-        assert_eq!(of(&two, HYPER), "point 2 has a number that is none");
+        assert_eq!(of(&two, HYPER), "point 2 has a number that is not finite");
         let none = Observed::without_effects(vec![], vec![]);
-        assert!(of(&none, HYPER).contains("needs 1 points at least, 0"));
+        assert!(of(&none, HYPER).contains("at least 1 points; 0"));
         let odd = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0]);
-        assert!(of(&odd, HYPER).contains("do not belong together"));
+        assert!(of(&odd, HYPER).contains("do not match"));
         let good = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0; 2]);
-        assert!(of(&good, Hyperparameters { noise_sigma_mm: 0.0, ..HYPER }).contains("the scatter is 0 mm"));
+        assert!(of(&good, Hyperparameters { noise_sigma_mm: 0.0, ..HYPER }).contains("the noise is 0 mm"));
         for noise_autocorrelation in [1.0, -0.1, f64::NAN] {
             assert!(of(&good, Hyperparameters { noise_autocorrelation, ..HYPER }).contains("below 1"));
         }
         for path in [vec![0.0; good.places.len() + 1], vec![f64::NAN; good.places.len()]] {
-            assert!(of(&Observed { path, ..good.clone() }, HYPER).contains("belong together"));
+            assert!(of(&Observed { path, ..good.clone() }, HYPER).contains("do not match"));
         }
         let alike = Observed {
             fixed_effects: DMatrix::from_element(9, 2, 1.0),
             ..Observed::without_effects(places(9), vec![0.0; 9])
         };
-        assert!(of(&alike, HYPER).contains("cannot be told apart"));
+        assert!(of(&alike, HYPER).contains("do not separate the effects"));
         assert!(DensePosterior::fit(&good, HYPER).is_ok(), "two points at one place");
     }
 }

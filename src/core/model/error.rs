@@ -7,38 +7,43 @@ use thiserror::Error;
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum ModelError {
-    #[error("{points} places, {deviations} deviations and {rows} rows of effects do not belong together")]
+    #[error("{points} places, {deviations} deviations and {rows} rows of effects do not match")]
     Shape { points: usize, deviations: usize, rows: usize },
-    #[error("a model needs {least} points at least, {points} were given")]
+    #[error("the model requires at least {least} points; {points} are given")]
     TooFewPoints { points: usize, least: usize },
-    #[error("point {} has a number that is none", point + 1)]
+    #[error("point {} has a number that is not finite", point + 1)]
     NotFinite { point: usize },
     #[error("the {what} is {value} mm; it must be finite and above 0")]
     Hyper { what: &'static str, value: f64 },
     #[error(
-        "the lay of the field goes along {along:?} and stretches it {stretch} times; it must be a unit vector, and 1 time at least"
+        "the lay of the field has the direction {along:?} and the stretch {stretch}; the direction must be a unit \
+         vector, and the stretch at least 1"
     )]
     Lay { along: [f64; 2], stretch: f64 },
     #[error(
-        "the standard uncertainty of the {what} is {value} (mm, rad or a share); it must be 0 at least and what a machine or a fixture can have: correct what is stated of it"
+        "the standard uncertainty of the {what} is {value} (mm, rad or a share); it must be at least 0 and plausible \
+         for a machine or a fixture: correct the stated value"
     )]
     Stated { what: &'static str, value: f64 },
     #[error(
-        "the {what} is expected to be {median} by a factor of {factor}; the one must be finite and above 0, the other finite and above 1: nothing is known for certain beforehand"
+        "the prior of the {what} has the median {median} and the factor {factor}; the median must be finite and \
+         above 0, the factor finite and above 1"
     )]
     Expected { what: &'static str, median: f64, factor: f64 },
-    #[error("the drift is {value}; it must be 0 at least and below 1")]
+    #[error("the drift is {value}; it must be at least 0 and below 1")]
     Drift { value: f64 },
     #[error(
-        "the covariance of the points is not definite: their scatter is too small beside the field, or places coincide"
+        "the covariance of the points is not positive definite: their noise is too small compared with the field, or \
+         places coincide"
     )]
     NotDefinite,
-    #[error("the effects cannot be told apart by these points; leave out what the surface does not show")]
+    #[error("these points do not separate the effects; remove the effects that the surface does not show")]
     EffectsAlike,
     #[error(
-        "the points are of {sessions} session; what differs between sessions is told by {least} at least: measure once more, or from another station"
+        "the points are of {sessions} session; at least {least} are required for the variance between sessions: \
+         measure once more, or from another station"
     )]
     TooFewSessions { sessions: usize, least: usize },
-    #[error("{points} points and {sessions} numbers of their sessions do not belong together")]
+    #[error("{points} points and {sessions} numbers of their sessions do not match")]
     Sessions { points: usize, sessions: usize },
 }

@@ -178,7 +178,7 @@ pub(super) fn unsound(
         ("radius of the probe", radius_mm, 10.0),
         ("temperature", temperature, 0.1),
     ];
-    let held = datum.map(|of| ("place where the part is held", of, 10.0)).into_iter();
+    let held = datum.map(|of| ("pose of the fixture", of, 10.0)).into_iter();
     shares
         .chain(angles)
         .chain(others)

@@ -28,7 +28,7 @@ impl Prior {
     /// # Errors
     /// Returns [`ModelError::Expected`] with the wrong values.
     pub(super) fn check(&self) -> Result<(), ModelError> {
-        for (what, [median, factor]) in [("range", self.range_mm), ("ratio of scatter to field", self.noise_ratio)] {
+        for (what, [median, factor]) in [("range", self.range_mm), ("ratio of noise to field", self.noise_ratio)] {
             if !(median.is_finite() && median > 0.0 && factor.is_finite() && factor > 1.0) {
                 return Err(ModelError::Expected { what, median, factor });
             }
@@ -76,10 +76,10 @@ mod tests {
     fn what_cannot_be_expected_is_refused_in_words() {
         let good = Prior::for_size(102.0);
         for (bad, words) in [
-            (Prior { range_mm: [8.0, 1.0], ..good }, "the range is expected to be 8 by a factor of 1;"),
-            (Prior { range_mm: [0.0, 2.0], ..good }, "the range is expected to be 0 by a factor of 2;"),
-            (Prior { noise_ratio: [f64::NAN, 2.0], ..good }, "the ratio of scatter to field is expected to be NaN"),
-            (Prior { noise_ratio: [0.1, f64::INFINITY], ..good }, "by a factor of inf;"),
+            (Prior { range_mm: [8.0, 1.0], ..good }, "the range has the median 8 and the factor 1;"),
+            (Prior { range_mm: [0.0, 2.0], ..good }, "the range has the median 0 and the factor 2;"),
+            (Prior { noise_ratio: [f64::NAN, 2.0], ..good }, "the ratio of noise to field has the median NaN"),
+            (Prior { noise_ratio: [0.1, f64::INFINITY], ..good }, "the factor inf;"),
         ] {
             let error = bad.check().unwrap_err().to_string();
             assert!(error.contains(words), "{error}");

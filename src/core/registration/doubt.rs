@@ -58,32 +58,33 @@ fn of_points(found: &Registration) -> Vec<String> {
     doubts.extend(found.no_verdict());
     if share(outliers) > MOST_OUTLIERS {
         doubts.push(format!(
-            "{outliers} of {points} points ({:.0} %) are outliers and were left out: look for dirt or coolant on the part, a probe that \
-             slipped or wears, points of a fixture, or steps and edges that the nominal surface does not have",
+            "{outliers} of {points} points ({:.0} %) are rejected as outliers: look for dirt or coolant on the part, \
+             a probe that slipped or wears, points of a fixture, or steps and edges that the nominal surface does \
+             not have",
             100.0 * share(outliers),
         ));
     }
     let in_gaps = if off_part > 0 { in_gaps(found, off_part) } else { 0 };
     if share(off_part - in_gaps) > MOST_OFF_PART {
         doubts.push(format!(
-            "{} of {points} points ({:.0} %) lie beyond the edge of the nominal surface and were left out: does the nominal \
-             surface reach as far as the part, and does the cloud belong to it?",
+            "{} of {points} points ({:.0} %) lie beyond the edge of the nominal surface and are not used: check that \
+             the nominal surface covers the part, and that the cloud belongs to it",
             off_part - in_gaps,
             100.0 * share(off_part - in_gaps),
         ));
     }
     if in_gaps > 0 {
         doubts.push(format!(
-            "{in_gaps} of {points} points ({:.0} %) lie over a gap of the nominal surface, where it has no points, and were left out: give it \
-             points there, if the part has a surface there",
+            "{in_gaps} of {points} points ({:.0} %) lie over a gap of the nominal surface, where it has no points, \
+             and are not used: add nominal points there, if the part has a surface there",
             100.0 * share(in_gaps),
         ));
     }
     let coverage = found.verdict.coverage;
     if coverage < LEAST_COVERAGE {
         doubts.push(format!(
-            "the {} points used lie on {:.0} % of the nominal surface only, and tell nothing of the rest: was the measurement or its \
-             file cut short, or is the nominal surface larger than the part?",
+            "the {} points used cover only {:.0} % of the nominal surface, and the rest is unknown: check whether \
+             the measurement or its file is cut short, or the nominal surface is larger than the part",
             points - outliers - off_part,
             100.0 * coverage,
         ));
@@ -140,8 +141,8 @@ impl Registration {
         let with = figures(&mut on_part.iter().map(|d| d.deviation_mm));
         let without = figures(&mut on_part.iter().filter(|d| d.in_fit).map(|d| d.deviation_mm));
         Some(format!(
-            "{contradicted} of {} points ({:.0} %) contradict their neighbours, so nothing can be judged by them: with them {with}, \
-             without them {without}; clean the part, check the probe, and measure again",
+            "{contradicted} of {} points ({:.0} %) contradict their neighbours, so no verdict is possible: with them \
+             {with}, without them {without}; clean the part, check the probe, and measure again",
             on_part.len(),
             100.0 * contradicted as f64 / on_part.len() as f64,
         ))
@@ -156,8 +157,8 @@ fn of_nominal(part: &Part, found: &Registration) -> Option<String> {
     let scatter_mm = part.nominal.scatter_mm();
     (scatter_mm > LEAST_MM.max(LEAST_OF_RMS * found.verdict.rms_mm)).then(|| {
         format!(
-            "the nominal points scatter by {} about a smooth surface, and each deviation by about as much: give them with more digits, or \
-             the surface that they were taken from",
+            "the nominal points have a noise of {} about a smooth surface, and each deviation has about as much: \
+             give them with more digits, or give the surface that they come from",
             length(scatter_mm),
         )
     })
@@ -168,8 +169,8 @@ fn of_left_out(found: &Registration) -> Option<String> {
     let WithLeftOut { points, rms_mm, pv_mm, places } = found.with_left_out()?;
     let were = if points == 1 { "1 point was".to_owned() } else { format!("{points} points were") };
     Some(format!(
-        "{were} left out, for no neighbour found the same: {places}; with what was left out PV is {} and RMS {}: clean the place and \
-         touch it again",
+        "{were} rejected, because no neighbour confirms the deviation: {places}; with all points PV is {} and RMS \
+         {}: clean the place and touch it again",
         length(pv_mm),
         length(rms_mm),
     ))
@@ -195,15 +196,16 @@ pub(super) fn of_radius(part: &Part, found: &Registration, measured: &[Point], o
         let (rms, other_rms) = (length(rms_mm), length(other_rms_mm));
         if is_contact {
             format!(
-                "the points look like contact points on the surface, not like centres of a ball of {given_mm} mm: as contact points they \
-                 fit to {other_rms} rms instead of {rms}; if the CMM has taken its radius off already, register with the method `contact`"
+                "the points look like contact points on the surface, not like centres of a ball of {given_mm} mm: as \
+                 contact points they fit to {other_rms} rms instead of {rms}; if the CMM has already subtracted the \
+                 radius, register with the method `contact`"
             )
         } else {
             let side = if told_mm < 0.0 { " on the other side of the surface" } else { "" };
             format!(
-                "a probe radius of about {:.2} mm{side} fits the points to {other_rms} rms, the {given_mm} mm given to {rms}: check which \
-                 ball was in the probe, and that the figure is its radius and not its diameter; else the part is bent in just that way, \
-                 as by a wheel whose radius is off",
+                "a probe radius of about {:.2} mm{side} fits the points to {other_rms} rms, the given {given_mm} mm \
+                 to {rms}: check which ball was in the probe, and that the value is its radius, not its diameter; \
+                 otherwise the part itself is bent in this way, as after a wheel of a wrong radius",
                 told_mm.abs()
             )
         }

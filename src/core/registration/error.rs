@@ -13,26 +13,27 @@ pub enum RegistrationError {
     #[error(transparent)]
     Surface(#[from] SurfaceError),
     #[error(
-        "the probe radius is {radius_mm} mm; it must be above 0 and below {limit_mm:.3} mm, half the size of the part; without a ball \
-         (radius 0) the points are contact points: register with the method `contact`"
+        "the probe radius is {radius_mm} mm; it must be above 0 and below {limit_mm:.3} mm, half the size of the \
+         part; for contact points (radius 0) register with the method `contact`"
     )]
     ProbeRadius { radius_mm: f64, limit_mm: f64 },
     #[error(
-        "there are {points} measured points and at least {least} are needed, one more than the pose has free directions; measure more, or \
-         hold what the fixture knows"
+        "there are {points} measured points; at least {least} are required, one more than the pose has free \
+         directions; measure more, or lock the directions that the fixture holds"
     )]
     TooFewPoints { points: usize, least: usize },
     #[error(
-        "the measured points are a line, or next to one: {width_mm:.3} mm wide, with {distance_mm:.3} mm from point to point; they do not \
-         tell how the part is turned about that line, nor where it lies across it; measure a strip of {least_mm:.3} mm at least, or start \
-         at a pose and hold {} and {}", hold[0].name(), hold[1].name()
+        "the measured points lie on or near one line: {width_mm:.3} mm wide, with {distance_mm:.3} mm from point to \
+         point; they do not determine the rotation of the part about that line, nor its position across it; measure \
+         a strip at least {least_mm:.3} mm wide, or give a start pose and lock {} and {}",
+        hold[0].name(), hold[1].name()
     )]
     Narrow { width_mm: f64, distance_mm: f64, least_mm: f64, hold: [Coordinate; 2] },
     #[error("measured point {} is not finite; remove it or correct it", index + 1)]
     NotFinite { index: usize },
     #[error(
-        "measured point {} at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the others, as no touch does; remove it or \
-         correct it", index + 1, at[0], at[1], at[2]
+        "measured point {} at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the others, too \
+         far for a touch; remove it or correct it", index + 1, at[0], at[1], at[2]
     )]
     FarOff { index: usize, at: [f64; 3], distance_mm: f64 },
     #[error(
@@ -40,11 +41,11 @@ pub enum RegistrationError {
         at[0], at[1], at[2]
     )]
     NominalFarOff { at: [f64; 3], distance_mm: f64 },
-    #[error("all {points} measured points lie on one line; a pose needs points off it")]
+    #[error("all {points} measured points lie on one line; measure points off the line")]
     Collinear { points: usize },
     #[error(
-        "{doubled} of {points} measured points that were looked at repeat another one exactly; was a file joined to itself? \
-         remove the repeats"
+        "{doubled} of {points} examined points repeat another point exactly; check whether a file was joined to \
+         itself, and remove the repeats"
     )]
     Repeated { doubled: usize, points: usize },
     #[error(
@@ -53,27 +54,30 @@ pub enum RegistrationError {
     )]
     Size { ratio: f64, measured_mm: f64, nominal_mm: f64, remedy: &'static str },
     #[error(
-        "only {used} of {points} measured points lie on the part; check that the cloud belongs to it, and the start pose"
+        "only {used} of {points} measured points lie on the part; check that the cloud belongs to the part, and \
+         check the start pose"
     )]
     TooFewUsed { used: usize, points: usize },
     #[error(
-        "no minimum within {iterations} iterations; the objective is at {objective_mm2:.3e} mm^2; allow more, or give a start pose"
+        "no minimum within {iterations} iterations; the objective is {objective_mm2:.3e} mm^2; allow more \
+         iterations, or give a start pose"
     )]
     NotConverged { iterations: usize, objective_mm2: f64 },
     #[error("the measured points do not fit the nominal surface: rms {rms_mm:.4} mm, limit {limit_mm:.4} mm; {remedy}")]
     DoesNotFit { rms_mm: f64, limit_mm: f64, remedy: String },
     #[error(
-        "the measured cloud is a mirror image of the part: as measured it fits to {rms_mm:.4} mm, mirrored to \
-         {mirrored_rms_mm:.4} mm rms; one axis of the CMM file is reversed"
+        "the measured cloud is a mirror image of the part: as measured it fits to {rms_mm:.4} mm rms, mirrored to \
+         {mirrored_rms_mm:.4} mm; one axis of the CMM file is reversed: correct it"
     )]
     Mirrored { rms_mm: f64, mirrored_rms_mm: f64 },
     #[error(
-        "the probe lies on the other side of the nominal surface: rms {other_rms_mm:.4} mm there, {rms_mm:.4} mm on the side \
-         given; turn the normals or the side"
+        "the probe lies on the other side of the nominal surface: rms {other_rms_mm:.4} mm there, {rms_mm:.4} mm on \
+         the given side; reverse the normals, or give the other side"
     )]
     WrongSide { rms_mm: f64, other_rms_mm: f64 },
     #[error(
-        "no direction of the pose is free or visible; give the pose that is held whole, unlock a direction, or give a surface with more shape"
+        "no free direction of the pose is observable; give the complete pose, unlock a direction, or give a surface \
+         with more shape"
     )]
     Undetermined,
 }

@@ -81,11 +81,11 @@ pub fn weak_for_compensation(found: &Registration, covariance: &Matrix6<f64>, li
     let weak: Vec<&str> = seen.map(|w| w.words.as_str()).collect();
     let weak = if weak.is_empty() { String::new() } else { format!(" ({})", weak.join("; ")) };
     Some(format!(
-        "the measured heights are good, but the shape of the part does not tell where on it they lie{weak}. The \
-         correction might sit {beside_mm:.2} mm beside its place, allowed are {:.2} mm. Where the error map climbs, by up to {:.2} um per \
-         mm, that makes it wrong by {:.1} um, allowed are {:.1} um, {:.0} % of the {:.1} um rms to be corrected; at edges and seams by \
-         more. Hold the directions in the recipe if the fixture holds the part better than that (registration.lock = [\"x\", \"y\", \
-         \"rz\"]), or measure edges or marks that show them",
+        "the measured heights are good, but the shape of the part does not determine where they lie on it{weak}. The \
+         correction may be displaced by {beside_mm:.2} mm, limit {:.2} mm. On slopes of the error map, up to {:.2} \
+         µm/mm, this makes the correction wrong by {:.1} µm, limit {:.1} µm, {:.0} % of the {:.1} µm rms to be \
+         corrected; at edges and seams by more. Lock these directions in the recipe if the fixture holds the part \
+         better than that (registration.lock = [\"x\", \"y\", \"rz\"]), or measure edges or marks that show them",
         limits.place_mm,
         1e3 * slope,
         1e3 * error_mm,
@@ -186,7 +186,7 @@ mod tests {
         }
         let n = deviations.len() as f64;
         let objective_mm2 = deviations.iter().map(|d| d.deviation_mm * d.deviation_mm).sum::<f64>();
-        let words = "x and y shift: found again to 3.4 mm only".to_owned();
+        let words = "x and y position repeats only to 3.4 mm".to_owned();
         let verdict = Verdict {
             used: deviations.len(),
             objective_mm2,
@@ -233,14 +233,11 @@ mod tests {
         let border = limits.share * at(1.0).verdict.rms_mm / unit;
         assert_eq!(weak(&at(0.999 * border), &limits), None);
         let why = weak(&at(1.001 * border), &limits).unwrap();
-        assert!(
-            why.contains("found again to 3.4 mm only") && why.contains("Hold the directions in the recipe"),
-            "{why}"
-        );
+        assert!(why.contains("repeats only to 3.4 mm") && why.contains("Lock these directions in the recipe"), "{why}");
         let near = MapLimits { share: 1e3, ..MapLimits::default() };
         assert_eq!(weak(&at(0.499), &near), None);
         let why = weak(&at(0.501), &near).unwrap();
-        assert!(why.contains("might sit 1.00 mm beside its place, allowed are 1.00 mm"), "{why}");
+        assert!(why.contains("may be displaced by 1.00 mm, limit 1.00 mm"), "{why}");
         // Locked directions have no variance.
         assert_eq!(weak(&at(0.0), &limits), None);
     }

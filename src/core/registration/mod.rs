@@ -179,8 +179,8 @@ fn confirm(part: &Part, found: &Registration, measured: &[Point], options: &Opti
         let elsewhere = || {
             (is_held && free_rms_mm <= limit_mm).then(|| {
                 format!(
-                    "with nothing held they fit to {free_rms_mm:.4} mm: the part lies elsewhere than the pose that is held; correct \
-                     that pose, or unlock more"
+                    "without locks they fit to {free_rms_mm:.4} mm: the part is not at the locked pose; correct that \
+                     pose, or unlock more directions"
                 )
             })
         };

@@ -157,13 +157,15 @@ fn check_sizes(measured_mm: f64, nominal_mm: f64) -> Result<(), RegistrationErro
     let remedy = match ratio {
         r if !(r > 0.0 && r.is_finite()) => "a size must be above 0",
         r if r > 500.0 => {
-            "are the nominal points in metres, or the measured ones in micrometres? give both in millimetres"
+            "check whether the nominal points are in metres or the measured points in micrometres; give both in \
+             millimetres"
         }
-        r if r > 15.0 => "are the nominal points in inches or centimetres? give both in millimetres",
-        r if r > 3.0 => "is this the nominal surface of this part, and are both in millimetres?",
-        r if r < 0.002 => "are the measured points in metres? give both in millimetres",
+        r if r > 15.0 => "check whether the nominal points are in inches or centimetres; give both in millimetres",
+        r if r > 3.0 => "check that this is the nominal surface of this part, and that both are in millimetres",
+        r if r < 0.002 => "check whether the measured points are in metres; give both in millimetres",
         r if r < 0.06 => {
-            "are the measured points in inches or centimetres, or on a small part of the surface only? give both in millimetres"
+            "check whether the measured points are in inches or centimetres, or cover only a small area of the \
+             surface; give both in millimetres"
         }
         _ => return Ok(()),
     };

@@ -51,7 +51,7 @@ impl Registration {
             return None;
         }
         let named = self.left_out().take(NAMED).map(|(k, d)| {
-            format!("point {k} at ({:.1}, {:.1}) mm by {:+.1} um", d.point.x, d.point.y, 1e3 * d.deviation_mm)
+            format!("point {k} at ({:.1}, {:.1}) mm by {:+.1} µm", d.point.x, d.point.y, 1e3 * d.deviation_mm)
         });
         let more = (points > NAMED).then(|| format!("and {} more", points - NAMED));
         let places = named.chain(more).collect::<Vec<_>>().join(", ");

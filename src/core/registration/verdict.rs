@@ -144,7 +144,7 @@ fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64
     let mut warnings = Vec::new();
     if !initial.side_known {
         warnings.push(
-            "the shape does not tell on which side of the surface the probe was; the side is assumed, state it"
+            "the shape does not determine on which side of the surface the probe was; the side is assumed: state it"
                 .to_string(),
         );
     }
@@ -209,7 +209,7 @@ fn held_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scaling: &Sca
     words
         .into_iter()
         .map(|w| WeakDirection {
-            words: format!("{w}: the surface cannot see it, it is held where it began"),
+            words: format!("{w}: the shape does not determine it; it keeps its start value"),
             held: true,
             sigma_mm: None,
         })
@@ -286,11 +286,11 @@ fn weakly_seen(scaled: &Matrix6<f64>, sigma_mm: f64, scaling: &Scaling, some_hel
             let names: Vec<&str> = group.iter().map(|k| ["x", "y", "z"][k % 3]).collect();
             let names = names.join(" and ");
             let words = if kind == "shift" {
-                format!("{names} shift: found again to {} only", length(at_rim[worst]))
+                format!("{names} position repeats only to {}", length(at_rim[worst]))
             } else {
                 let angle = at_rim[worst] / scaling.size_mm;
                 format!(
-                    "rotation about {names}: found again to {:.2} mrad only, {} at the rim",
+                    "rotation about {names} repeats only to {:.2} mrad, {} at the rim",
                     1e3 * angle,
                     length(at_rim[worst])
                 )
@@ -308,9 +308,9 @@ pub(super) fn length(mm: f64) -> String {
         l if l >= 10.0 => format!("{l:.0} mm"),
         l if l >= 1.0 => format!("{l:.1} mm"),
         l if l >= 0.1 => format!("{l:.2} mm"),
-        l if l >= 0.01 => format!("{:.0} um", 1e3 * l),
-        l if l >= 1e-3 => format!("{:.1} um", 1e3 * l),
-        l => format!("{:.2} um", 1e3 * l),
+        l if l >= 0.01 => format!("{:.0} µm", 1e3 * l),
+        l if l >= 1e-3 => format!("{:.1} µm", 1e3 * l),
+        l => format!("{:.2} µm", 1e3 * l),
     }
 }
 

@@ -16,7 +16,7 @@ pub enum SurfaceError {
         index + 1, at[0], at[1], at[2]
     )]
     FarOff { index: usize, at: [f64; 3], distance_mm: f64 },
-    #[error("all {points} nominal points lie on one line; a surface needs points off it")]
+    #[error("all {points} nominal points lie on one line; a surface requires points off the line")]
     Collinear { points: usize },
     #[error(
         "nominal points {} and {} share one place at ({:.6}, {:.6}, {:.6}) mm; remove the duplicate",
@@ -24,8 +24,8 @@ pub enum SurfaceError {
     )]
     DuplicatePoints { first: usize, second: usize, at: [f64; 3] },
     #[error(
-        "nominal points {} and {} at ({:.6}, {:.6}, {:.6}) mm are near-duplicates, {apart_mm:e} mm apart: what runs between them is rounding; \
-         remove one of them", first + 1, second + 1, at[0], at[1], at[2]
+        "nominal points {} and {} at ({:.6}, {:.6}, {:.6}) mm are near-duplicates, {apart_mm:e} mm apart: the \
+         surface between them is rounding error; remove one of them", first + 1, second + 1, at[0], at[1], at[2]
     )]
     NearDuplicates { first: usize, second: usize, at: [f64; 3], apart_mm: f64 },
     #[error(
@@ -34,28 +34,35 @@ pub enum SurfaceError {
     NoProjection { tried: String },
     #[error("the nominal mesh has no triangle; give a file with faces")]
     NoTriangles,
-    #[error("a triangle of the nominal mesh names vertex {vertex}, but there are {points} (counted from 0)")]
+    #[error(
+        "a triangle of the nominal mesh names vertex {vertex}, but there are {points} (counted from 0); export the \
+         mesh again"
+    )]
     VertexOutOfRange { vertex: u32, points: usize },
     #[error(
-        "{triangles} triangles of the nominal mesh share one edge at ({:.6}, {:.6}, {:.6}) mm; a surface has two at most",
+        "{triangles} triangles of the nominal mesh share one edge at ({:.6}, {:.6}, {:.6}) mm; a surface has at most \
+         two; repair the mesh",
         at[0], at[1], at[2]
     )]
     NonManifold { at: [f64; 3], triangles: usize },
     #[error(
-        "{count} triangles of the nominal mesh are there twice, the first at ({:.6}, {:.6}, {:.6}) mm; remove the doubles",
+        "{count} triangles of the nominal mesh are duplicates, the first at ({:.6}, {:.6}, {:.6}) mm; remove the \
+         duplicates",
         at[0], at[1], at[2]
     )]
     DoubledTriangles { count: usize, at: [f64; 3] },
     #[error(
-        "the nominal mesh of {triangles} triangles is a closed solid, and which of its faces is ground it does not say; export that face alone"
+        "the nominal mesh of {triangles} triangles is a closed solid and does not show which of its faces is ground; \
+         export only that face"
     )]
     ClosedSolid { triangles: usize },
     #[error(
-        "neighbouring triangles of the nominal mesh turn opposite ways at ({:.6}, {:.6}, {:.6}) mm; orient them alike",
+        "neighbouring triangles of the nominal mesh turn opposite ways at ({:.6}, {:.6}, {:.6}) mm; give them the \
+         same orientation",
         at[0], at[1], at[2]
     )]
     Orientation { at: [f64; 3] },
-    #[error("a grid of {columns} x {rows} nodes was announced and {points} points were given")]
+    #[error("the grid has {columns} x {rows} nodes, and {points} points are given; give one point for each node")]
     GridSize { columns: usize, rows: usize, points: usize },
     #[error("a patch list is empty; give at least one patch")]
     NoPatches,

@@ -261,7 +261,7 @@ impl Judge {
     fn is_new(&self, expected: &Expected, file: &WatchedFile, notes: &mut Vec<String>) -> bool {
         let earlier = !self.settings.accept_earlier_files && expected.stored.header.is_earlier(&file.name, &file.stamp);
         if earlier {
-            notes.push(format!("{} lay there before the plan was handed over; left alone", file.name));
+            notes.push(format!("{} was there before the plan was handed over; ignored", file.name));
         }
         !earlier
     }
@@ -277,7 +277,7 @@ impl Judge {
                 continue;
             }
             if !file.settled {
-                notes.push(format!("{} is still changing, or has only just stopped; waiting", file.name));
+                notes.push(format!("{} is still changing or changed a moment ago; waiting", file.name));
                 // Another file must not be accepted before a file that matches the pattern has settled.
                 if pattern.fits(&file.name) {
                     return Ok(None);
@@ -286,7 +286,7 @@ impl Judge {
             }
             match self.foreign_reason(ticket, &pattern, file) {
                 Ok(None) => ours.push(file),
-                Ok(Some(why)) => notes.push(format!("{} {why}; left alone", file.name)),
+                Ok(Some(why)) => notes.push(format!("{} {why}; ignored", file.name)),
                 Err(error) => notes.push(error.to_string()),
             }
         }
@@ -319,7 +319,7 @@ impl Judge {
             let most = MAX_UNMATCHED_BYTES >> 20;
             let pattern = pattern.as_str();
             return Ok(Some(format!(
-                "is larger than {most} MiB and its name does not fit {pattern}: it was not looked into"
+                "is larger than {most} MiB, and its name does not match {pattern}: it was not read"
             )));
         }
         let says = read_statements(&file.path, &read_bytes(&file.path)?)?;
@@ -327,9 +327,10 @@ impl Judge {
         Ok(contradiction(&says, &ticket.part, ticket.cycle, &ticket.identity).or_else(|| {
             match says_so || pattern.fits(&file.name) {
                 true => None,
-                false => {
-                    Some(format!("does not say that it belongs here and its name does not fit {}", pattern.as_str()))
-                }
+                false => Some(format!(
+                    "does not state that it belongs here, and its name does not match {}",
+                    pattern.as_str()
+                )),
             }
         }))
     }
@@ -394,20 +395,20 @@ impl Judge {
         let (pairs, waiting) = self.paired(&expected.stored.header, stations, &new)?;
         if !waiting.is_empty() {
             let (there, of, waiting) = (pairs.len(), stations.files.len(), waiting.join(", "));
-            notes.push(format!("{there} of {of} stations are there; waiting for {waiting}"));
+            notes.push(format!("{there} of {of} stations are complete; waiting for {waiting}"));
             return Ok(None);
         }
         let used = |name: &str| pairs.iter().any(|(p, r)| p.name == name || r.name == name);
         let left: Vec<&str> = new.iter().map(|f| f.name.as_str()).filter(|name| !used(name)).collect();
         if !left.is_empty() {
-            notes.push(format!("left alone, no station's: {}", left.join(", ")));
+            notes.push(format!("ignored, because they belong to no station: {}", left.join(", ")));
         }
         let accepted = self.merge(expected, stations, &pairs)?;
         let (there, least) = (accepted.measurement.points.len(), self.settings.min_points);
         if self.settings.free_count && there < least {
             notes.extend(accepted.notes);
             notes.push(format!(
-                "{there} points of {} stations; at least {least} are needed, waiting for further stations",
+                "{there} points of {} stations; at least {least} are required; waiting for further stations",
                 pairs.len()
             ));
             return Ok(None);
@@ -592,7 +593,7 @@ impl Exchange for CmmFolders {
         let answer = match judgement {
             Ok(None) => None,
             Err(error) => {
-                notes.push(format!("not taken: {error}"));
+                notes.push(format!("not accepted: {error}"));
                 None
             }
             Ok(Some(accepted)) => {
@@ -611,7 +612,7 @@ impl Exchange for CmmFolders {
 
 fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
     let off = result.switched_off;
-    (off > 0).then(|| format!("{name}: {off} rows are switched off and were left out"))
+    (off > 0).then(|| format!("{name}: {off} rows are switched off and were ignored"))
 }
 
 /// Reads the plan of a hand-over from its files as they were written.

@@ -75,7 +75,8 @@ impl Confirmation {
         let (map, identity) = (self.map.trim().to_lowercase(), &ticket.identity);
         if map.len() < 8 || !identity.starts_with(&map) {
             let found = if map.is_empty() { "no map".to_owned() } else { format!("map `{}`", self.map) };
-            let remedy = "is the grinder set up with another map? copy the file from the folder of the hand-over";
+            let remedy =
+                "check whether the grinder has another map, and copy the file from the folder of the hand-over";
             return wrong(found, format!("map {identity}"), remedy);
         }
         let job = (self.job.unwrap_or(ticket.job), self.cycle.unwrap_or(ticket.cycle));
@@ -89,7 +90,11 @@ impl Confirmation {
             || !positive(self.removed_mm3)
             || !self.temperature_c.is_none_or(f64::is_finite)
         {
-            return wrong("a negative size".to_owned(), "sizes of 0 or more".to_owned(), "correct the numbers");
+            return wrong(
+                "a negative or invalid number".to_owned(),
+                "numbers of 0 or more".to_owned(),
+                "correct the numbers",
+            );
         }
         Ok(())
     }
@@ -123,11 +128,11 @@ impl GrinderFolders {
     ) -> Option<(Confirmation, String)> {
         let file = found.iter().find(|f| f.name == name)?;
         if stored.header.is_earlier(name, &file.stamp) {
-            notes.push(format!("{name} lay there before the map was handed over; left alone"));
+            notes.push(format!("{name} was there before the map was handed over; ignored"));
             return None;
         }
         if !file.settled {
-            notes.push(format!("{name} is still changing, or has only just stopped; waiting"));
+            notes.push(format!("{name} is still changing or changed a moment ago; waiting"));
             return None;
         }
         let read = || -> Result<(Confirmation, String), ExchangeError> {
@@ -136,7 +141,7 @@ impl GrinderFolders {
             confirmation.check(&file.path, &stored.header)?;
             Ok((confirmation, hex(&Sha256::digest(&bytes))))
         };
-        read().map_err(|error| notes.push(format!("not taken: {error}"))).ok()
+        read().map_err(|error| notes.push(format!("not accepted: {error}"))).ok()
     }
 
     fn record(&self, stored: &StoredHandover, done: &Confirmation, now: Duration) -> PassRecord {
@@ -192,7 +197,8 @@ impl Exchange for GrinderFolders {
             let (what, word, file) = if begun { ("end", "done", DONE) } else { ("start", "started", STARTED) };
             let map = stored.header.identity.get(..8).unwrap_or_default();
             notes.push(format!(
-                "waiting for the {what} to be confirmed: regrind confirm {word} --map {map}, or copy {file} from {} to {}",
+                "waiting for the confirmation of the {what}: regrind confirm {word} --map {map}, or copy {file} from \
+                 {} to {}",
                 stored.path.display(),
                 self.settings.inbox.display()
             ));

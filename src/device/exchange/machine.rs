@@ -356,13 +356,13 @@ impl<M: Exchange> FolderMachine<M> {
     fn withdrawal_notes(&self) -> Vec<String> {
         let words = match (self.start_confirmed, self.kind) {
             (true, MachineKind::Grinder) => {
-                "the hand-over was taken back, but the start was confirmed: stop the grinder at its own panel"
+                "the hand-over was withdrawn, but the start was confirmed: stop the grinder at its own panel"
             }
             (_, MachineKind::Grinder) => {
-                "the hand-over was taken back; if the grinder runs on it, stop it at its own panel"
+                "the hand-over was withdrawn; if the grinder runs on it, stop the grinder at its own panel"
             }
             (_, MachineKind::Cmm) => {
-                "the plan was taken back; if the measuring machine runs on it, stop it at its own panel"
+                "the plan was withdrawn; if the measuring machine runs on it, stop the machine at its own panel"
             }
         };
         vec![words.to_owned()]
@@ -410,7 +410,7 @@ impl<M: Exchange> FolderMachine<M> {
         };
         if handed.job != intended.job || handed.sequence != intended.start_sequence {
             let why = format!(
-                "the folder holds a hand-over of {} with number {}, meant was {} with number {}",
+                "the folder has a hand-over of {} with number {}, expected {} with number {}",
                 handed.job, handed.sequence, intended.job, intended.start_sequence
             );
             return Ok(Reconciled::Unknown { reason: why });
@@ -438,7 +438,7 @@ impl<M: Exchange> FolderMachine<M> {
             }
             HandOverStatus::Closed => {
                 (self.state, self.job) = (State::Idle, None);
-                let why = "its result was acknowledged before; it must stand in the journal".to_owned();
+                let why = "its result was already acknowledged; look for it in the journal".to_owned();
                 Reconciled::Unknown { reason: why }
             }
         })
@@ -469,7 +469,7 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
     }
 
     async fn connect(&mut self) -> DeviceResult<Identity> {
-        self.run_blocking("who it is", |machine, _| {
+        self.run_blocking("its identity", |machine, _| {
             machine.open()?;
             Ok(Identity::for_manual_machine(machine.kind, &machine.name))
         })
@@ -575,7 +575,7 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
 
     async fn reconcile(&mut self, intended: &Armed) -> DeviceResult<Reconciled> {
         let intended = intended.clone();
-        self.run_blocking("what became of a start", move |machine, _| machine.reconcile(&intended)).await
+        self.run_blocking("the outcome of a start", move |machine, _| machine.reconcile(&intended)).await
     }
 
     async fn confirm(&mut self, word: OperatorConfirmation) -> DeviceResult<Vec<String>> {

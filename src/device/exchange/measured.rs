@@ -60,7 +60,7 @@ impl ResultRequirements<'_> {
             };
             let slot = *place.get(index).ok_or_else(|| wrong("is not a target of the plan"))?;
             if all[slot].status == PointStatus::Touched {
-                return Err(wrong("came before"));
+                return Err(wrong("occurs twice"));
             }
             all[slot] = touched(*index, (*point).into());
         }
@@ -142,7 +142,7 @@ pub fn contradiction(says: &Statements, part: &str, cycle: u16, plan: &str) -> O
     if let Some(other) = says.cycle.filter(|other| *other != cycle) {
         return Some(format!("is of cycle {other}, not {cycle}"));
     }
-    says.plan.as_ref().filter(|other| *other != plan).map(|_| "was measured by another plan".to_owned())
+    says.plan.as_ref().filter(|other| *other != plan).map(|_| "was measured with another plan".to_owned())
 }
 
 fn touched(index: u32, at_mm: [f64; 3]) -> MeasuredPoint {

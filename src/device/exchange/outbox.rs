@@ -150,7 +150,7 @@ impl Outbox {
                 if path.join(ACCEPTED_FILE).is_file() { Some(read_json(&path.join(ACCEPTED_FILE))?) } else { None };
             let ending = name.strip_prefix(base_name(&ticket.part, ticket.job()).as_str());
             let Some(standing) = ENDINGS.iter().find(|(_, e)| Some(*e) == ending).map(|(s, _)| *s) else {
-                let expected = "a folder with the name that was given to it, or with the ending .held, .stopped, .aborted or .done";
+                let expected = "a folder with its original name, or with the ending .held, .stopped, .aborted or .done";
                 let found = name.to_owned();
                 return Err(FormatError::Unexpected {
                     path,
@@ -243,10 +243,10 @@ impl Drop for DraftFolder {
 fn rename(from: &Path, to: &Path) -> Result<(), FormatError> {
     let failed = |action| move |source| FormatError::Unwritable { path: to.to_owned(), action, source };
     if to.exists() {
-        return Err(failed("giving it its name")(io::Error::from(io::ErrorKind::AlreadyExists)));
+        return Err(failed("renaming it")(io::Error::from(io::ErrorKind::AlreadyExists)));
     }
-    fs::rename(from, to).map_err(failed("giving it its name"))?;
-    sync_folder(to).map_err(failed("bringing it to the disk"))
+    fs::rename(from, to).map_err(failed("renaming it"))?;
+    sync_folder(to).map_err(failed("flushing it to the disk"))
 }
 
 /// Reads a small JSON file.

@@ -119,7 +119,7 @@ impl DriverFactory for ExchangeWire {
 
     fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         if self.outbox == self.inbox && !self.outbox.is_empty() {
-            let allowed = "what is written and what is awaited must be told apart";
+            let allowed = "written files and awaited files require different folders";
             document.report(&place.key("wire.inbox"), "is the same folder as `outbox`", allowed, "give each a folder");
         }
         self.check_result(place, document);
@@ -129,7 +129,7 @@ impl DriverFactory for ExchangeWire {
 
     fn check_against_grinder(&self, grinder: &Self, document: &mut Document) {
         if self.inbox == grinder.inbox && !self.inbox.is_empty() {
-            let allowed = "a result must be told to one machine";
+            let allowed = "each machine requires its own results";
             document.report("grinder.wire.inbox", "is the inbox of the CMM too", allowed, "give each machine its own");
         }
     }
@@ -215,8 +215,8 @@ impl ExchangeWire {
         }
         if plain.contains(['/', '\\', '{', '}']) || plain.matches('*').count() > 1 {
             let allowed =
-                "it must be the name of a file in the inbox, with `{part}`, `{job}`, `{cycle}` and one `*` at most";
-            let remedy = "\"{part}_c{cycle}.*\" is usual";
+                "it must be the name of a file in the inbox, with `{part}`, `{job}`, `{cycle}` and at most one `*`";
+            let remedy = "the usual name is \"{part}_c{cycle}.*\"";
             document.report(&place.key("wire.result"), format!("is {name:?}"), allowed, remedy);
         }
     }
@@ -226,19 +226,19 @@ impl ExchangeWire {
         let key = place.key("wire.dmis_sensor");
         if place.table == "grinder" {
             let allowed = "a grinder has no measuring program";
-            return document.report(&key, "is given for a grinder", allowed, "leave it out");
+            return document.report(&key, "is given for a grinder", allowed, "remove it");
         }
         if !sensor.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-')) {
             let allowed = "it must be a label of DMIS: letters, digits, _ and -";
-            document.report(&key, format!("is {sensor:?}"), allowed, "write it as S(...) has it");
+            document.report(&key, format!("is {sensor:?}"), allowed, "write it as in S(...)");
         }
         if self.coordinates.is_none() {
-            let allowed = "a DMIS program says whether the radius of the probe is taken off";
+            let allowed = "a DMIS program states whether the radius of the probe is subtracted";
             document.report(
                 &place.key("wire.coordinates"),
-                "is missing beside `dmis_sensor`",
+                "is missing; `dmis_sensor` requires it",
                 allowed,
-                "centres or contacts",
+                "write centres or contacts",
             );
         }
     }
@@ -251,7 +251,7 @@ impl ExchangeWire {
                 document.report(&stations, "have no `reference_points`", allowed, "name their file");
             }
             (true, true) if !document.has_problem(&stations) => {
-                let allowed = "they merge stations, and there is none";
+                let allowed = "they merge stations, and no station is given";
                 document.report(&reference, "is given without stations", allowed, "add [[cmm.wire.stations]]");
             }
             _ => {}
@@ -264,14 +264,14 @@ impl ExchangeWire {
             for (name, key) in [(points, "points"), (reference, "reference")] {
                 let key = place.key(&format!("wire.stations[{k}].{key}"));
                 if name.contains(['/', '\\']) || name.matches('*').count() > 1 {
-                    let allowed = "it must be the name of a file in the inbox, with one `*` at most";
-                    document.report(&key, format!("is {name:?}"), allowed, "leave the folder out");
+                    let allowed = "it must be the name of a file in the inbox, with at most one `*`";
+                    document.report(&key, format!("is {name:?}"), allowed, "remove the folder");
                 }
             }
             if stars[0] != stars[1] && stars[0].max(stars[1]) == 1 {
                 let key = place.key(&format!("wire.stations[{k}].reference"));
-                let found = format!("is {reference:?} where `points` is {points:?}");
-                document.report(&key, found, "`*` must stand in both names or in none", "add the `*`");
+                let found = format!("is {reference:?}, and `points` is {points:?}");
+                document.report(&key, found, "`*` must be in both names or in none", "add the `*`");
             }
         }
     }

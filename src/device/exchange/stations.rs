@@ -38,7 +38,7 @@ impl PlacedStation {
             self.rms_mm,
             each.join(", ")
         );
-        for (what, names) in [("does not see", &self.missing), ("left out, not nominal:", &self.extra)] {
+        for (what, names) in [("does not see", &self.missing), ("ignored, not nominal:", &self.extra)] {
             if !names.is_empty() {
                 words += &format!("; {what} {}", names.join(", "));
             }
@@ -130,9 +130,9 @@ fn match_points(
     };
     match have {
         _ if have == want => Ok(Matching { pairs: (0..have).map(|k| (k, k)).collect() }),
-        _ if have > want => Err(refuse("it cannot be told which are extra")),
-        _ if have < 3 => Err(refuse("3 are needed")),
-        _ if want > MAX_NOMINAL => Err(refuse("it cannot be told which are missing")),
+        _ if have > want => Err(refuse("it is unknown which points are extra")),
+        _ if have < 3 => Err(refuse("at least 3 are required")),
+        _ if want > MAX_NOMINAL => Err(refuse("it is unknown which points are missing")),
         _ => match_subset(seen, nominal, limit_mm).map_err(refuse),
     }
 }
@@ -149,8 +149,8 @@ fn match_subset(seen: &References, nominal: &References, limit_mm: f64) -> Resul
     let mut fits: Vec<Matching> = fits.take(2).collect();
     match fits.len() {
         1 => Ok(fits.remove(0)),
-        0 => Err("their distances fit none of them"),
-        _ => Err("their distances fit in more than one way"),
+        0 => Err("their distances match none of the nominal points"),
+        _ => Err("their distances match in more than one way"),
     }
 }
 
@@ -162,7 +162,8 @@ fn diagnose(from: &[Point], to: &[Point], names: &[String], limit_mm: f64) -> (O
             let mut exchanged = from.to_vec();
             exchanged.swap(a, b);
             if fits(fit_rigid(&exchanged, to).ok()) {
-                let words = format!("{} and {} seem exchanged: with the two swapped all fit", names[a], names[b]);
+                let words =
+                    format!("{} and {} are probably swapped: with the two swapped all points fit", names[a], names[b]);
                 return (Some(a), words);
             }
         }
@@ -173,7 +174,7 @@ fn diagnose(from: &[Point], to: &[Point], names: &[String], limit_mm: f64) -> (O
         .filter(|&k| from.len() > 3 && fits(fit_rigid(&without(from, k), &without(to, k)).ok()))
         .collect();
     match alone[..] {
-        [k] => (Some(k), "without it the others fit: measure it again, or correct the nominal point".to_owned()),
+        [k] => (Some(k), "without it the other points fit: measure it again, or correct the nominal point".to_owned()),
         _ => (None, "no single point explains it: check the order of the points and the nominal file".to_owned()),
     }
 }
@@ -231,7 +232,7 @@ mod tests {
         let placed = place_station("3", &seen(&[3, 0, 4, 1], true), &nominal(4), 0.1).unwrap();
         assert!(is_planted(&placed));
         assert!(placed.missing == ["c"] && placed.extra == ["e"]);
-        assert!(placed.summary().contains("does not see c; left out, not nominal: e"), "{}", placed.summary());
+        assert!(placed.summary().contains("does not see c; ignored, not nominal: e"), "{}", placed.summary());
         let placed = place_station("3", &seen(&[0, 2, 3, 4], false), &nominal(5), 0.1).unwrap();
         assert!(is_planted(&placed) && placed.missing == ["b"]);
     }
@@ -240,14 +241,15 @@ mod tests {
     fn exchanged_and_moved_points_are_named() {
         let message = place_station("3", &seen(&[0, 2, 1, 3, 4], false), &nominal(5), 0.1).unwrap_err().to_string();
         assert!(
-            message.contains("station 3: reference point b is off by") && message.contains("b and c seem exchanged"),
+            message.contains("station 3: reference point b is off by")
+                && message.contains("b and c are probably swapped"),
             "{message}"
         );
         let mut moved = seen(&[0, 1, 2, 3, 4], false);
         moved.points[3].at.x += 2.0;
         let message = place_station("3", &moved, &nominal(5), 0.1).unwrap_err().to_string();
         assert!(
-            message.contains("reference point d is off by 2.000 mm, limit 0.1 mm; without it the others fit"),
+            message.contains("reference point d is off by 2.000 mm, limit 0.1 mm; without it the other points fit"),
             "{message}"
         );
         assert!(place_station("3", &moved, &nominal(5), 2.0).is_ok());
@@ -257,9 +259,9 @@ mod tests {
     fn what_cannot_be_matched_is_refused_in_words() {
         let cases = [
             (seen(&[0, 1, 2, 3, 4], false), 4, "extra"),
-            (seen(&[0, 1], false), 4, "3 are needed"),
-            (seen(&[0, 4], true), 4, "missing are b, c, d, not known are e"),
-            (seen(&[4, 0, 1], false), 4, "their distances fit none of them"),
+            (seen(&[0, 1], false), 4, "3 are required"),
+            (seen(&[0, 4], true), 4, "missing: b, c, d; unknown: e"),
+            (seen(&[4, 0, 1], false), 4, "their distances match none of the nominal points"),
         ];
         for (seen, count, expected) in cases {
             let message = place_station("3", &seen, &nominal(count), 0.1).unwrap_err().to_string();

@@ -159,7 +159,7 @@ impl LineParser {
     /// Returns an error if the line is not exactly of the format.
     pub fn read(&self, line: &str) -> Result<Hit, LineError> {
         if let Some((at, c)) = line.chars().enumerate().find(|(_, c)| !matches!(c, '\t' | ' '..='~')) {
-            let why = format!("its character {} is {c:?}, which is no plain text", at + 1);
+            let why = format!("its character {} is {c:?}, which is not plain text", at + 1);
             return Err(LineError::whole_line(why));
         }
         let fields = self.fields(line)?;
@@ -181,11 +181,11 @@ impl LineParser {
         };
         let expected = if self.format.has_rotary() { 4 } else { 3 };
         let why = match fields.len() {
-            found if found < expected => "it is cut short, or in another format",
-            found if found > expected => "two lines have run together, or it is in another format",
+            found if found < expected => "it is incomplete, or in another format",
+            found if found > expected => "two lines are joined, or it is in another format",
             _ => return Ok(fields),
         };
-        Err(LineError::whole_line(format!("it has {} values where {expected} belong: {why}", fields.len())))
+        Err(LineError::whole_line(format!("it has {} values instead of {expected}: {why}", fields.len())))
     }
 
     /// Removes the letter from a value, if the format requires one.
@@ -196,7 +196,10 @@ impl LineParser {
         }
         let letter = LETTERS[k];
         let number = field.strip_prefix(letter).or(field.strip_prefix(letter.to_ascii_lowercase()));
-        number.ok_or_else(|| LineError { value: k + 1, reason: format!("is {field:?}, and begins with no {letter}") })
+        number.ok_or_else(|| LineError {
+            value: k + 1,
+            reason: format!("is {field:?}, and does not begin with {letter}"),
+        })
     }
 
     fn coordinate(&self, k: usize, field: &str) -> Result<f64, LineError> {
@@ -208,11 +211,11 @@ impl LineParser {
         };
         let value = exact(number, self.mark, digits, digits).ok_or_else(|| match digits {
             0 => flaw("and not a whole number".to_owned()),
-            _ => flaw(format!("and not a number with {digits} digits behind a {:?}", self.mark)),
+            _ => flaw(format!("and not a number with {digits} digits after a {:?}", self.mark)),
         })?;
         let value_mm = if scale_mm == 1e-3 { value / 1e3 } else { value * scale_mm };
         if value_mm.abs() > MAX_COORDINATE_MM {
-            return Err(flaw(format!("and {MAX_COORDINATE_MM} mm is the most")));
+            return Err(flaw(format!("and the limit is {MAX_COORDINATE_MM} mm")));
         }
         Ok(value_mm)
     }
@@ -226,7 +229,7 @@ impl LineParser {
         };
         let angle = angle.ok_or_else(|| flaw("and not an angle"))?;
         if angle.abs() > MAX_ANGLE_DEG {
-            return Err(flaw("and 36000 degrees are the most"));
+            return Err(flaw("and the limit is 36000°"));
         }
         Ok(angle)
     }
@@ -329,9 +332,9 @@ mod tests {
     fn a_line_that_lost_or_gained_anything_is_refused_with_the_place() {
         let reading = LineParser::default();
         for (line, why) in [
-            ("100.000,200.000", "it has 2 values where 3 belong: it is cut short"),
+            ("100.000,200.000", "it has 2 values instead of 3: it is incomplete"),
             ("100.000,200.000,300.00", "its value 3 is \"300.00\", and not a number with 3 digits"),
-            ("100.000,200.000,300.000100.000,200.000,300.000", "it has 5 values where 3 belong: two lines"),
+            ("100.000,200.000,300.000100.000,200.000,300.000", "it has 5 values instead of 3: two lines"),
             ("100.000,200.000,300.0001", "its value 3"),
             ("100.000,,300.000", "its value 2 is \"\""),
             ("1OO.000,200.000,300.000", "its value 1"),
@@ -341,7 +344,7 @@ mod tests {
             ("100.000,2\u{0}0.000,300.000", "its character 10"),
             ("100.000,200 .000,300.000", "its value 2"),
             ("--1.000,200.000,300.000", "its value 1"),
-            ("999999.000,200.000,300.000", "100000 mm is the most"),
+            ("999999.000,200.000,300.000", "the limit is 100000 mm"),
             ("PROBE 1 QUALIFIED", "it has 1 values"),
             ("", "it has 1 values"),
         ] {

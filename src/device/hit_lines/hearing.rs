@@ -142,14 +142,14 @@ impl MeasurementSession {
         match gathered {
             ReceivedLine::Line(line) => self.line(&line),
             ReceivedLine::Endless(text) => {
-                self.reject_line(&text, "it does not end: see baud rate, parity and the cable")
+                self.reject_line(&text, "it does not end: check baud rate, parity and the cable")
             }
         }
     }
 
     /// Processes a line that has begun and whose rest does not come.
     pub(super) fn cut_short(&mut self, text: &str) {
-        self.reject_line(text, "its end did not come: it is cut short; touch that point again");
+        self.reject_line(text, "it is incomplete: its end did not arrive; touch that point again");
     }
 
     fn line(&mut self, line: &str) {
@@ -157,7 +157,7 @@ impl MeasurementSession {
         if begins {
             if let Some(asked) = self.measurement.as_mut().filter(|_| self.state.is_moving()) {
                 asked.lines += 1;
-                asked.log_line(line, None, Some("it begins as the cell file says"), None);
+                asked.log_line(line, None, Some("it begins with an ignored prefix of the cell file"), None);
             }
             return;
         }
@@ -172,8 +172,8 @@ impl MeasurementSession {
         {
             let [wanted_deg, within_deg] = judging.rotary_deg;
             let why = format!(
-                "the rotary table stands at {stands_deg} degrees, and {wanted_deg} within {within_deg} are wanted: turn it back, and touch the \
-                 point again"
+                "the rotary table is at {stands_deg}°; {wanted_deg}° ± {within_deg}° is required: turn it back, and \
+                 touch the point again"
             );
             return self.reject_line(line, &why);
         }
@@ -188,7 +188,7 @@ impl MeasurementSession {
             }
             Ok(TouchAssignment::DuplicateLine) => {
                 asked.duplicate_lines += 1;
-                asked.log_line(line, None, Some("it is the line before, sent twice"), None);
+                asked.log_line(line, None, Some("it repeats the line before"), None);
             }
             Err(why) => self.refuse(line, &why),
         }
@@ -204,7 +204,8 @@ impl MeasurementSession {
             }
             (Some(asked), State::Held) => {
                 asked.lines += 1;
-                let held = "it came while the machine was confirmed to stand; go on, then touch that point again";
+                let held =
+                    "it arrived after the confirmation that the machine stands; resume, then touch that point again";
                 asked.refuse(line, held);
             }
             _ => self.unrequested_lines = (self.unrequested_lines.0 + 1, line.chars().take(80).collect()),
@@ -226,10 +227,7 @@ impl MeasurementSession {
             self.cut_short(&text);
         }
         if let Some(asked) = self.measurement.as_mut().filter(|_| self.state.is_moving()) {
-            asked.refuse(
-                "",
-                "the connection was lost; what was touched meanwhile did not come, see the targets that are left",
-            );
+            asked.refuse("", "the connection was lost; touches since then did not arrive: check the remaining targets");
             self.state = if self.state == State::Execute { State::Holding } else { self.state };
         }
         self.link_error = Some(error);
@@ -264,18 +262,23 @@ impl MeasurementSession {
         let refused = asked.into_iter().flat_map(|asked| asked.refused_lines.iter().cloned());
         let duplicate_lines = asked.filter(|asked| asked.duplicate_lines > 0 && asked.list.is_complete());
         let duplicate_lines =
-            duplicate_lines.map(|asked| format!("{} lines came twice and were taken once", asked.duplicate_lines));
+            duplicate_lines.map(|asked| format!("{} lines arrived twice and were used once", asked.duplicate_lines));
         let (count, last) = &self.unrequested_lines;
         let unrequested_lines = (*count > 0).then(|| {
             let fitting = LineParser::fitting(last);
             let fits = match &fitting[..] {
-                [] => "it is in none of the eight formats".to_owned(),
-                several => format!("it fits {}", several.iter().map(ToString::to_string).collect::<Vec<_>>().join("; or ")),
+                [] => "it matches none of the eight formats".to_owned(),
+                several => {
+                    format!("it matches {}", several.iter().map(ToString::to_string).collect::<Vec<_>>().join("; or "))
+                }
             };
             let ours = &self.rules.parser;
             let (last, read) = (LineError::whole_line(format!("{last:?}")), ours.read(last).err());
-            let read = read.map_or("and is read".to_owned(), |flaw| format!("and is refused, for {flaw}"));
-            format!("lines came while nothing was asked for, and were not taken; the last one is {last}: {fits}; the cell file says {ours}, {read}")
+            let read = read.map_or("and accepts it".to_owned(), |flaw| format!("and rejects it: {flaw}"));
+            format!(
+                "lines arrived without a request and were not used; the last one is {last}: {fits}; the cell \
+                     file has {ours}, {read}"
+            )
         });
         refused.chain(duplicate_lines).chain(unrequested_lines).collect()
     }
@@ -288,8 +291,8 @@ impl MeasurementSession {
         let first: Vec<String> = left.iter().take(SOME).map(ToString::to_string).collect();
         let more = if left.len() > SOME { ", ..." } else { "" };
         match left.len() {
-            0 => "no target is left".to_owned(),
-            count => format!("{count} targets are left: {}{more}", first.join(", ")),
+            0 => "no targets remain".to_owned(),
+            count => format!("{count} targets remain: {}{more}", first.join(", ")),
         }
     }
 
@@ -332,16 +335,19 @@ mod tests {
         hear(&mut heard, "5.000,0.000,1.50010.000,0.000,1.500");
         assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
         let refusals = heard.refusals();
-        assert!(refusals[0].starts_with("REFUSED line 3 of the measurement") && refusals[0].contains("run together"));
+        assert!(
+            refusals[0].starts_with("REFUSED line 3 of the measurement")
+                && refusals[0].contains("two lines are joined")
+        );
         // The person who leads the probe does not know of the hold yet.
         hear(&mut heard, "15.000,0.000,1.500");
         assert_eq!((heard.state, touched(&heard)), (State::Holding, 2));
-        assert_eq!(heard.remaining_targets(), "2 targets are left: 101, 102");
+        assert_eq!(heard.remaining_targets(), "2 targets remain: 101, 102");
         // A machine at rest touches nothing.
         heard.state = State::Held;
         hear(&mut heard, "5.000,0.000,1.500");
         assert_eq!((heard.state, touched(&heard)), (State::Held, 2));
-        assert!(heard.refusals()[1].contains("confirmed to stand"));
+        assert!(heard.refusals()[1].contains("after the confirmation"));
     }
 
     #[test]
@@ -365,14 +371,14 @@ mod tests {
         assert_eq!((heard.state, touched(&heard)), (State::Execute, 1));
         hear(&mut heard, "5.000,0.000,1.500,245.5");
         assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
-        assert!(heard.refusals()[0].contains("stands at 245.5 degrees"));
+        assert!(heard.refusals()[0].contains("is at 245.5°"));
         let mut heard = session(2);
         heard.state = State::Idle;
         heard.measurement = None;
         hear(&mut heard, "X1.0,Y2.0,Z3.0");
         let told = heard.refusals().pop().unwrap();
         assert!(
-            told.contains("format = \"lettered-decimal\", decimals = 1; the cell file says format = \"decimal\""),
+            told.contains("format = \"lettered-decimal\", decimals = 1; the cell file has format = \"decimal\""),
             "{told}"
         );
     }
@@ -384,6 +390,6 @@ mod tests {
         let gone = DeviceError::Disconnected { machine: "x".into(), operation: "reading" };
         heard.link_lost(gone, Some("5.000,0.0".to_owned()));
         assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
-        assert!(heard.refusals()[0].contains("cut short") && heard.refusals()[1].contains("did not come"));
+        assert!(heard.refusals()[0].contains("incomplete") && heard.refusals()[1].contains("did not arrive"));
     }
 }

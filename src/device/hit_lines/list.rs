@@ -92,8 +92,8 @@ impl TargetList {
         let (index, limit_mm) = (self.indices[k], self.rules.limit_mm);
         if away_mm > limit_mm {
             return Err(format!(
-                "it is {away_mm:.3} mm from target {index}, the nearest one, and limit_mm is {limit_mm}: see that the right part lies where the \
-                 cell file has it, and touch the target again"
+                "it is {away_mm:.3} mm from the nearest target, {index}, and limit_mm is {limit_mm}: check that the \
+                 right part is at the position of the cell file, and touch the target again"
             ));
         }
         match (self.points[k].replace(point(index)), self.rules.repeated) {
@@ -103,8 +103,8 @@ impl TargetList {
                 self.points[k] = Some(first);
                 let apart_mm = distance(first.position_mm, at_mm);
                 Err(format!(
-                    "target {index} was touched before, {apart_mm:.4} mm from here, and that touch stands: go on with the targets that are left, \
-                     or say repeated = \"replace\" in the cell file"
+                    "target {index} was already touched, {apart_mm:.4} mm from here, and that touch is valid: \
+                     continue with the remaining targets, or write repeated = \"replace\" into the cell file"
                 ))
             }
         }
@@ -187,8 +187,8 @@ pub(super) mod tests {
         let mut list = TargetList::new(&plan(3), Coordinates::Centres, false, RULES);
         // Centre of a ball of 1.5 mm radius.
         assert_eq!(list.assign("a", [5.2, 0.1, 1.6], at(0)), Ok(TouchAssignment::First(101)));
-        assert!(list.assign("b", [5.2, 0.1, 0.0], at(10)).unwrap_err().contains("target 101"));
-        assert!(list.assign("c", [12.5, 0.0, 1.5], at(20)).unwrap_err().contains("2.500 mm from target"));
+        assert!(list.assign("b", [5.2, 0.1, 0.0], at(10)).unwrap_err().contains("nearest target, 101"));
+        assert!(list.assign("c", [12.5, 0.0, 1.5], at(20)).unwrap_err().contains("2.500 mm from the nearest target"));
         assert_eq!(list.assign("d", [10.0, 0.0, 1.5], at(30)), Ok(TouchAssignment::First(102)));
         assert_eq!((list.progress(), list.is_complete()), ((2, Some(3)), false));
         assert_eq!(list.remaining().collect::<Vec<_>>(), [100]);
@@ -212,8 +212,8 @@ pub(super) mod tests {
         // A line that is repeated again and again does not become a new touch by its age.
         assert_eq!(list.assign("a", centre, at(300)), Ok(TouchAssignment::DuplicateLine));
         let repeated = list.assign("a", centre, at(600)).unwrap_err();
-        assert!(repeated.contains("target 100 was touched before, 0.0000 mm"), "{repeated}");
-        assert!(list.assign("b", [0.01, 0.0, 1.5], at(601)).unwrap_err().contains("that touch stands"));
+        assert!(repeated.contains("target 100 was already touched, 0.0000 mm"), "{repeated}");
+        assert!(list.assign("b", [0.01, 0.0, 1.5], at(601)).unwrap_err().contains("that touch is valid"));
         assert_eq!(list.points()[0].position_mm, centre);
         let telling = TouchRules { repeated: Repeated::Replace, ..RULES };
         let mut list = TargetList::new(&plan(2), Coordinates::Centres, false, telling);

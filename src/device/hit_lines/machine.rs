@@ -120,7 +120,7 @@ impl HitLinesCmm {
             }
             State::Holding => stop("HOLD"),
             State::Stopping => stop("STOP"),
-            State::Held => vec![format!("{}; regrind resume goes on", hearing.remaining_targets())],
+            State::Held => vec![format!("{}; to continue: regrind resume", hearing.remaining_targets())],
             State::Aborting => vec!["ABORT: stop it at its own panel NOW; nothing here can".to_owned()],
             _ => Vec::new(),
         }
@@ -128,13 +128,13 @@ impl HitLinesCmm {
 
     /// Ends the measurement on a person's confirmation. Returns the files that are kept.
     fn finish_measurement(&self, hearing: &mut MeasurementSession) -> Result<Vec<String>, String> {
-        let Some(asked) = &hearing.measurement else { return Err("no measurement is asked for".to_owned()) };
+        let Some(asked) = &hearing.measurement else { return Err("no measurement is requested".to_owned()) };
         let (there, _) = asked.list.progress();
         if let Some(least) = self.settings.min_free_points.filter(|least| there < *least) {
-            return Err(format!("{there} points came, and at least {least} are wanted: go on measuring"));
+            return Err(format!("{there} points arrived; at least {least} are required: continue to measure"));
         }
         if there == 0 {
-            return Err("not a single point came: see the cable and the settings of the machine's printer".to_owned());
+            return Err("no point arrived: check the cable and the settings of the machine's printer".to_owned());
         }
         let kept = vec![plan_file(asked.job), hits_file(asked.job)];
         hearing.finish(Outcome::Complete);
@@ -146,7 +146,7 @@ impl HitLinesCmm {
         let mut hearing = locked(&self.session);
         let taken = match (word, hearing.state) {
             (OperatorConfirmation::Done { file: Some(_), .. }, _) => {
-                Err("its points come by the line: leave --file out".to_owned())
+                Err("its points come by the line: remove --file".to_owned())
             }
             (OperatorConfirmation::Done { .. }, State::Execute | State::Holding | State::Held) => {
                 self.finish_measurement(&mut hearing)
@@ -160,9 +160,9 @@ impl HitLinesCmm {
                 Ok(Vec::new())
             }
             (OperatorConfirmation::Started { .. }, _) => {
-                Err("nothing is started here; measure, and confirm done".to_owned())
+                Err("a measurement has no start to confirm; measure, and confirm done".to_owned())
             }
-            (_, state) => Err(format!("it is {state}, and nothing of that kind is asked")),
+            (_, state) => Err(format!("it is {state}, and no confirmation of this kind is expected")),
         };
         drop(hearing);
         taken.map_err(|why| self.not_accepted(why))
@@ -384,7 +384,7 @@ impl Machine for HitLinesCmm {
         Ok(match hearing.state {
             State::Complete | State::Aborted if ours => Reconciled::Finished(status_of(&hearing)),
             state if ours && (state.is_moving() || state == State::Held) => Reconciled::Running(status_of(&hearing)),
-            _ => Reconciled::Unknown { reason: "only who was asked to do it can tell what became of it".to_owned() },
+            _ => Reconciled::Unknown { reason: "only the operator knows the outcome of the job".to_owned() },
         })
     }
 

@@ -234,7 +234,7 @@ impl DriverFactory for HitLinesWire {
 
     fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         if place.table == "grinder" {
-            let allowed = "hit lines are those of measuring machines";
+            let allowed = "hit lines are for measuring machines";
             return document.report("grinder.wire.kind", "is \"hit-lines\"", allowed, "name another wire");
         }
         self.check_line(place, document);
@@ -333,13 +333,13 @@ impl HitLinesWire {
     }
 
     fn check_line(&self, place: &MachineTable<'_>, document: &mut Document) {
-        let one = "it is heard on a serial port or through a terminal server";
+        let one = "the lines come from a serial port or a terminal server";
         match (&self.device, &self.host) {
             (None, None) => {
-                document.report(&place.key("wire.device"), "is missing, and `host` too", one, "name one of them");
+                document.report(&place.key("wire.device"), "is missing, and so is `host`", one, "name one of them");
             }
             (Some(_), Some(_)) => {
-                document.report(&place.key("wire.host"), "is there beside `device`", one, "leave one of them out");
+                document.report(&place.key("wire.host"), "is given together with `device`", one, "remove one of them");
             }
             (Some(device), None) if device == AUTO && place.simulated == Some(false) => {
                 let allowed = "only a simulated cell makes its own port";
@@ -348,7 +348,7 @@ impl HitLinesWire {
             (None, Some(_)) if self.port == 0 && place.simulated == Some(false) => {
                 let found = "is 0 in a cell that is not simulated";
                 let allowed = "it must be a whole number from 1 to 65535";
-                document.report(&place.key("wire.port"), found, allowed, "see the settings of the terminal server");
+                document.report(&place.key("wire.port"), found, allowed, "check the settings of the terminal server");
             }
             _ => {}
         }
@@ -358,17 +358,17 @@ impl HitLinesWire {
         let Some(format) = self.format else { return };
         if format.is_integer() && self.unit == Unit::Inch {
             let found = "is inch, and the format has whole numbers";
-            let allowed = "whole numbers are micrometres";
-            document.report("cmm.wire.unit", found, allowed, "leave it out, or have the machine print decimals");
+            let allowed = "whole numbers are in µm";
+            document.report("cmm.wire.unit", found, allowed, "remove it, or set the machine to print decimals");
         }
         if self.decimal == Mark::Comma && self.separator == Separator::Comma && !format.is_integer() {
-            let found = "is \"comma\", as the separator is";
+            let found = "is \"comma\", the same as the separator";
             let allowed = "one mark cannot be both";
-            document.report("cmm.wire.decimal", found, allowed, "say what stands between two values: separator");
+            document.report("cmm.wire.decimal", found, allowed, "set `separator` to the mark between two values");
         }
         if format.is_lettered() && self.axes != Axes::Xyz {
             let found = "is given, and the lines have letters";
-            document.report("cmm.wire.axes", found, "the letters tell the axes", "leave it out");
+            document.report("cmm.wire.axes", found, "the letters name the axes", "remove it");
         }
     }
 }

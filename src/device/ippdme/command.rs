@@ -42,15 +42,15 @@ impl Command {
         }
         let (tag, rest) = tagged(line)?;
         if has_stray_blank(rest) {
-            return Err(arguments("a blank where none may stand"));
+            return Err(arguments("a blank that is not allowed"));
         }
         let mut reader = Reader::new(rest, Strictness::Strict);
         let command = Self::untagged(&mut reader)?;
         if !reader.is_at_end() {
-            return Err(SyntaxError { number: 507, reason: "something stands behind the command" });
+            return Err(SyntaxError { number: 507, reason: "there is text after the command" });
         }
         if command.is_event() != matches!(tag, Tag::Event(_)) {
-            return Err(SyntaxError { number: 1, reason: "commands that end in E have event tags, and no others" });
+            return Err(SyntaxError { number: 1, reason: "only commands that end in E have event tags" });
         }
         grammar::check(&command)?;
         Ok((tag, command))
@@ -62,7 +62,7 @@ impl Command {
         let end = text.bytes().position(|b| !b.is_ascii_alphanumeric()).unwrap_or(text.len());
         let name = &text[..end];
         if !grammar::is_known(name) {
-            return Err(illegal("a command that nobody knows"));
+            return Err(illegal("an unknown command"));
         }
         *reader = Reader::new(&text[end..], Strictness::Strict);
         if !reader.eat('(') {
@@ -85,11 +85,11 @@ impl fmt::Display for Command {
 
 /// Splits a line into its tag and the rest after the blank.
 fn tagged(line: &str) -> Result<(Tag, &str), SyntaxError> {
-    let illegal = SyntaxError { number: 1, reason: "a tag that is none" };
+    let illegal = SyntaxError { number: 1, reason: "an invalid tag" };
     let tag = line.get(..5).and_then(Tag::read).ok_or(illegal)?;
     if matches!(tag, Tag::Command(0) | Tag::Event(0)) {
         return Err(SyntaxError { number: 1, reason: "tags count from 1" });
     }
-    let rest = line[5..].strip_prefix(' ').ok_or(SyntaxError { number: 2, reason: "no blank behind the tag" })?;
+    let rest = line[5..].strip_prefix(' ').ok_or(SyntaxError { number: 2, reason: "no blank after the tag" })?;
     Ok((tag, rest))
 }

@@ -125,7 +125,7 @@ pub(super) fn is_known(name: &str) -> bool {
 /// Returns the error with which a server refuses the arguments.
 pub(super) fn check(command: &Command) -> Result<(), SyntaxError> {
     let Some((_, shape)) = COMMANDS.iter().find(|(name, _)| *name == command.name) else {
-        return Err(SyntaxError { number: 507, reason: "a command that nobody knows" });
+        return Err(SyntaxError { number: 507, reason: "an unknown command" });
     };
     let items = &command.arguments[..];
     let values_are_numbers = |item: &Item| match item {
@@ -133,7 +133,7 @@ pub(super) fn check(command: &Command) -> Result<(), SyntaxError> {
         _ => true,
     };
     if !items.iter().all(values_are_numbers) {
-        return Err(arguments("in the parentheses of a property stand numbers"));
+        return Err(arguments("the parentheses of a property must contain numbers"));
     }
     let one = || match items {
         [] | [Item::Nothing] => Err(arguments("it has one argument")),
@@ -169,7 +169,7 @@ pub(super) fn check(command: &Command) -> Result<(), SyntaxError> {
 fn numbers(items: &[Item], counts: &[usize], wanted: &[NumberCondition]) -> Result<(), SyntaxError> {
     let numbers: Option<Vec<f64>> = items.iter().map(Item::number).collect();
     let numbers = numbers.filter(|numbers| counts.contains(&numbers.len()));
-    let numbers = numbers.ok_or(arguments("it has another number of numbers"))?;
+    let numbers = numbers.ok_or(arguments("the number of numbers is wrong"))?;
     for wanted in wanted {
         let (P(k) | T(k)) = wanted;
         if numbers[*k] <= 0.0 {
@@ -202,7 +202,7 @@ fn properties(items: &[Item], fits: &dyn Fn(&str, &[Item]) -> bool) -> Result<()
         return Err(arguments("it has at least one argument"));
     }
     for (k, item) in items.iter().enumerate() {
-        let Item::Call(name, values) = item else { return Err(arguments("an argument is no property")) };
+        let Item::Call(name, values) = item else { return Err(arguments("an argument is not a property")) };
         if !fits(name, values) {
             return Err(arguments("an argument is not one of its properties"));
         }
@@ -213,7 +213,7 @@ fn properties(items: &[Item], fits: &dyn Fn(&str, &[Item]) -> bool) -> Result<()
 
 fn once(before: &[Item], name: &str) -> Result<(), SyntaxError> {
     let twice = before.iter().any(|item| matches!(item, Item::Call(other, _) if other == name));
-    if twice { Err(arguments("a property stands there twice")) } else { Ok(()) }
+    if twice { Err(arguments("a property occurs twice")) } else { Ok(()) }
 }
 
 fn daemonised(items: &[Item]) -> Result<(), SyntaxError> {
@@ -259,7 +259,7 @@ fn trailing(items: &[Item], otherwise: SyntaxError) -> Result<(), SyntaxError> {
 fn each_property(items: &[Item], check: fn(&[&str], &[Item]) -> Result<(), SyntaxError>) -> Result<(), SyntaxError> {
     let all_calls = !items.is_empty() && items.iter().all(|item| matches!(item, Item::Call(..)));
     if !all_calls {
-        return trailing(items, arguments("an argument is no property"));
+        return trailing(items, arguments("an argument is not a property"));
     }
     for item in items {
         let Item::Call(name, values) = item else { continue };
@@ -270,7 +270,7 @@ fn each_property(items: &[Item], check: fn(&[&str], &[Item]) -> Result<(), Synta
 }
 
 fn enumerated(item: &Item, items: &[Item]) -> Result<(), SyntaxError> {
-    let Item::Call(name, values) = item else { return trailing(items, arguments("the argument is no property")) };
+    let Item::Call(name, values) = item else { return trailing(items, arguments("the argument is not a property")) };
     let parts: Vec<&str> = name.split('.').collect();
     if !values.is_empty() {
         return Err(arguments("a property is asked for with empty parentheses"));
@@ -288,12 +288,12 @@ fn tool(parts: &[&str]) -> Result<(), SyntaxError> {
 
 fn third_and_fourth(parts: &[&str], fourth: &[&str]) -> Result<(), SyntaxError> {
     if parts.get(2).is_some_and(|part| !PARAMETERS.contains(part)) {
-        return Err(bad("the third part is no parameter"));
+        return Err(bad("the third part is not a parameter"));
     }
     if parts.get(3).is_some_and(|part| !fourth.contains(part)) {
-        return Err(bad("the fourth part is no side of a parameter"));
+        return Err(bad("the fourth part is not a side of a parameter"));
     }
-    if parts.len() > 4 { Err(arguments("a property has four parts at most")) } else { Ok(()) }
+    if parts.len() > 4 { Err(arguments("a property has at most four parts")) } else { Ok(()) }
 }
 
 fn check_read_property(parts: &[&str], values: &[Item]) -> Result<(), SyntaxError> {
@@ -302,21 +302,21 @@ fn check_read_property(parts: &[&str], values: &[Item]) -> Result<(), SyntaxErro
     }
     tool(parts)?;
     match parts {
-        [_] => Err(arguments("a tool alone is no property")),
+        [_] => Err(arguments("a tool alone is not a property")),
         ["FoundTool", "Alignment"] => Err(arguments("only the active tool has an alignment")),
         [
             _,
             "Alignment" | "CollisionVolume" | "Id" | "Name" | "AvrRadius" | "AvrOffsets" | "QualSigma" | "QualTime",
         ] => Ok(()),
         [_, "GoToPar" | "PtMeasPar" | "ScanPar", _, ..] => third_and_fourth(parts, &["Act", "Def", "Max", "Min"]),
-        _ => Err(bad("the second part is no property of a tool")),
+        _ => Err(bad("the second part is not a property of a tool")),
     }
 }
 
 fn set(parts: &[&str], values: &[Item]) -> Result<(), SyntaxError> {
     tool(parts)?;
     match parts {
-        [_] | [_, _] => Err(arguments("a property that is set has three parts or four")),
+        [_] | [_, _] => Err(arguments("a property that is set has three or four parts")),
         [_, "GoToPar" | "PtMeasPar" | "ScanPar", _, ..] => third_and_fourth(parts, &["Act"]),
         _ => Err(bad("the second part is GoToPar, PtMeasPar or ScanPar")),
     }?;

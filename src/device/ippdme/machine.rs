@@ -171,7 +171,7 @@ impl IppdmeCmm {
         match failure {
             Failure::Link(error) | Failure::Implausible(error) => error,
             Failure::Refused(error) => DeviceError::MethodRefused { machine, method, error },
-            Failure::Aborted => DeviceError::Disconnected { machine, operation: "aborted while it was met" },
+            Failure::Aborted => DeviceError::Disconnected { machine, operation: "aborted during the connection" },
         }
     }
 
@@ -258,7 +258,7 @@ impl Machine for IppdmeCmm {
         let shared = locked(&self.shared);
         let way = self.memory.loaded.as_ref().map(|(work, _)| {
             let Route { travel_m, plan_order_m: plain_m, .. } = work.route;
-            format!("the way across is {travel_m:.2} m, {plain_m:.2} m in the plan's order")
+            format!("the travel between targets is {travel_m:.2} m, {plain_m:.2} m in the plan's order")
         });
         let why = shared.stop_reason.iter().cloned();
         why.chain(shared.notes.iter().cloned()).chain(way).collect()
@@ -435,12 +435,12 @@ impl Machine for IppdmeCmm {
         }
         if self.memory.unresolved.take_if(|untold| Some(*untold) == key).is_some() && shared.state == State::Idle {
             let gone =
-                "the server keeps no job: the machine stands, and what it had touched for the interrupted run is gone";
+                "the server stores no job: the machine has stopped, and the touches of the interrupted run are lost";
             (shared.job, shared.state, shared.outcome) = (key, State::Complete, Outcome::Failed);
             (shared.stop_reason, shared.clear_of_part) = (Some(gone.to_owned()), None);
             return Ok(Reconciled::Finished(self.status_of(&shared)));
         }
-        let why = "the server keeps no job, and this program has none of that number".to_owned();
+        let why = "the server stores no job, and this program has none with that number".to_owned();
         Ok(Reconciled::Unknown { reason: why })
     }
 }

@@ -91,7 +91,7 @@ fn data(text: &str) -> Result<Vec<Item>, SyntaxError> {
 
 fn ended(mut reader: Reader<'_>, items: Vec<Item>) -> Result<Vec<Item>, SyntaxError> {
     let whole = reader.is_at_end() && !items.contains(&Item::Nothing);
-    if whole { Ok(items) } else { Err(SyntaxError { number: 8, reason: "something stands between the data" }) }
+    if whole { Ok(items) } else { Err(SyntaxError { number: 8, reason: "there is text between the data" }) }
 }
 
 /// Parses `Error(severity, number, cause, text)`. Cause and text may lack their quotes and may contain any characters.

@@ -137,7 +137,7 @@ fn check(
             payload: "plan",
             field: format!("the height of the normal of target {}", target.index),
             value: target.normal[2],
-            limit: "-0.2 or more: the probe comes from above; turn the part, or leave the target out",
+            limit: "-0.2 or more, because the probe comes from above; turn the part, or remove the target",
         });
     }
     let start = approach(target, plan);

@@ -28,7 +28,7 @@ impl Worker {
         if locked(&self.shared).radius_mm.is_none() {
             // A point of a scan does not report the radius either.
             self.session
-                .note("it does not tell the radius of its tool, so rows are touched and not scanned".to_owned());
+                .note("it does not report the radius of its tool, so rows are touched and not scanned".to_owned());
             return Ok(());
         }
         let wanted = [("ScanPar.Speed", scan.speed_mm_s), ("ScanPar.Retract", work.plan.approach_mm)];
@@ -120,7 +120,7 @@ impl Worker {
             let most = 0.5 * steps.fold(f64::INFINITY, f64::min);
             let aside_mm = lateral_distance_mm(target, &work.plan, *at_mm);
             if aside_mm > most {
-                let field = format!("how far beside target {} its point of the scan lies", target.index);
+                let field = format!("the lateral distance of the scanned point from target {}", target.index);
                 let (machine, unit) = (Arc::clone(&self.session.machine), "mm".to_owned());
                 let error = DeviceError::OutOfRange { machine, field, value: aside_mm, min: 0.0, max: most, unit };
                 return Err(Failure::Implausible(error));

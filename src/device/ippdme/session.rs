@@ -272,17 +272,17 @@ impl Session {
         match (response.tag, response.content) {
             (Tag::UNSOLICITED, ResponseContent::Error(error)) if !is_harmless(&error) => Err(Failure::Refused(error)),
             (Tag::UNSOLICITED, ResponseContent::Error(error)) => {
-                self.note(format!("unasked: {error}"));
+                self.note(format!("unsolicited: {error}"));
                 Ok(())
             }
             (Tag::UNSOLICITED, ResponseContent::Data(data)) => {
-                self.note(format!("somebody at the machine: {}", super::text::list(&data)));
+                self.note(format!("action at the machine: {}", super::text::list(&data)));
                 Ok(())
             }
             (Tag::UNSOLICITED, _) => Ok(()),
             (Tag::Command(number), _) if self.was_sent(number) => Ok(()),
             (Tag::Event(number), _) if number <= self.last_event => Ok(()),
-            (tag, _) => Err(Failure::Link(self.unreadable(tag.to_string(), "it answers what was not asked"))),
+            (tag, _) => Err(Failure::Link(self.unreadable(tag.to_string(), "it answers a request that was not sent"))),
         }
     }
 
@@ -365,7 +365,7 @@ impl Session {
             match response.content {
                 ResponseContent::Complete if response.tag == tag => return Ok(()),
                 ResponseContent::Error(error) if response.tag == tag && !is_harmless(&error) && !may_refuse => {
-                    let why = "it does not carry out AbortE";
+                    let why = "it does not execute AbortE";
                     self.note(format!("AbortE: {error}"));
                     return Err(Failure::Link(self.unreadable(error.to_string(), why)));
                 }

@@ -145,7 +145,7 @@ impl DriverFactory for IppdmeWire {
         }
         self.check_address(place, document);
         if !document.is_there("cmm.travel") {
-            let allowed = "every position is held against the machine's volume before it moves";
+            let allowed = "every position is checked against the machine's volume before it moves";
             document.report("cmm.wire.kind", "is \"ippdme\" without [cmm.travel]", allowed, "add min_mm and max_mm");
         }
         if self.tool.contains(['"', '\r', '\n']) || !self.tool.is_ascii() {
@@ -155,8 +155,8 @@ impl DriverFactory for IppdmeWire {
         if let Some([_, _, _, theta, ..]) = self.part_frame
             && !(0.0..=180.0).contains(&theta)
         {
-            let found = format!("has a theta of {theta} degrees");
-            document.report("cmm.wire.part_frame", found, "theta is 0 to 180 degrees", "correct its fourth number");
+            let found = format!("has a theta of {theta}°");
+            document.report("cmm.wire.part_frame", found, "theta must be 0° to 180°", "correct its fourth number");
         }
     }
 
@@ -203,20 +203,25 @@ impl IppdmeWire {
         if host.is_empty() {
             // The schema reports this.
         } else if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
-            let allowed = "it must be a name or an address alone, such as \"192.168.0.20\"";
-            document.report(&place.key("wire.host"), format!("is {host:?}"), allowed, "the port has a key of its own");
+            let allowed = "it must be only a name or an address, such as \"192.168.0.20\"";
+            document.report(
+                &place.key("wire.host"),
+                format!("is {host:?}"),
+                allowed,
+                "write the port into its own key",
+            );
         } else if place.simulated == Some(true) && !is_here {
             document.report(
                 &place.key("wire.host"),
                 format!("is {host:?} in a simulated cell"),
                 "simulated machines are on this computer: 127.0.0.1, ::1 or localhost",
-                "is the machine real? then write `simulated = false`",
+                "if the machine is real, write `simulated = false`",
             );
         }
         if self.port == 0 && place.simulated == Some(false) {
             let found = "is 0 in a cell that is not simulated";
             let allowed = "it must be a whole number from 1 to 65535";
-            document.report(&place.key("wire.port"), found, allowed, "1294 is usual for I++ DME");
+            document.report(&place.key("wire.port"), found, allowed, "the usual port of I++ DME is 1294");
         }
     }
 }

@@ -176,7 +176,7 @@ impl<'a> Reader<'a> {
             return Ok(Vec::new());
         }
         let items = self.items()?;
-        if self.eat(')') { Ok(items) } else { Err(arguments("something stands where a comma or ) should")) }
+        if self.eat(')') { Ok(items) } else { Err(arguments("a comma or ) is missing")) }
     }
 
     /// Parses items separated by commas.
@@ -195,7 +195,7 @@ impl<'a> Reader<'a> {
             Some('"') => self.text(),
             Some('0'..='9' | '+' | '-' | '.') => self.number().map(Item::Number),
             Some('A'..='Z' | 'a'..='z') => self.named(),
-            Some(_) => Err(arguments("a character that begins nothing")),
+            Some(_) => Err(arguments("an unexpected character")),
         }
     }
 
@@ -238,7 +238,7 @@ impl<'a> Reader<'a> {
                 self.rest = &self.rest[1..];
             }
             if !(1..=3).contains(&self.take_while(|b| b.is_ascii_digit()).len()) {
-                return Err(bad("an exponent that has not one, two or three digits"));
+                return Err(bad("an exponent without one, two or three digits"));
             }
         }
         let value = all[..all.len() - self.rest.len()].parse().ok().filter(|value: &f64| value.is_finite());
@@ -258,7 +258,7 @@ impl<'a> Reader<'a> {
         }
         self.depth += 1;
         if self.depth > MAX_DEPTH {
-            return Err(arguments("parentheses within too many others"));
+            return Err(arguments("parentheses nested too deep"));
         }
         let items = self.in_parentheses()?;
         self.depth -= 1;

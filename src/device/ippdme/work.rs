@@ -255,7 +255,7 @@ impl Worker {
     /// Rises to the clearance height and fails the job: too many targets could not be reached.
     async fn fail_unreachable(&mut self, work: &RoutedPlan, unreached: u32) -> Result<(), Failure> {
         self.rise(work).await?;
-        let text = format!("{unreached} targets could not be reached: see how the part lies");
+        let text = format!("{unreached} targets could not be reached: check the position of the part");
         Err(Failure::Refused(ServerError { severity: 3, number: 2504, cause: String::new(), text }))
     }
 
@@ -265,7 +265,7 @@ impl Worker {
         let mut shared = locked(&self.shared);
         if shared.state == State::Execute && shared.last_status_request.elapsed() > self.settings.silence_limit {
             shared.state = State::Holding;
-            shared.stop_reason = Some("nobody looked at it for too long, and it held by itself".to_owned());
+            shared.stop_reason = Some("no status request arrived for too long, and it holds by itself".to_owned());
             return JobRequest::Hold;
         }
         *self.job_request.borrow()
@@ -320,7 +320,7 @@ impl Worker {
         let told = told.line().and_then(|data| values(data, "CoordSystem"));
         match told.as_deref() {
             Some([Item::Name(name) | Item::Text(name)]) if name == frame => Ok(()),
-            _ => Err(Failure::Implausible(self.missing_value("GetCoordSystem", "the frame that was set"))),
+            _ => Err(Failure::Implausible(self.missing_value("GetCoordSystem", "the frame in force"))),
         }
     }
 
@@ -328,7 +328,8 @@ impl Worker {
     async fn check_tool_radius(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         let told = self.request_if_supported("GetProp", vec![Item::property_query("Tool.AvrRadius")]).await?;
         let Some(told) = told else {
-            self.session.note("it does not tell the radius of its tool; that of each touch is looked at".to_owned());
+            self.session
+                .note("it does not report the radius of its tool; the radius of each touch is checked".to_owned());
             return Ok(());
         };
         let missing = || self.missing_value("GetProp", "Tool.AvrRadius");
@@ -360,11 +361,11 @@ impl Worker {
             let property = named(name);
             let value = told
                 .value(&property)
-                .ok_or_else(|| Failure::Implausible(self.missing_value("GetProp", "what was set")))?;
+                .ok_or_else(|| Failure::Implausible(self.missing_value("GetProp", "the values that were set")))?;
             // A lower speed only costs time. Any other difference changes the measurement.
             let slower = name.ends_with("Speed") && value > 0.0 && value < *wanted;
             if slower {
-                self.session.note(format!("{property} is {value}, and not {wanted} as was asked"));
+                self.session.note(format!("{property} is {value} instead of the requested {wanted}"));
             } else if (value - wanted).abs() > 1e-4 * wanted.abs() + 1e-6 {
                 let machine = Arc::clone(&self.session.machine);
                 return Err(Failure::Implausible(DeviceError::NotSet {
@@ -452,7 +453,7 @@ impl Worker {
         if off_mm <= most {
             return Ok(());
         }
-        let field = format!("the distance of the touch of target {} from where it was sent", target.index);
+        let field = format!("the distance of the touch of target {} from the target", target.index);
         let (machine, unit) = (Arc::clone(&self.session.machine), "mm".to_owned());
         Err(Failure::Implausible(DeviceError::OutOfRange { machine, field, value: off_mm, min: 0.0, max: most, unit }))
     }
@@ -499,7 +500,7 @@ impl Worker {
         let told = self.session.ask("Get", ["X", "Y", "Z"].map(Item::property_query).to_vec()).await?;
         let at = ["X", "Y", "Z"].map(|axis| told.value(axis));
         let [Some(x), Some(y), Some(z)] = at else {
-            return Err(Failure::Implausible(self.missing_value("Get", "where the probe is")));
+            return Err(Failure::Implausible(self.missing_value("Get", "the position of the probe")));
         };
         self.position_mm = Some([x, y, z]);
         Ok(())
@@ -528,7 +529,7 @@ pub(super) async fn request_if_supported(
     match session.ask(name, arguments).await {
         Ok(answer) => Ok(Some(answer)),
         Err(Failure::Refused(error)) if UNSUPPORTED_ERRORS.contains(&error.number) => {
-            session.note(format!("it has no {name} as it was asked: {error}"));
+            session.note(format!("it does not support this {name}: {error}"));
             session.clear_errors(1).await?;
             Ok(None)
         }

@@ -79,7 +79,7 @@ impl Controller {
             Ok(Reply::Value(server)) => server,
             Ok(_) => return Err(DeviceError::Password { machine: self.machine(), key: "connect_password" }),
             Err(LinkFault::NotProtocol | LinkFault::TimedOut) => {
-                return Err(self.not_linuxcnc("hello", "nothing that fits"));
+                return Err(self.not_linuxcnc("hello", "no valid answer"));
             }
             Err(fault) => return Err(self.fault(fault, "hello")),
         };
@@ -138,7 +138,7 @@ impl Controller {
 
     fn decode_state(&self, told: &[String], errors: Vec<String>) -> DeviceResult<ControllerState> {
         let [enable, estop, machine, mode, homed, program, interpreter, line, at] = told else {
-            return Err(self.not_linuxcnc("its status", "less than was asked"));
+            return Err(self.not_linuxcnc("its status", "an incomplete answer"));
         };
         let switch = |what: &'static str, told: &str| match told {
             "ON" => Ok(true),

@@ -38,7 +38,7 @@ impl Folders {
             cycles.flatten().filter_map(|entry| Some((cycle(&entry.path())?, entry.path().join(PASS_PROGRAM_FILE))));
         let newest = cycles.filter(|(_, file)| file.is_file()).max_by_key(|(cycle, _)| *cycle);
         let (cycle, file) = newest.ok_or_else(|| {
-            format!("{} holds no {PASS_PROGRAM_FILE}: the journal says why none was written", self.run.display())
+            format!("{} has no {PASS_PROGRAM_FILE}: see the journal for the reason", self.run.display())
         })?;
         self.framed(cycle, &file, map, rounds)
     }
@@ -60,7 +60,7 @@ impl Folders {
         write_atomic(&file, &program.text).map_err(|error| error.to_string())?;
         match lies_there(&file) {
             true => Ok(()),
-            false => Err(format!("{} does not hold what was written into it", file.display())),
+            false => Err(format!("{} differs from the data that were written to it", file.display())),
         }
     }
 

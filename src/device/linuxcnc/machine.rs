@@ -321,14 +321,14 @@ impl Machine for LinuxcncGrinder {
         let not_taken = |why: &str| DeviceError::NotAccepted { machine: self.machine(), reason: why.to_owned() };
         let program = self.job.as_ref().and_then(|work| work.program.clone());
         let ended = match word {
-            OperatorConfirmation::Started { .. } => return Err(not_taken("it stands; confirm done, or still")),
+            OperatorConfirmation::Started { .. } => return Err(not_taken("it has stopped; confirm done, or still")),
             OperatorConfirmation::Done { file: Some(_), .. } => {
-                return Err(not_taken("a pass leaves no file: leave --file out"));
+                return Err(not_taken("a pass has no file: remove --file"));
             }
             OperatorConfirmation::Done { map_identity: Some(map), .. }
                 if program.is_none_or(|program| program.map != map) =>
             {
-                return Err(not_taken("that is another map than the one of its program"));
+                return Err(not_taken("that map is not the one of its program"));
             }
             OperatorConfirmation::Done { .. } => Stage::Ended(State::Complete, Outcome::Complete),
             OperatorConfirmation::Still => Stage::Ended(State::Complete, Outcome::Stopped),

@@ -169,19 +169,17 @@ fn check_mode(code: &[Vec<&str>]) -> Result<(), String> {
     for words in code {
         let has = |word: &str| words.iter().any(|w| w.eq_ignore_ascii_case(word));
         if has("G64") && !words.iter().any(|w| w.starts_with(['P', 'p'])) {
-            return Err("it sets G64 without a tolerance, which rounds corners off as it likes".to_owned());
+            return Err("it sets G64 without a tolerance, which rounds corners without a limit".to_owned());
         }
         says |= has("G61") || has("G61.1") || has("G64");
         let moves = words.iter().any(|w| w.starts_with(['X', 'Y', 'Z', 'x', 'y', 'z']));
         if moves && !says {
-            return Err(
-                "it moves before it says how exactly it is to be followed (G61, G61.1, or G64 with P)".to_owned()
-            );
+            return Err("it moves before it sets the path mode (G61, G61.1, or G64 with P)".to_owned());
         }
     }
     match says {
         true => Ok(()),
-        false => Err("it does not say how exactly it is to be followed (G61, G61.1, or G64 with P)".to_owned()),
+        false => Err("it does not set the path mode (G61, G61.1, or G64 with P)".to_owned()),
     }
 }
 

@@ -117,16 +117,21 @@ impl DriverFactory for LinuxcncWire {
         self.check_path(place, document);
         let host = &self.host;
         if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
-            let allowed = "it must be a name or an address alone, such as \"192.168.0.30\"";
-            document.report(&place.key("wire.host"), format!("is {host:?}"), allowed, "the port has a key of its own");
+            let allowed = "it must be only a name or an address, such as \"192.168.0.30\"";
+            document.report(
+                &place.key("wire.host"),
+                format!("is {host:?}"),
+                allowed,
+                "write the port into its own key",
+            );
         }
         for (key, password) in
             [("connect_password", &self.connect_password), ("control_password", &self.control_password)]
         {
             let plain = password.chars().all(|c| c.is_ascii_graphic()) && !password.eq_ignore_ascii_case("off");
             if !plain {
-                let allowed = "it is one word of plain ASCII, and not \"off\"";
-                document.report(&place.key(&format!("wire.{key}")), "is no password", allowed, "correct it");
+                let allowed = "it must be one word of plain ASCII, and not \"off\"";
+                document.report(&place.key(&format!("wire.{key}")), "is not a valid password", allowed, "correct it");
             }
         }
         self.check_folder(place, document);
@@ -136,7 +141,8 @@ impl DriverFactory for LinuxcncWire {
         let default = Self::default();
         let here = self.host == "localhost" || self.host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
         let known = self.control_password == default.control_password;
-        let note = "linuxcncrsh has the password that everybody knows, and listens on every address: let only this computer reach its port";
+        let note = "linuxcncrsh has its default password and listens on every address: let only this computer reach \
+                    its port";
         (known && !here).then(|| note.to_owned()).into_iter().collect()
     }
 
@@ -199,11 +205,11 @@ impl LinuxcncWire {
                 document.report(&place.key("wire.kind"), "is \"linuxcnc\" in a simulated cell", allowed, remedy);
             }
             (Some(false), Some(_)) => {
-                let allowed = "the wheel of a real machine needs nobody to tell it where it is";
-                document.report(&key, "stands in a cell that is not simulated", allowed, "leave it out");
+                let allowed = "only a simulated wheel requires it";
+                document.report(&key, "is set in a cell that is not simulated", allowed, "remove it");
             }
             (_, Some(words)) if words.iter().any(String::is_empty) => {
-                document.report(&key, "has an empty word", "it is a program and its arguments", "take it out");
+                document.report(&key, "has an empty word", "it must be a program and its arguments", "remove the word");
             }
             _ => {}
         }
@@ -217,10 +223,11 @@ impl LinuxcncWire {
         };
         let plain = |c: char| c.is_ascii_graphic() && !matches!(c, '(' | ')' | ';' | ',' | '%' | '#');
         if !folder.chars().all(plain) {
-            let allowed = "the controller takes paths of plain ASCII, without blanks, brackets, commas and semicolons";
+            let allowed =
+                "the controller accepts paths of plain ASCII, without blanks, brackets, commas and semicolons";
             document.report(&place.key(key), format!("is {folder:?}"), allowed, "name another folder");
         } else if self.programs_at_controller.is_some() && !folder.starts_with('/') {
-            let allowed = "the controller is asked for it by its whole path";
+            let allowed = "the controller requires the full path";
             document.report(&place.key(key), format!("is {folder:?}"), allowed, "begin it with /");
         }
     }

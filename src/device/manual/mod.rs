@@ -211,10 +211,10 @@ impl ManualMachine {
             OperatorConfirmation::Started { map_identity } | OperatorConfirmation::Done { map_identity, .. }
                 if self.names_other_map(map_identity) =>
             {
-                Err(self.not_accepted("that is another map than the one asked for: which program is in the grinder?"))
+                Err(self.not_accepted("that map is not the requested one: check which program is in the grinder"))
             }
             OperatorConfirmation::Started { .. } if is_cmm => {
-                Err(self.not_accepted("nothing is started here; measure, and confirm done"))
+                Err(self.not_accepted("a measurement has no start to confirm; measure, and confirm done"))
             }
             OperatorConfirmation::Started { .. } if self.state == State::Execute => {
                 self.started_at.get_or_insert_with(Instant::now);
@@ -225,10 +225,10 @@ impl ManualMachine {
             {
                 let kept = match file {
                     Some(file) if is_cmm => self.accept_file(file).await?,
-                    None if is_cmm => return Err(self.not_accepted("name the measurement: --file, and where it is")),
-                    Some(_) => return Err(self.not_accepted("a pass leaves no file: leave --file out")),
+                    None if is_cmm => return Err(self.not_accepted("name the file of the measurement: --file")),
+                    Some(_) => return Err(self.not_accepted("a pass has no file: remove --file")),
                     None if self.started_at.is_none() => {
-                        return Err(self.not_accepted("confirm first that it has begun: regrind confirm started"));
+                        return Err(self.not_accepted("confirm first that the pass has begun: regrind confirm started"));
                     }
                     None => Vec::new(),
                 };
@@ -245,7 +245,7 @@ impl ManualMachine {
                 self.finish(Outcome::Stopped);
                 Ok(Vec::new())
             }
-            _ => Err(self.not_accepted(format!("it is {}, and nothing of that kind is asked", self.state))),
+            _ => Err(self.not_accepted(format!("it is {}, and no confirmation of this kind is expected", self.state))),
         }
     }
 
@@ -260,7 +260,7 @@ impl ManualMachine {
     /// Accepts a file as the requested measurement, and stores its bytes in the folder of the run.
     async fn accept_file(&mut self, file: PathBuf) -> DeviceResult<Vec<String>> {
         let (Some((job, done)), Some((ManualTask::Measure(plan), _))) = (self.job, &self.task) else {
-            return Err(self.not_accepted("no measurement is asked for"));
+            return Err(self.not_accepted("no measurement is requested"));
         };
         let (settings, plan, taken) = (self.settings.clone(), Arc::clone(plan), self.accepted_files.clone());
         let cycle_folder = self.cycle_folder(job);
@@ -463,7 +463,7 @@ impl Machine for ManualMachine {
         Ok(match self.state {
             State::Complete | State::Aborted if ours => Reconciled::Finished(self.current_status()),
             state if ours && (state.is_moving() || state == State::Held) => Reconciled::Running(self.current_status()),
-            _ => Reconciled::Unknown { reason: "only who was asked to do it can tell what became of it".to_owned() },
+            _ => Reconciled::Unknown { reason: "only the operator knows the outcome of the job".to_owned() },
         })
     }
 

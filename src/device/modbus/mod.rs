@@ -832,7 +832,7 @@ impl ModbusMachine {
             1 => Ok(Coordinates::Centres),
             2 => Ok(Coordinates::Contacts),
             other => {
-                let (field, found) = ("what its coordinates are", u32::from(other));
+                let (field, found) = ("the kind of its coordinates", u32::from(other));
                 Err(DeviceError::Unlisted { machine: self.machine(), field, found })
             }
         }
@@ -940,14 +940,12 @@ fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
     if status.boot_id != boot_id {
         let is = status.boot_id;
         return unknown(format!(
-            "the machine was restarted since (boot id {boot_id:08x}, now {is:08x}); look at the part"
+            "the machine was restarted since then (boot id {boot_id:08x}, now {is:08x}); check the part"
         ));
     }
     if status.begun_by == start_sequence {
         return match status.job {
-            Some(held) if held != job => {
-                unknown(format!("START {start_sequence} has begun {held} there, {job} was meant"))
-            }
+            Some(held) if held != job => unknown(format!("START {start_sequence} began {held} instead of {job}")),
             _ if status.done == start_sequence => Some(Reconciled::Finished(status.into())),
             _ => match status.state {
                 State::Execute | State::Holding | State::Held | State::Stopping | State::Aborting => {
@@ -955,7 +953,7 @@ fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
                 }
                 State::Aborted | State::Faulted => Some(Reconciled::Finished(status.into())),
                 state => unknown(format!(
-                    "START {start_sequence} was taken, but the machine is {state} and keeps no result of it"
+                    "the machine accepted START {start_sequence}, but it is {state} and has no result of it"
                 )),
             },
         };

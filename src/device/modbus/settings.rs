@@ -144,14 +144,19 @@ impl TcpWire {
         if host.is_empty() {
             // Reported by the schema.
         } else if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
-            let allowed = "it must be a name or an address alone, such as \"192.168.0.10\"";
-            document.report(&place.key("wire.host"), format!("is {host:?}"), allowed, "the port has a key of its own");
+            let allowed = "it must be only a name or an address, such as \"192.168.0.10\"";
+            document.report(
+                &place.key("wire.host"),
+                format!("is {host:?}"),
+                allowed,
+                "write the port into its own key",
+            );
         } else if place.simulated == Some(true) && !is_here {
             document.report(
                 &place.key("wire.host"),
                 format!("is {host:?} in a simulated cell"),
                 "simulated machines are on this computer: 127.0.0.1, ::1 or localhost",
-                "is the machine real? then write `simulated = false`",
+                "if the machine is real, write `simulated = false`",
             );
         }
         if self.port == 0 && place.simulated == Some(false) {
@@ -159,7 +164,7 @@ impl TcpWire {
                 &place.key("wire.port"),
                 "is 0 in a cell that is not simulated",
                 "it must be a whole number from 1 to 65535",
-                "502 is usual for Modbus TCP",
+                "the usual port of Modbus TCP is 502",
             );
         }
     }
@@ -172,8 +177,8 @@ impl TcpWire {
     /// Reports to the document if both machines have the same address.
     pub(super) fn compare(&self, grinder: &Self, document: &mut Document) {
         if self == grinder && self.port != 0 {
-            let found = format!("is {}, as that of the CMM at the same host and port", grinder.unit);
-            let allowed = "two machines need two units or two ports";
+            let found = format!("is {}, the same as that of the CMM at the same host and port", grinder.unit);
+            let allowed = "two machines require two units or two ports";
             document.report("grinder.wire.unit", found, allowed, "correct one of them");
         }
     }
@@ -220,13 +225,13 @@ impl RtuWire {
             return;
         }
         if self.unit == grinder.unit {
-            let found = format!("is {}, as that of the CMM on the same line", grinder.unit);
-            let allowed = "two machines on one line need two units";
+            let found = format!("is {}, the same as that of the CMM on the same line", grinder.unit);
+            let allowed = "two machines on one line require two units";
             document.report("grinder.wire.unit", found, allowed, "correct one of them");
         }
         if self.line() != grinder.line() {
             let found = "has another speed, parity or stop bits than the CMM on the same line";
-            document.report("grinder.wire", found, "a line has one setting", "make them the same");
+            document.report("grinder.wire", found, "a line has only one setting", "make them the same");
         }
     }
 
@@ -326,7 +331,7 @@ impl RegisterMap {
             let end = u32::from(first) + u32::from(count);
             let key = place.key(&format!("registers.{name}"));
             if end > REGISTERS {
-                let found = format!("is {first}; the block has {count} registers and would end at {}", end - 1);
+                let found = format!("is {first}; the block has {count} registers and ends at {}", end - 1);
                 document.report(&key, found, "the last register of a device is 65535", "lower it");
             }
             for &(other, start, length) in &blocks[..k] {
@@ -438,20 +443,25 @@ impl Signal {
             if let Some(name) = &table.name
                 && written[..k].iter().any(|other| other.name.as_ref() == Some(name))
             {
-                let found = format!("is {name:?} a second time");
-                document.report(&key("name"), found, "", "give every signal its own name");
+                let found = format!("is {name:?} again");
+                document.report(&key("name"), found, "", "give each signal its own name");
             }
             if table.scale == 0.0 {
-                document.report(&key("scale"), "is 0", "every value would be 0", "1 leaves the number as it is");
+                document.report(
+                    &key("scale"),
+                    "is 0",
+                    "every value would be 0",
+                    "write 1 to keep the number unchanged",
+                );
             }
             let Some(signal) = Self::from_table(table, word_order) else { continue };
             if signal.range[0] >= signal.range[1] {
                 let found = format!("is [{}, {}]", signal.range[0], signal.range[1]);
-                document.report(&key("range"), found, "the first must be less than the second", "interchange them");
+                document.report(&key("range"), found, "the first must be less than the second", "swap them");
             }
             let last = u32::from(signal.address) + u32::from(signal.kind.registers()) - 1;
             if last >= REGISTERS {
-                let found = format!("is {}; the value would end at {last}", signal.address);
+                let found = format!("is {}; the value ends at {last}", signal.address);
                 document.report(&key("address"), found, "the last register of a device is 65535", "lower it");
             }
             signals.push(signal);

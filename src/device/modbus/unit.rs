@@ -370,21 +370,24 @@ fn layout_fault(words: &[u16], order: WordOrder) -> Option<Cow<'static, str>> {
         let other = order.with_bytes_swapped();
         let is_whole = |order| Registers::new(&exchanged, order).u32(4) == SENTINEL_WHOLE;
         let fits = if is_whole(other) { other } else { other.with_words_swapped() };
-        Some(format!(
-            "with the two bytes of each register the other way round than the cell file says: write word_order = \"{}\", or have its server or the \
-             gateway send the other one first",
-            fits.name()
-        ).into())
+        Some(
+            format!(
+                "with the two bytes of each register swapped relative to the cell file: write word_order = \"{}\", or \
+             set its server or the gateway to send the other byte first",
+                fits.name()
+            )
+            .into(),
+        )
     } else if begins(2, as_it_is) || begins(2, swapped) {
         Some(
-            "one register later than the cell file says: its server counts from 1 where the protocol counts from 0; correct its addresses, or add 1 to \
-             each in the table `registers` of the cell file"
+            "one register later than in the cell file: its server counts from 1, and the protocol counts from 0; \
+             correct its addresses, or add 1 to each in the table `registers` of the cell file"
                 .into(),
         )
     } else if begins(0, as_it_is) || begins(0, swapped) {
         Some(
-            "one register earlier than the cell file says: its server takes 1 off each address; correct its addresses, or take 1 off each in the table \
-             `registers` of the cell file"
+            "one register earlier than in the cell file: its server subtracts 1 from each address; correct its \
+             addresses, or subtract 1 from each in the table `registers` of the cell file"
                 .into(),
         )
     } else {

@@ -105,13 +105,13 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     let bytes = read_whole(base, MOST_BYTES)?;
     let program = |what: &str, remedy| GcodeError::Program { path: base.to_owned(), what: what.into(), remedy };
     let text = decoded(&bytes)
-        .ok_or_else(|| program("the program is no plain text", "give the program as the controller reads it"))?;
+        .ok_or_else(|| program("the program is not plain text", "give the program as the controller reads it"))?;
     let text = &*text;
     if let Some((what, remedy)) = other_control(text) {
         return Err(program(what, remedy));
     }
     if is_same_file(base, out) {
-        return Err(program("the corrected program would take the place of this one", "give another name to --out"));
+        return Err(program("the corrected program would overwrite this one", "give another name to --out"));
     }
     refuse_foreign(base, text, amendment)?;
     let mut writer = Rewriter::new(amendment);
@@ -143,13 +143,13 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     let done = writer.done;
     if done.straight + done.arcs == 0 {
         return Err(program(
-            "it has no move at feed, so there is nothing to correct",
-            "is it the program of the pass?",
+            "the program has no move at feed, so there is nothing to correct",
+            "check that it is the program of the pass",
         ));
     }
     if done.beside_map_mm > MOST_BESIDE * done.feed_mm {
         let over_mm = done.feed_mm - done.beside_map_mm;
-        let what = format!("of {:.3} mm at feed {over_mm:.3} mm lie over the map", done.feed_mm);
+        let what = format!("only {over_mm:.3} mm of {:.3} mm at feed lie over the map", done.feed_mm);
         let remedy =
             "give the map in the program's coordinates, and the program in millimetres with points in its numbers";
         return Err(GcodeError::Program { path: base.to_owned(), what, remedy });
@@ -231,11 +231,12 @@ fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), 
     }
     match amendment.map.base {
         MapBase::Nothing if !maps.is_empty() => refused(
-            "the program has a correction in it, and this one is absolute: it replaces that, it does not come on top of it",
+            "the program already has a correction, and this one is absolute: it replaces the other and does not add \
+             to it",
             "correct the program without a correction, as regrind plan --program writes it",
         ),
         MapBase::Map(identity) if !maps.contains(&identity) => refused(
-            "the map was measured after a pass with another correction than the program has in it",
+            "the map was measured after a pass with another correction than the one in the program",
             "correct the program that the part was ground with before it was measured",
         ),
         _ => Ok(()),
@@ -413,7 +414,7 @@ impl<'a> Rewriter<'a> {
         loop {
             if pieces > MOST_POINTS {
                 let found = format!("the move of {length:.1} mm would be divided into {pieces:.0} pieces");
-                return Err((found, "allow a larger tolerance, or take a coarser map"));
+                return Err((found, "allow a larger tolerance, or use a coarser map"));
             }
             let shifts: Vec<Vector> = (0..=pieces as usize)
                 .map(|k| displacement(self.amendment, &way(k as f64 / pieces)))
@@ -431,8 +432,8 @@ impl<'a> Rewriter<'a> {
     fn measure(&mut self, way: &dyn Fn(f64) -> Point, length: f64, shifts: &[Vector]) -> Result<(), Refusal> {
         let largest_mm = shifts.iter().map(Vector::norm).fold(0.0, f64::max);
         if largest_mm > self.amendment.largest_mm {
-            let found = format!("the map would move the tool by {:.1} um", 1e3 * largest_mm);
-            return Err((found, "is it the right map, in the right unit? allow more by --max-correction-um"));
+            let found = format!("the map would move the tool by {:.1} µm", 1e3 * largest_mm);
+            return Err((found, "check that it is the right map in the right unit, or raise --max-correction-um"));
         }
         self.done.largest_mm = self.done.largest_mm.max(largest_mm);
         let count = shifts.len() - 1;
@@ -513,8 +514,9 @@ pub(super) fn displacement(amendment: &Amendment, at: &Point) -> Result<Vector, 
     let centre = at + Vector::z() * along.centre_above_mm;
     displaced(along.nominal, shift, &centre).ok_or_else(|| {
         let found = format!("no place of the nominal surface is under x {:.3}, y {:.3}, z {:.3} mm", at.x, at.y, at.z);
-        let remedy = "high above a hollow part its normals cross: go down by G0 and begin the move at feed nearer to the part; \
-                      else: is the program in the frame of the nominal surface, and is its point the one that was told?";
+        let remedy = "normals cross high above a concave part: go down by G0 and begin the move at feed nearer to \
+                      the part; otherwise check that the program is in the frame of the nominal surface, and that \
+                      its point is the stated one";
         (found, remedy)
     })
 }

@@ -227,8 +227,8 @@ impl<'a> Check<'a> {
     /// Corrected lines that differ from base and map.
     pub(super) fn line(&mut self, line: &str, text: &[u8]) -> Result<(), Refusal> {
         self.compared(line, text).map_err(|found| {
-            let found = format!("the corrected lines would not be the base and the map: {found}");
-            (found, "nothing was written; please report it with the program and the map")
+            let found = format!("the corrected lines differ from the base and the map: {found}");
+            (found, "nothing was written; report it with the program and the map")
         })
     }
 
@@ -237,7 +237,7 @@ impl<'a> Check<'a> {
         let base = block(line).map_err(readable)?;
         let over = self.base.over;
         let wanted = self.base.read(&base)?;
-        let text = std::str::from_utf8(text).map_err(|_| "no text")?;
+        let text = std::str::from_utf8(text).map_err(|_| "the corrected lines are not text")?;
         let (mut ways, mut words) = (Vec::new(), BTreeMap::new());
         for line in text.lines() {
             let block = block(line).map_err(readable)?;
@@ -301,7 +301,7 @@ impl<'a> Check<'a> {
         let found = if brings && off(found[0].at(0.0), begin) > 0.0 { &found[1..] } else { found };
         let (first, last) = (found[0].at(0.0), found[found.len() - 1].at(1.0));
         if off(last, end) > allowed {
-            return Err(format!("it ends {:.6} mm beside", off(last, end)));
+            return Err(format!("it ends {:.6} mm off", off(last, end)));
         }
         let samples = 2 * found.len() + 3;
         let (mut k, mut before, mut length) = (0, begin, 0.0);
@@ -322,14 +322,14 @@ impl<'a> Check<'a> {
             // A straight move down to the part can begin where the rapid move ended.
             let reaches = away(&found[k]).min(beside(first, begin, wanted));
             if reaches > allowed {
-                return Err(format!("it is {reaches:.6} mm from where the map has it"));
+                return Err(format!("it is {reaches:.6} mm from the position by the map"));
             }
         }
         let written: f64 = found.iter().map(Way::length).sum();
         // The chords between the samples are shorter than an arc.
         let longest = length.max(way.length()) + off(first, begin) + 4.0 * allowed;
         if written > longest * (1.0 + 1e-6) {
-            return Err(format!("it is {:.6} mm longer", written - longest));
+            return Err(format!("it is {:.6} mm too long", written - longest));
         }
         Ok(())
     }

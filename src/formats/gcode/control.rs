@@ -113,7 +113,7 @@ impl Control {
             return Ok(Act::Stay);
         }
         let Some(motion) = self.motion else {
-            return Err(("axes are named and no G0, G1, G2 or G3 is in force".into(), "write which move is meant"));
+            return Err(("the line names axes, and no G0, G1, G2 or G3 is in force".into(), "write the kind of move"));
         };
         if let (Some((word, true)), true) = (turned, moves && motion > 0 || motion > 1) {
             return Err(axis_refused(word));
@@ -131,7 +131,7 @@ impl Control {
             let missing: String =
                 ['X', 'Y', 'Z'].into_iter().zip(self.at).filter(|(_, v)| v.is_none()).map(|(c, _)| c).collect();
             let remedy = "write a G0 with these axes before it";
-            return Err((format!("it is not known where {missing} is when this move begins"), remedy));
+            return Err((format!("the position of {missing} is unknown at the beginning of this move"), remedy));
         };
         self.moved = true;
         let arc = is_arc.then(|| self.arc(block, from, to, motion == 2)).transpose()?;
@@ -153,7 +153,7 @@ impl Control {
                 // Allowed only for inputs and outputs.
                 b'E' | b'L' if has_io(block) => {}
                 b'U' | b'V' | b'W' => return Err(axis_refused(word)),
-                _ => return Err((format!("{} is not known", word.text), "remove it, if it does not move the tool")),
+                _ => return Err((format!("{} is unknown", word.text), "remove it if it does not move the tool")),
             }
         }
         check_once(block)?;
@@ -161,7 +161,7 @@ impl Control {
     }
 
     fn g(&mut self, word: &Word, asked: &mut Asked) -> Result<(), Refusal> {
-        match tenths(word).ok_or_else(|| (format!("{} is not known", word.text), "correct the number"))? {
+        match tenths(word).ok_or_else(|| (format!("{} is unknown", word.text), "correct the number"))? {
             code @ (0 | 10 | 20 | 30) => {
                 (self.motion, asked.motion) = (Some((code / 10) as u8), Some((code / 10) as u8));
             }
@@ -192,9 +192,9 @@ impl Control {
             // Cancels shifted zeros; the position of the tool in the coordinates of the program is then unknown.
             921 if !self.moved => asked.forgets = [true; 3],
             930 => {
-                let remedy = "let the CAM system write feeds a minute (G94)";
+                let remedy = "let the CAM system write feeds per minute (G94)";
                 return Err((
-                    format!("{} states times of moves, which a divided line does not keep", word.text),
+                    format!("{} gives the time of a move, which divided lines do not keep", word.text),
                     remedy,
                 ));
             }
@@ -208,7 +208,7 @@ impl Control {
             }
             _ => {
                 let found =
-                    format!("{} may move the tool or the zero in a way that the program does not tell", word.text);
+                    format!("{} can move the tool or the zero in a way that the program does not show", word.text);
                 return Err((found, "let the CAM system write plain G0, G1, G2 and G3"));
             }
         }
@@ -266,7 +266,10 @@ impl Control {
     /// Processes a move that the program gives in machine coordinates: the positions of its axes are unknown after it.
     fn machine(&mut self, asked: &Asked, named: [Option<f64>; 3], axes: bool) -> Result<Act, Refusal> {
         if asked.machine && (self.relative || self.motion.is_none_or(|motion| motion > 1)) {
-            return Err(("G53 stands with an arc, without a move or in G91".into(), "G53 goes with G0 and G1, in G90"));
+            return Err((
+                "G53 is used with an arc, without a move or in G91".into(),
+                "use G53 only with G0 or G1, in G90",
+            ));
         }
         if asked.machine && !axes {
             return Err(("G53 names no axis".into(), "name the axes that move"));
@@ -283,7 +286,7 @@ impl Control {
             let Some(value) = named[k].map(|v| v * self.unit_mm) else { continue };
             let to = if self.relative {
                 let Some(before) = self.at[k] else {
-                    let found = format!("{} moves by a distance from a place that is not known", ['X', 'Y', 'Z'][k]);
+                    let found = format!("{} moves by a distance from an unknown position", ['X', 'Y', 'Z'][k]);
                     return Err((found, "begin with a G0 in absolute coordinates (G90)"));
                 };
                 before + value
@@ -291,10 +294,7 @@ impl Control {
                 value
             };
             if to.abs() > LARGEST_MM {
-                let found = format!(
-                    "{} goes to {to:e} mm, farther than the {LARGEST_MM:e} that are written",
-                    ['X', 'Y', 'Z'][k]
-                );
+                let found = format!("{} goes to {to:e} mm; the limit is {LARGEST_MM:e} mm", ['X', 'Y', 'Z'][k]);
                 return Err((found, "correct the number, or the unit (G20, G21)"));
             }
             target[k] = Some(to);
@@ -317,11 +317,11 @@ impl Control {
             })),
             _ => {
                 let remedy = "give the two of I, J, K that lie in the plane of the arc, or R";
-                return Err(("the centre of the arc is not told, or told twice".into(), remedy));
+                return Err(("the centre of the arc is missing, or given twice".into(), remedy));
             }
         };
         if self.arcs_absolute && (centres[a].is_none() || centres[b].is_none()) && matches!(centre, Centre::At(_)) {
-            return Err(("G90.1 asks for both places of the centre".into(), "add the missing one"));
+            return Err(("G90.1 requires both coordinates of the centre".into(), "add the missing one"));
         }
         Arc::new(self.plane, from, to, clockwise, centre)
     }
@@ -369,13 +369,13 @@ fn check_once(block: &Block) -> Result<(), Refusal> {
             b'G' => same(&GROUPS, tenths(word).unwrap_or(i64::MIN)),
             b'M' => same(&M_GROUPS, word.value as i64),
             letter if before.iter().any(|other| other.letter == letter) => {
-                return Err((format!("{} stands twice", char::from(letter)), "keep one of them"));
+                return Err((format!("{} occurs twice", char::from(letter)), "keep one of them"));
             }
             _ => None,
         };
         if let Some(other) = other {
             let found =
-                format!("{} and {} stand in one line, and only one of them can be meant", other.text, word.text);
+                format!("{} and {} are in one line, and only one of them can be in force", other.text, word.text);
             return Err((found, "divide the line, or keep one of them"));
         }
     }
@@ -394,11 +394,11 @@ fn check_uses(block: &Block, asked: &Asked, moves: bool, is_arc: bool) -> Result
         };
         if !used {
             let found = format!("{} has no meaning in this line", word.text);
-            return Err((found, "write what it belongs to into the line, or remove it"));
+            return Err((found, "add the word that it belongs to, or remove it"));
         }
     }
     if asked.motion.is_some() && (asked.reference || asked.dwell) {
-        let found = "a move stands in one line with a pause or with a way to the reference point".to_owned();
+        let found = "a move is in one line with a dwell or a move to the reference point".to_owned();
         return Err((found, "divide the line"));
     }
     Ok(())

@@ -353,60 +353,64 @@ pub struct Fault {
 #[non_exhaustive]
 pub enum DialectError {
     #[error(
-        "the dialect `{dialect}` has no words for grinding.path_mode = \"{mode}\"; choose another path mode, or write [path.{key}] into a \
-         dialect of your own"
+        "the dialect `{dialect}` has no words for grinding.path_mode = \"{mode}\"; choose another path mode, or \
+         write [path.{key}] into a dialect of your own"
     )]
     Mode { dialect: String, mode: &'static str, key: &'static str },
     #[error(
-        "the dialect `{dialect}` cannot say how far corners may be rounded off: a setting of the control does; write \
-         grinder.program.controller_tolerance_um, as it is set, into the cell file"
+        "the dialect `{dialect}` cannot state how far the control may round corners: a setting of the control does; \
+         write that setting as grinder.program.controller_tolerance_um into the cell file"
     )]
     ToleranceUnknown { dialect: String },
     #[error(
-        "the control rounds corners off by {found_um} um (grinder.program.controller_tolerance_um), and grinding.path_tolerance_um allows \
-         {limit_um} um; set the control tighter, or allow more"
+        "the control rounds corners by {found_um} µm (grinder.program.controller_tolerance_um); \
+         grinding.path_tolerance_um allows {limit_um} µm; set a tighter tolerance on the control, or raise \
+         grinding.path_tolerance_um"
     )]
     ToleranceWide { found_um: f64, limit_um: f64 },
     #[error(
-        "grinding.path_tolerance_um = {found_um} cannot be written with the {decimals} decimals of a length in the dialect `{dialect}`; write a \
-         multiple of {step_um} um"
+        "grinding.path_tolerance_um = {found_um} cannot be written with the {decimals} decimals of a length in the \
+         dialect `{dialect}`; write a multiple of {step_um} µm"
     )]
     ToleranceFine { dialect: String, found_um: f64, decimals: u8, step_um: f64 },
     #[error(
-        "the dialect `{dialect}` writes {decimals} decimals, which moves points by up to {found_um:.3} um, and grinding.chord_error_um allows \
-         {limit_um} um; allow more, or have the control read more decimals and write them into a dialect of your own"
+        "the dialect `{dialect}` writes {decimals} decimals, which moves points by up to {found_um:.3} µm; \
+         grinding.chord_error_um allows {limit_um} µm; raise it, or write more decimals into a dialect of your own \
+         if the control reads them"
     )]
     Rounding { dialect: String, decimals: u8, found_um: f64, limit_um: f64 },
     #[error(
-        "the dialect `{dialect}` has no words for arcs; leave grinder.program.arcs_within_um out, or write [arcs] into a dialect of your own"
+        "the dialect `{dialect}` has no words for arcs; remove grinder.program.arcs_within_um, or write [arcs] into \
+         a dialect of your own"
     )]
     NoArcs { dialect: String },
     #[error(
-        "grinder.program.arcs_within_um = {found_um} is less than the {least_um:.4} um that the {decimals} decimals of the dialect `{dialect}` move \
-         points by; allow more, or have the control read more decimals and write them into a dialect of your own"
+        "grinder.program.arcs_within_um is {found_um} µm, less than the {least_um:.4} µm by which the {decimals} \
+         decimals of the dialect `{dialect}` move points; raise it, or write more decimals into a dialect of your \
+         own if the control reads them"
     )]
     ArcsFine { dialect: String, found_um: f64, decimals: u8, least_um: f64 },
     #[error(
-        "grinder.program.arcs_within_um = {found_um} lets arcs be farther from the path than the {limit_um} um of grinding.chord_error_um; write \
+        "grinder.program.arcs_within_um is {found_um} µm, more than grinding.chord_error_um, {limit_um} µm; write \
          {limit_um} or less"
     )]
     ArcsWide { found_um: f64, limit_um: f64 },
-    #[error(
-        "grinder.program.arcs_within_um is for a wheel that stands upright, and grinding.tilt leans it; leave one of them out"
-    )]
+    #[error("grinder.program.arcs_within_um requires an upright wheel, and grinding.tilt tilts it; remove one of them")]
     ArcsTilted,
     #[error(
-        "the dialect `{dialect}` has no words for a control that keeps the wheel's centre while the head tilts; say where the pivot is, \
-         grinder.rotary.pivot_mm, or write [rotary.tool_centre] into a dialect of your own"
+        "the dialect `{dialect}` has no words for a control that keeps the wheel's centre while the head tilts; give \
+         the place of the pivot, grinder.rotary.pivot_mm, or write [rotary.tool_centre] into a dialect of your own"
     )]
     ToolCentre { dialect: String },
     #[error(
-        "the dialect `{dialect}` has no words for slides that go with a head that tilts; leave grinder.rotary.pivot_mm out, if the control keeps the \
-         wheel's centre, or write [rotary.slides] into a dialect of your own"
+        "the dialect `{dialect}` has no words for slides that move with a tilting head; remove \
+         grinder.rotary.pivot_mm if the control keeps the wheel's centre, or write [rotary.slides] into a dialect of \
+         your own"
     )]
     Slides { dialect: String },
     #[error(
-        "programs of the dialect `{dialect}` have the numbers {least} to {most} (program.numbers), and cycle {cycle} is beyond; give it more"
+        "programs of the dialect `{dialect}` have the numbers {least} to {most} (program.numbers), and cycle {cycle} \
+         has none left; extend the range"
     )]
     Number { dialect: String, least: u32, most: u32, cycle: u16 },
 }
@@ -561,26 +565,26 @@ impl Dialect {
         if let Some(blocks) =
             self.blocks.as_ref().filter(|blocks| blocks.first.saturating_add(blocks.step) > blocks.last)
         {
-            let found = format!("is {}, less than `first` and one `step`", blocks.last);
-            fault("blocks.last", found, "blocks must be told apart", "raise it");
+            let found = format!("is {}, less than `first` plus `step`", blocks.last);
+            fault("blocks.last", found, "blocks require different numbers", "raise it");
         }
         if !self.dialect.extension.chars().all(|c| c.is_ascii_alphanumeric()) {
             let found = format!("is {:?}", self.dialect.extension);
-            fault("dialect.extension", found, "letters and digits make an extension", "leave the point out");
+            fault("dialect.extension", found, "an extension has only letters and digits", "remove the point");
         }
         let [x, y, z] = &self.words.axes;
         if x == y || y == z || z == x {
             fault("words.axes", format!("are {x}, {y} and {z}"), "each axis has a word of its own", "name three axes");
         }
         if (&self.words.rapid, &self.words.rapid_ends) == (&self.words.line, &String::new()) {
-            let found = format!("is {:?}, as `line` is", self.words.rapid);
-            fault("words.rapid", found, "a control must tell rapid moves from feeds", "correct one of them");
+            let found = format!("is {:?}, the same as `line`", self.words.rapid);
+            fault("words.rapid", found, "a control must distinguish rapid moves from feeds", "correct one of them");
         }
         if let Some([least, most]) = self.program.numbers.filter(|[least, most]| least > most || *least == 0) {
             fault(
                 "program.numbers",
                 format!("are {least} to {most}"),
-                "the first is the least, from 1 on",
+                "the first must be at least 1 and at most the second",
                 "correct them",
             );
         }
@@ -653,13 +657,13 @@ impl Dialect {
         if !line.chars().all(|c| matches!(c, ' '..='~')) {
             return Some((
                 format!("is {line:?}"),
-                "controls read plain characters on one line",
-                "write each line by itself",
+                "only printable ASCII characters on one line are allowed",
+                "write each line as its own entry, in plain characters",
             ));
         }
         if line.len() > self.text.longest_line {
             let found = format!("has {} characters", line.len());
-            return Some((found, "it must be no longer than text.longest_line", "shorten it"));
+            return Some((found, "it must be at most text.longest_line", "shorten it"));
         }
         let bare = match key.starts_with("path.blend.begin") {
             true => line.replace(TOLERANCE, ""),
@@ -671,7 +675,8 @@ impl Dialect {
             false => line.to_owned(),
         };
         if bare.contains(['{', '}']) {
-            let allowed = "{name} and, beside program.numbers, {number} may stand in program.begin and program.end, {tolerance_mm} in path.blend.begin";
+            let allowed = "program.begin and program.end may have {name} and, with program.numbers, {number}; \
+                           path.blend.begin may have {tolerance_mm}";
             return Some((format!("is {line:?}"), allowed, "remove it"));
         }
         // Only slides that move with a tilting head use a feed by time.
@@ -679,7 +684,7 @@ impl Dialect {
         let is_other = |word: &&str| *word != allowed && OTHER.contains(word);
         let other = line.to_ascii_uppercase().split_whitespace().find(is_other).map(str::to_owned);
         other.map(|word| {
-            let allowed = "programs are written in mm, in mm/min and in absolute places";
+            let allowed = "programs use mm, mm/min and absolute coordinates";
             (format!("has the word {word}"), allowed, "remove it")
         })
     }
@@ -707,7 +712,7 @@ impl ArcWords {
     /// Returns the faults of the arc words: key, text found, allowed values, remedy.
     fn faults(&self) -> impl Iterator<Item = (&'static str, String, &'static str, &'static str)> {
         let missing = || "is missing".to_owned();
-        let allowed = "an arc is told by its end and its centre";
+        let allowed = "an arc requires its end and its centre";
         let by_words = self.centre != CentreWords::BlockBefore;
         let same = self.clockwise == self.counter_clockwise && self.clockwise_ends == self.counter_clockwise_ends;
         let twice = |words: &[String; 3]| words[0] == words[1] || words[1] == words[2] || words[2] == words[0];
@@ -721,19 +726,24 @@ impl ArcWords {
                 )
             }),
             (!by_words && self.centre_block.is_none()).then(|| {
-                ("arcs.centre_block", missing(), allowed, "write what begins the block of its centre, such as \"CC \"")
+                (
+                    "arcs.centre_block",
+                    missing(),
+                    allowed,
+                    "write the beginning of the block of its centre, such as \"CC \"",
+                )
             }),
             self.centre_words.as_ref().filter(|words| twice(words)).map(|words| {
                 let found = format!("are {}", words.join(", "));
                 ("arcs.centre_words", found, "each axis has a word of its own", "name three words")
             }),
             same.then(|| {
-                let found = format!("is {:?}, as `clockwise` is", self.counter_clockwise);
+                let found = format!("is {:?}, the same as `clockwise`", self.counter_clockwise);
                 (
                     "arcs.counter_clockwise",
                     found,
-                    "a control must tell both turns apart",
-                    "correct one of them, or what ends them",
+                    "a control must distinguish the two directions",
+                    "correct one of them, or their ends",
                 )
             }),
         ]

@@ -14,21 +14,21 @@ use crate::FormatError;
 pub enum GcodeError {
     #[error(transparent)]
     File(#[from] FormatError),
-    #[error(
-        "{axis} of move {number} is {value_mm} mm; the path must not be used: please report it with the files that led to it"
-    )]
+    #[error("{axis} of move {number} is {value_mm} mm; do not use the path: report it with the files that led to it")]
     NotFinite { axis: char, value_mm: f64, number: u64 },
     #[error(transparent)]
     Dialect(#[from] DialectError),
     #[error(
-        "{axis} of move {number} is {value_mm} mm, and the dialect takes {largest_mm} mm at most (numbers.largest_mm); move the work offset"
+        "{axis} of move {number} is {value_mm} mm; the dialect allows at most {largest_mm} mm (numbers.largest_mm); \
+         move the work offset"
     )]
     Large { axis: char, value_mm: f64, number: u64, largest_mm: f64 },
     #[error(
-        "of the feed of {feed_mm_min} mm/min of move {number} nothing is left with {decimals} decimals (numbers.feed_decimals); raise grinding.feed_mm_min"
+        "the feed of {feed_mm_min} mm/min of move {number} is 0 with {decimals} decimals (numbers.feed_decimals); \
+         raise grinding.feed_mm_min"
     )]
     Slow { feed_mm_min: f64, decimals: u8, number: u64 },
-    #[error("{found} moves came where {expected} were announced; please report it with the files that led to it")]
+    #[error("the path has {found} moves instead of the expected {expected}; report it with the files that led to it")]
     Count { found: u64, expected: u64 },
     #[error("{path}, line {line}: {what}; {remedy}")]
     Line { path: PathBuf, line: u64, what: String, remedy: &'static str },

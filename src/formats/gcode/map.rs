@@ -116,7 +116,7 @@ impl MapLines {
     /// Reads one line; the error describes the fault.
     fn take(&mut self, line: &[u8]) -> Result<(), String> {
         self.hash.update(line);
-        let text = std::str::from_utf8(line).map_err(|_| "the line is no text")?.trim_start_matches('\u{feff}').trim();
+        let text = std::str::from_utf8(line).map_err(|_| "the line is not text")?.trim_start_matches('\u{feff}').trim();
         if let Some(comment) = text.strip_prefix('#') {
             self.simulation |= comment.trim() == "SIMULATION";
             self.part = self.part.or(identity_in(comment, "part:"));
@@ -130,9 +130,9 @@ impl MapLines {
             let valid = match cell.map(|cell| cell.unwrap_or_default().to_lowercase()).as_deref() {
                 None | Some("1" | "1.0" | "true") => true,
                 Some("0" | "0.0" | "false") => false,
-                Some(other) => return Err(format!("{other:?} says neither 1 nor 0 of a node")),
+                Some(other) => return Err(format!("the column `valid` has {other:?} instead of 1 or 0")),
             };
-            self.nodes.push(node(text, valid).ok_or_else(|| format!("{text:?} is no node of a map"))?);
+            self.nodes.push(node(text, valid).ok_or_else(|| format!("{text:?} is not a node of a map"))?);
             self.valid.push(valid);
         }
         Ok(())
@@ -140,11 +140,11 @@ impl MapLines {
 
     /// Arranges the nodes on their grid after all lines were read.
     fn into_map(self, path: &Path) -> Result<ProgramMap, GcodeError> {
-        let remedy = "every node of a regular grid of three rows and three columns at least needs its row";
+        let remedy = "give a row for every node of a regular grid of at least three rows and three columns";
         let no_grid = |what: String| GcodeError::Program { path: path.to_owned(), what, remedy };
         let kind = self.kind.ok_or_else(|| no_grid("the map is empty".into()))?;
-        let (grid, order) =
-            grid(&self.nodes).ok_or_else(|| no_grid(format!("its {} nodes are no whole grid", self.nodes.len())))?;
+        let (grid, order) = grid(&self.nodes)
+            .ok_or_else(|| no_grid(format!("its {} nodes are not a complete grid", self.nodes.len())))?;
         let mut values_mm: Vec<f64> = order.iter().map(|&point| self.nodes[point].z).collect();
         let valid: Vec<bool> = order.iter().map(|&point| self.valid[point]).collect();
         if !valid.contains(&true) {

@@ -31,8 +31,8 @@ const LONGEST_LINE: usize = 255;
 /// Block delete, variables and expressions, O-words, a letter without a number, a comment without an end.
 pub(super) fn block(line: &str) -> Result<Block<'_>, Refusal> {
     if line.len() > LONGEST_LINE {
-        let found = format!("the line is {} characters long, and controllers take {LONGEST_LINE}", line.len());
-        return Err((found, "is it a program? divide the line"));
+        let found = format!("the line has {} characters, and controllers read at most {LONGEST_LINE}", line.len());
+        return Err((found, "check that the file is a program, and divide the line"));
     }
     let mut block = Block::default();
     let bytes = line.as_bytes();
@@ -57,8 +57,8 @@ pub(super) fn block(line: &str) -> Result<Block<'_>, Refusal> {
                 at = end;
             }
             b'/' => {
-                let remedy = "delete the line or the stroke: what it does must be known beforehand";
-                return Err(("the line begins with a stroke and may be left out by a switch".into(), remedy));
+                let remedy = "delete the line or the slash: the correction must know whether the line runs";
+                return Err(("the line begins with a slash, so a switch can skip it".into(), remedy));
             }
             b'#' | b'[' | b'<' | b'=' => return Err(expression()),
             other => {
@@ -72,7 +72,7 @@ pub(super) fn block(line: &str) -> Result<Block<'_>, Refusal> {
 
 fn expression() -> Refusal {
     let remedy = "let the CAM system write the program out in plain numbers";
-    ("a variable or an expression is used, whose value only the controller knows".into(), remedy)
+    ("the line has a variable or an expression; only the controller knows its value".into(), remedy)
 }
 
 /// Reads the word that begins at a byte, and returns it with its end.
@@ -81,7 +81,7 @@ fn word(line: &str, at: usize) -> Result<(Word<'_>, usize), Refusal> {
     let letter = bytes[at].to_ascii_uppercase();
     if letter == b'O' {
         let remedy = "let the CAM system write loops and subprograms out";
-        return Err(("an O-word calls or repeats what stands elsewhere".into(), remedy));
+        return Err(("an O-word calls or repeats other lines".into(), remedy));
     }
     let mut begin = at + 1;
     while bytes.get(begin).is_some_and(u8::is_ascii_whitespace) {
@@ -98,7 +98,7 @@ fn word(line: &str, at: usize) -> Result<(Word<'_>, usize), Refusal> {
             Ok((Word { letter, value, text: line.get(at..end).unwrap_or_default() }, end))
         }
         _ => Err((
-            format!("{} is followed by {number:?}, which is no number", char::from(letter)),
+            format!("{} is followed by {number:?}, which is not a number", char::from(letter)),
             "write a number with a point and without an exponent",
         )),
     }

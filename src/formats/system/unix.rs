@@ -37,7 +37,7 @@ pub(crate) fn open_to_read(path: &Path) -> io::Result<File> {
     let is_given =
         ["/dev/fd/", "/dev/stdin", "/proc/self/fd/"].iter().any(|place| path.starts_with(place.trim_end_matches('/')));
     if (kind.is_fifo() || kind.is_char_device() || kind.is_block_device()) && !is_given {
-        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is a pipe or a device and no file"));
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is a pipe or a device, not a file"));
     }
     File::open(path)
 }

@@ -199,7 +199,7 @@ fn check_frame<'d>(place: &Place<'_>, axes: Node<'d, 'd>) -> Result<(), FormatEr
         let unit = if matches!(name, "r11" | "r22" | "r33") { 1.0 } else { 0.0 };
         let found = place.number(element)?;
         if (found - unit).abs() > 1e-9 {
-            let expected = "a frame that is not turned; export the map without rotation";
+            let expected = "a frame that is not rotated; export the map without rotation";
             return Err(place.unexpected(element, expected, &found.to_string()));
         }
     }
@@ -212,7 +212,10 @@ fn from_north<'d>(place: &Place<'_>, axes: Node<'d, 'd>, notes: &mut Vec<String>
     match text(origin).as_str() {
         "" | "SW" => Ok(false),
         "NW" => {
-            notes.push("the file says that its first sample is the north-western one: rows were turned over".into());
+            notes.push(
+                "the file states that its first sample is the north-western one: the order of the rows was reversed"
+                    .into(),
+            );
             Ok(true)
         }
         other => Err(place.unexpected(origin, "SW or NW", other)),
@@ -245,8 +248,8 @@ fn axis<'d>(place: &Place<'_>, node: Node<'d, 'd>, revision: &str) -> Result<Axi
     // Before the amendment of 2020 the increment of floating-point values had no meaning, and some readers ignore it.
     let floating = matches!(kind, Kind::Float32 | Kind::Float64);
     if absolute && floating && increment != 1.0 && !revision.contains("25178") {
-        let expected = "an increment of 1, as it is not said whether floating point values are multiplied by it; export the \
-                        values in metres";
+        let expected = "an increment of 1, because the file does not state whether it scales floating point values; \
+                        export the values in metres";
         return Err(place.unexpected(node, expected, &increment.to_string()));
     }
     Ok(Axis { absolute, kind, increment, offset_m })

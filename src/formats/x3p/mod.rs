@@ -226,8 +226,8 @@ impl<'a> Container<'a> {
             1 => Ok(Self { path, zip, folder: folders.remove(0) }),
             0 => Err(FormatError::WrongKind {
                 path: path.to_owned(),
-                expected: "an X3P map, whose main.xml says what it holds",
-                found: "a zip archive without one",
+                expected: "an X3P map with a main.xml",
+                found: "a zip archive without a main.xml",
                 remedy: "unpack it and give the file that is in it, or export the map again",
             }),
             _ => Err(FormatError::Unexpected {

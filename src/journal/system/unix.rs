@@ -134,41 +134,43 @@ impl LockFolder {
         let path = place.join(name);
         let bad = |what: String| {
             let remedy = format!(
-                "have root do `chown -h root:root {0}; chmod 1777 {0}` if it is a folder, take away what lies there if it is none, and write \
-                 `d {0} 1777 root root -` into /etc/tmpfiles.d/regrind.conf; or install the package, which brings it for a group",
+                "as root, run `chown -h root:root {0}; chmod 1777 {0}` if it is a folder, or remove it if it is not, \
+                 and write `d {0} 1777 root root -` into /etc/tmpfiles.d/regrind.conf; or install the package, which \
+                 creates it for a group",
                 path.display()
             );
             BadFolder { what, remedy }
         };
         let failed = |action: &str, error: Errno| bad(format!("{action}: {}", io::Error::from(error)));
-        let place =
-            rustix::fs::open(place, AS_FOLDER, Mode::empty()).map_err(|error| failed("opening its place", error))?;
+        let place = rustix::fs::open(place, AS_FOLDER, Mode::empty())
+            .map_err(|error| failed("opening its parent folder", error))?;
         let open = || rustix::fs::openat(&place, name, AS_FOLDER | OFlags::NOFOLLOW, Mode::empty());
         let opened = match open() {
             Err(Errno::NOENT) => {
-                make_folder(&place, name).map_err(|error| failed("making it", error))?;
+                make_folder(&place, name).map_err(|error| failed("creating it", error))?;
                 open()
             }
             opened => opened,
         };
         let folder = opened.map_err(|error| match error {
-            Errno::LOOP | Errno::NOTDIR => bad("a link or a file lies in its place".to_owned()),
+            Errno::LOOP | Errno::NOTDIR => bad("it is a link or a file".to_owned()),
             Errno::ACCESS => BadFolder {
-                what: "it is for the users of a group alone".to_owned(),
+                what: "it is only for the users of a group".to_owned(),
                 remedy: format!(
-                    "have root add you to that group (`stat -c %G {}` names it, `usermod -aG GROUP NAME` adds), and sign in anew",
+                    "have root add you to that group (`stat -c %G {}` shows the group, `usermod -aG GROUP NAME` \
+                     adds), and sign in again",
                     path.display()
                 ),
             },
             error => failed("opening it", error),
         })?;
-        let found = rustix::fs::fstat(&folder).map_err(|error| failed("looking at it", error))?;
+        let found = rustix::fs::fstat(&folder).map_err(|error| failed("inspecting it", error))?;
         if !is_trusted(found.st_uid) {
-            return Err(bad(format!("it belongs to {}, who may exchange what lies in it", user_of(found.st_uid))));
+            return Err(bad(format!("it belongs to {}, so that user can replace its files", user_of(found.st_uid))));
         }
         let mode = found.st_mode & 0o7777;
         if mode & 0o022 != 0 && mode & 0o1000 == 0 {
-            return Err(bad(format!("its mode is {mode:o}: others may take away the files of each other in it")));
+            return Err(bad(format!("its mode is {mode:o}: users can remove each other's files in it")));
         }
         Ok(Self { folder, is_for_all: mode & 0o002 != 0 })
     }
@@ -194,7 +196,7 @@ impl LockFolder {
         let open = |flags: OFlags| rustix::fs::openat(&self.folder, name, AS_FILE | flags, Mode::empty());
         let opened = match open(OFlags::RDWR) {
             Err(Errno::NOENT) => {
-                self.make(name, mode).map_err(|error| format!("it cannot be made: {}", words(error)))?;
+                self.make(name, mode).map_err(|error| format!("it cannot be created: {}", words(error)))?;
                 open(OFlags::RDWR)
             }
             opened => opened,
@@ -211,12 +213,14 @@ impl LockFolder {
         };
         let found = rustix::fs::fstat(&file).map_err(words)?;
         if FileType::from_raw_mode(found.st_mode) != FileType::RegularFile {
-            return Err("it is no file".to_owned());
+            return Err("it is not a file".to_owned());
         }
         let is_spoiled = found.st_nlink != 1 || found.st_size.cast_unsigned() > MOST_TOLD;
         if is_spoiled && !is_trusted(found.st_uid) {
             let (names, bytes) = (found.st_nlink, found.st_size);
-            return Err(format!("it has {names} names and {bytes} bytes, and a lock has one and {MOST_TOLD} at most"));
+            return Err(format!(
+                "it has {names} names and {bytes} bytes; a lock has one name and at most {MOST_TOLD} bytes"
+            ));
         }
         let lock = File::from(file);
         // A lock file that others have damaged is still the lock, but its content is neither read nor changed.

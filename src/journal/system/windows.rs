@@ -48,7 +48,7 @@ pub(crate) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>
     let own_name = regrind_windows::own_name().unwrap_or_else(|_| "%USERNAME%".into());
     let open = || OpenToOthers {
         how: others.join(", "),
-        remedy: format!("`icacls FILE /inheritance:r /grant:r \"{own_name}:F\"` takes it from them"),
+        remedy: format!("run `icacls FILE /inheritance:r /grant:r \"{own_name}:F\"`"),
     };
     Ok((!others.is_empty()).then(open))
 }
@@ -105,8 +105,8 @@ impl LockFolder {
         // Another run can create it at the same moment.
         match made {
             Err(error) if !folder.is_dir() => {
-                let remedy = format!("see that {} can be written", place.display());
-                Err(BadFolder { what: format!("making it: {error}"), remedy })
+                let remedy = format!("check that {} is writable", place.display());
+                Err(BadFolder { what: format!("creating it: {error}"), remedy })
             }
             _ => Ok(Self(folder)),
         }

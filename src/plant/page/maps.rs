@@ -137,7 +137,7 @@ async fn samples(plant: &Shared, link: &Link, run: i32, name: &str) -> Result<Re
         return Ok(Err("its file has not arrived yet".into()));
     };
     if regrind_journal::sha256_hex(&content) != super::super::hex::digits(&sha256) {
-        return Ok(Err("the plant's copy of its file is not what was written".into()));
+        return Ok(Err("the plant's copy of its file was changed".into()));
     }
     let name = name.to_owned();
     let parsed = spawn_blocking(move || {

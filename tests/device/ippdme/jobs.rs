@@ -133,7 +133,7 @@ async fn a_program_that_is_started_again_says_that_the_points_are_gone() {
     bench.cmm.connect().await.unwrap();
     let Reconciled::Finished(status) = bench.cmm.reconcile(&armed).await.unwrap() else { panic!() };
     assert_eq!((status.state, status.outcome, status.clear_of_part), (State::Complete, Outcome::Failed, None));
-    assert!(bench.cmm.notes().iter().any(|note| note.contains("is gone")));
+    assert!(bench.cmm.notes().iter().any(|note| note.contains("are lost")));
     assert!(bench.cmm.collect(job(&plan), &Interrupt::new()).await.is_err());
     bench.cmm.acknowledge(status.done).await.unwrap();
     let armed = begin(&mut bench.cmm, &plan).await.unwrap();
@@ -224,5 +224,5 @@ async fn a_job_that_nobody_looks_at_holds_by_itself() {
     bench.begin(&plan).await.unwrap();
     let held = until(&mut bench.cmm, |status| has_state(status, State::Held)).await.unwrap();
     assert!(held.progress.is_some_and(|(done, _)| done < 10));
-    assert!(bench.cmm.notes()[0].contains("nobody looked"), "{:?}", bench.cmm.notes());
+    assert!(bench.cmm.notes()[0].contains("no status request"), "{:?}", bench.cmm.notes());
 }

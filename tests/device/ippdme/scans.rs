@@ -91,7 +91,7 @@ async fn a_point_that_is_missing_makes_no_other_one_wrong() {
 
 #[tokio::test]
 async fn points_that_stand_for_their_neighbours_are_refused() {
-    assert_scan_refused(Fault::PointsShifted, "beside target").await;
+    assert_scan_refused(Fault::PointsShifted, "the lateral distance").await;
 }
 
 #[tokio::test]
@@ -162,7 +162,7 @@ async fn an_abort_in_a_scan_ends_it_there() {
 
 #[tokio::test]
 async fn numbers_that_come_in_another_order_are_no_points() {
-    assert_scan_refused(Fault::Reordered, "from where it was sent").await;
+    assert_scan_refused(Fault::Reordered, "from the target").await;
 }
 
 #[tokio::test]

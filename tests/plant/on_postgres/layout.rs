@@ -14,7 +14,8 @@ fn a_layout_that_is_not_ours_is_refused() {
     for arguments in [&init, &ship] {
         let (_, told) = plant.ends(arguments, 2);
         assert!(
-            told.contains("the layout of Regrind 99") && told.contains("use the version of Regrind that laid it out"),
+            told.contains("the layout of Regrind 99")
+                && told.contains("use the version of Regrind that made this layout"),
             "{told}"
         );
     }

@@ -440,7 +440,7 @@ fn a_run_is_proven_before_anything_is_made_of_it() {
     assert!(said.contains("SN-0042 , cycle 1, cell-1") && said.contains("One scale for all: ±"), "{said}");
     plant.sql("UPDATE artefact SET content = 'other' WHERE sha256 = (SELECT sha256 FROM run_artefact WHERE name = 'cycle-1/error_map.csv')");
     let said = words(&shown.text("/maps?run=1:1"));
-    assert!(said.contains("is not what was written"), "{said}");
+    assert!(said.contains("was changed"), "{said}");
 }
 
 /// Returns the page of a run after it shows the result of its verification.

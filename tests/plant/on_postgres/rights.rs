@@ -118,7 +118,7 @@ fn a_cell_reads_its_own_alone_and_writes_nothing_by_hand() {
     assert!(plant.postgres.ask_as("cell_2", "wrong", "regrind", "SELECT 1").is_err());
     plant.does(&["plant", "retire", "cell-2", "--plant", "owner.toml"]);
     let (_, told) = plant.ends(&["ship", "--once", "--plant", "cell-2.toml", "--runs", "runs-2"], 2);
-    assert!(told.contains("refused to let this computer in"), "{told}");
+    assert!(told.contains("refused the login of this computer"), "{told}");
     assert_eq!(plant.sql("SELECT count(*) FROM record"), all.to_string());
 }
 

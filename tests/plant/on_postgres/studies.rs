@@ -40,7 +40,7 @@ fn a_study_is_made_by_whoever_works_and_each_run_is_that_of_its_seed() {
     let (code, told, errors) = begin("acceptance.rms_um=0.002,1.0");
     assert!(code == 0 && told.starts_with("limits: 4 jobs"), "{told}{errors}");
     let (code, _, told) = begin("acceptance.rms_um=1.0");
-    assert!(code == 2 && told.contains("there is a study \"limits\""), "{told}");
+    assert!(code == 2 && told.contains("a study \"limits\" already exists"), "{told}");
 
     // One worker dies with a job, whose lease expires faster here.
     let mut dies = Running::new(regrind(&["study", "work", "--plant", "farm-1.toml"], plant.home.path()));

@@ -133,7 +133,7 @@ fn a_recipe_that_is_not_what_two_people_signed_is_refused_and_put_down() {
     assert_eq!(plant.incidents().last().unwrap()["what"], "recipe refused");
     let (_, told) =
         plant.ends(&["plant", "approve", "small", "--person", "Ada", "--key", "Bob.key", "--plant", "planner.toml"], 2);
-    assert!(told.contains("another person signs it"), "{told}");
+    assert!(told.contains("another person must sign it"), "{told}");
 
     // An attacker with all rights in the database gives an old recipe a new name, changes a text, and forges a
     // signature.
@@ -145,7 +145,7 @@ fn a_recipe_that_is_not_what_two_people_signed_is_refused_and_put_down() {
         plant.sql("UPDATE recipe r SET (name, version, text) = (SELECT k.name, k.version, k.text FROM kept k)");
     }
     plant.sql("UPDATE approval SET signature = repeat('ab', 64) WHERE person = 'Bob'");
-    refused("is signed by Ada of those in this cell's plant file");
+    refused("is signed by Ada of the persons in this cell's plant file");
     // A cell that knows only one of the two approvers.
     let one = approvers.split("\n[[approver]]").nth(1).unwrap();
     cell(&plant, "cell-2", &format!("\n[[approver]]{one}"));

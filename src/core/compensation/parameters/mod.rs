@@ -215,19 +215,25 @@ pub struct Parameters {
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum ParameterError {
-    #[error("{points} points do not tell parameters from form; measure {LEAST_POINTS} at least")]
+    #[error("{points} points do not separate parameters from form; measure at least {LEAST_POINTS}")]
     TooFew { points: usize },
-    #[error("point {} has a coordinate, normal or deviation that is not finite; the measurement must not be used", index + 1)]
+    #[error(
+        "point {} has a coordinate, normal or deviation that is not finite; do not use this measurement",
+        index + 1
+    )]
     NotFinite { index: usize },
-    #[error("the normal at point {} has nz = {nz:.4}; it must be {LEAST_NZ} at least, for the wheel comes from above", index + 1)]
+    #[error(
+        "the normal at point {} has nz = {nz:.4}; it must be at least {LEAST_NZ}, because the wheel comes from above",
+        index + 1
+    )]
     Normal { index: usize, nz: f64 },
-    #[error("{found} values of progress are given for {points} points; there must be one for each")]
+    #[error("{found} values of progress are given for {points} points; give one for each point")]
     Progress { found: usize, points: usize },
-    #[error("a wheel radius of {radius_mm} mm is stated; it must be above 0")]
+    #[error("the wheel radius is {radius_mm} mm; it must be above 0")]
     WheelRadius { radius_mm: f64 },
-    #[error("{what} of {value} is stated; it must be finite and {limit}")]
+    #[error("{what} is {value}; it must be finite and {limit}")]
     Stated { what: &'static str, value: f64, limit: &'static str },
-    #[error("parameters cannot be told from the form of the part: {0}")]
+    #[error("parameters cannot be separated from the form of the part: {0}")]
     Field(#[from] ModelError),
 }
 
@@ -290,7 +296,7 @@ fn check(contacts: &[Contact], progress: Option<&[f64]>, options: &ParameterOpti
         return Err(ParameterError::Stated { what: "a tolerance of a parameter", value, limit: "above 0" });
     }
     if let Some(value) = options.datum.into_iter().flatten().find(|u| !(*u >= 0.0 && u.is_finite())) {
-        return Err(ParameterError::Stated { what: "an uncertainty of the datum", value, limit: "0 at least" });
+        return Err(ParameterError::Stated { what: "an uncertainty of the datum", value, limit: "at least 0" });
     }
     if let Some(progress) = progress.filter(|p| p.len() != points) {
         return Err(ParameterError::Progress { found: progress.len(), points });

@@ -8,7 +8,7 @@ use super::{EXPANDED, NOTHING, Parameter, ParameterKind, ParameterOptions};
 /// Minimum share, relative to the largest, with which another column is named as a cause of an inseparable one.
 const NAMED: f64 = 0.2;
 pub(super) const NO_DATUM: &str =
-    "how well the datum holds the part, which nobody states (registration.lock_uncertainty_um)";
+    "the uncertainty of the datum, which is not stated (registration.lock_uncertainty_um)";
 
 /// Returns the name of a parameter, for people.
 pub fn name(kind: ParameterKind) -> &'static str {
@@ -57,7 +57,7 @@ impl ParameterKind {
 pub(super) fn alike(target: &[f64], others: &[(String, &Vec<f64>)]) -> Vec<String> {
     let size = dot(target, target).sqrt();
     if size * size <= NOTHING * target.len() as f64 {
-        return vec!["nothing at all, for it has no effect on a level surface".to_owned()];
+        return vec!["zero, because it has no effect on a level surface".to_owned()];
     }
     let others: Vec<_> = others.iter().filter(|(_, c)| dot(c, c) > NOTHING * c.len() as f64).collect();
     // Unit columns; the least-squares solution of minimum norm divides the share between columns with the same
@@ -85,11 +85,11 @@ pub(super) fn message(parameter: &Parameter, rest_rms_mm: f64, options: &Paramet
     let (name, unit, units) = (name(kind), kind.unit(), kind.units());
     if !parameter.alike.is_empty() {
         let alike = parameter.alike.join(" and ");
-        return format!("{name}: cannot be told apart from {alike}; it is left to the map");
+        return format!("{name}: cannot be separated from {alike}; the map corrects it");
     }
     let found = format!("{:.2} \u{b1} {:.2} {unit}", units * value, EXPANDED * units * sigma);
     if !parameter.offered {
-        return format!("{name}: off by {found} is no clear error; it is left to the map");
+        return format!("{name}: off by {found}, which is not significant; the map corrects it");
     }
     let with_um = 1e3 * (rest_rms_mm + parameter.removes_rms_mm);
     let gain = format!("{:.2} of {with_um:.2} um rms", 1e3 * parameter.removes_rms_mm);
@@ -100,11 +100,13 @@ pub(super) fn message(parameter: &Parameter, rest_rms_mm: f64, options: &Paramet
         }
         _ => String::new(),
     };
-    let off = format!("{name}: {stated}off by {found}, which makes {gain}");
+    let off = format!("{name}: {stated}off by {found}, which explains {gain}");
     let key = kind.key().map(|key| format!("compensation.parameters.{key}"));
     match (key, taken) {
-        (Some(key), 0.0) => format!("{off}; {key} = its tolerance would take it back, now the map does"),
-        (Some(_), taken) => format!("{off}; {:.2} {unit} of it are taken back", units * taken),
-        (None, _) => format!("{off}; it is left to the map, for the wheel wears anew in the next pass"),
+        (Some(key), 0.0) => {
+            format!("{off}; the map corrects it; to compensate the parameter itself, set {key} to its tolerance")
+        }
+        (Some(_), taken) => format!("{off}; {:.2} {unit} of it are compensated", units * taken),
+        (None, _) => format!("{off}; the map corrects it, because the wheel wears again in the next pass"),
     }
 }

@@ -159,7 +159,7 @@ impl PathOptions {
         }
         let is_ball = matches!(self.wheel, Wheel::Sphere { .. });
         if is_ball && matches!(lean, Lean::Following { .. }) && found.abs() < LEAST_LEAN {
-            let allowed = "2 degrees or more to either side: the pole of a ball stands still";
+            let allowed = "at least 2° to either side: the pole of a sphere has no cutting speed";
             return Err(PathError::Option { key: "lead of a ball (rad)", found, allowed });
         }
         Ok(())

@@ -117,8 +117,8 @@ fn the_quantiles_of_student_are_those_of_the_tables() {
 fn what_are_no_sessions_is_refused_in_words() {
     let points = || Observed::without_effects(vec![[0.0; 2], [9.0, 1.0]], vec![1.0, 2.0]);
     let odd = Sessions::new(points(), vec![1]).err().unwrap().to_string();
-    assert_eq!(odd, "2 points and 1 numbers of their sessions do not belong together");
+    assert_eq!(odd, "2 points and 1 numbers of their sessions do not match");
     let one =
         Sessions::new(points(), vec![4, 4]).unwrap().between_session_variance(&Prior::for_size(10.0)).err().unwrap();
-    assert!(one.to_string().contains("1 session; what differs between sessions is told by 2 at least"), "{one}");
+    assert!(one.to_string().contains("1 session; at least 2 are required"), "{one}");
 }

@@ -265,7 +265,7 @@ impl SamplingDefinition {
             (None, Some(nm)) if nm > 0.0 && nm <= 1e6 => Ok(Sampling::Accuracy { accuracy_mm: 1e-6 * nm }),
             (None, Some(nm)) => {
                 let limit = "greater than 0 and at most 1e6 nm";
-                Err(DefinitionError::out_of_range("accuracy_nm", nm, limit, "0.1 is a good choice"))
+                Err(DefinitionError::out_of_range("accuracy_nm", nm, limit, "0.1 is a usual value"))
             }
             (spacing, accuracy) => {
                 let count = usize::from(spacing.is_some()) + usize::from(accuracy.is_some());

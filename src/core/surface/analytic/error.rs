@@ -39,8 +39,9 @@ pub enum DefinitionError {
     SectionOffParent { x_mm: f64, y_mm: f64 },
     /// In the parent's frame, the aperture misses the section.
     #[error(
-        "the aperture does not hold the section's centre ({x_mm} mm, {y_mm} mm); with `frame = \"parent\"` the aperture is \
-         given in the parent's frame: write `centre_mm = [{x_mm}, {y_mm}]`, or choose the frame \"shifted\" or \"tilted\""
+        "the aperture does not contain the section's centre ({x_mm} mm, {y_mm} mm); with `frame = \"parent\"` the \
+         aperture is in the parent's frame: write `centre_mm = [{x_mm}, {y_mm}]`, or choose the frame \"shifted\" or \
+         \"tilted\""
     )]
     SectionOutsideAperture { x_mm: f64, y_mm: f64 },
     /// The outline is none.
@@ -48,8 +49,9 @@ pub enum DefinitionError {
     Aperture(#[from] ApertureError),
     /// The aperture reaches beyond the disc on which the polynomials are meant.
     #[error(
-        "the aperture reaches {reach_mm} mm from the axis, beyond `surface.normalisation_radius_mm`, which is {limit_mm} mm; \
-         the polynomials mean nothing there: make the aperture smaller, or fit the coefficients to a larger radius"
+        "the aperture reaches {reach_mm} mm from the axis, beyond `surface.normalisation_radius_mm`, which is \
+         {limit_mm} mm; the polynomials are not valid there: make the aperture smaller, or fit the coefficients to a \
+         larger radius"
     )]
     BeyondNormalisation { reach_mm: f64, limit_mm: f64 },
     /// The formula has no value somewhere in the aperture.
@@ -59,7 +61,7 @@ pub enum DefinitionError {
     )]
     NotDefined { x_mm: f64, y_mm: f64 },
     /// Both ways of choosing the spacing are given, or none.
-    #[error("[sampling] takes either `spacing_mm` or `accuracy_nm`, and has {count} of them; keep one")]
+    #[error("[sampling] requires either `spacing_mm` or `accuracy_nm`, and has {count} of them; keep one")]
     Sampling { count: usize },
     /// The sampling would be too large.
     #[error(
@@ -75,8 +77,9 @@ pub enum DefinitionError {
     TooMuchWork { nodes: f64, terms: usize, work: f64, limit: f64 },
     /// No spacing is fine enough; reached is twice the largest error found at the finest spacing tried.
     #[error(
-        "an accuracy of {accuracy_nm} nm is out of reach: at a spacing of {spacing_mm} mm the error is still {reached_nm} nm; \
-         ask for less, or keep the aperture away from where the surface becomes infinitely steep or has a kink"
+        "the accuracy of {accuracy_nm} nm cannot be reached: at a spacing of {spacing_mm} mm the error is still \
+         {reached_nm} nm; raise `accuracy_nm`, or keep the aperture away from places where the surface becomes \
+         infinitely steep or has a kink"
     )]
     AccuracyOutOfReach { accuracy_nm: f64, reached_nm: f64, spacing_mm: f64 },
 }
@@ -125,7 +128,7 @@ pub(super) fn finite(key: &str, value: f64) -> Result<f64, DefinitionError> {
     if value.is_finite() {
         return Ok(value);
     }
-    Err(DefinitionError::out_of_range(key, value, "a finite number", "write a number, or leave the key out"))
+    Err(DefinitionError::out_of_range(key, value, "a finite number", "write a number, or remove the key"))
 }
 
 /// Checks a radius of curvature, which may be infinite, and returns its curvature.
@@ -134,7 +137,7 @@ pub(super) fn curvature(key: &str, radius_mm: f64) -> Result<f64, DefinitionErro
         return Ok(1.0 / radius_mm);
     }
     let limit = "at least 1e-6 mm in magnitude, positive with the centre of curvature at +z";
-    Err(DefinitionError::out_of_range(key, radius_mm, limit, "write inf where there is no curvature"))
+    Err(DefinitionError::out_of_range(key, radius_mm, limit, "for no curvature write inf"))
 }
 
 /// Checks a length that must be positive.
@@ -142,5 +145,5 @@ pub(super) fn positive(key: &str, length_mm: f64) -> Result<f64, DefinitionError
     if length_mm > 0.0 && length_mm <= 1e6 {
         return Ok(length_mm);
     }
-    Err(DefinitionError::out_of_range(key, length_mm, "greater than 0 and at most 1e6 mm", "write it in millimetres"))
+    Err(DefinitionError::out_of_range(key, length_mm, "greater than 0 and at most 1e6 mm", "write it in mm"))
 }

@@ -66,7 +66,7 @@ impl OffAxis {
         frame: SectionFrame,
     ) -> Result<Self, DefinitionError> {
         if !(0.0..=1e6).contains(&distance_mm) {
-            let remedy = "turn `azimuth_deg` by 180 for the other side";
+            let remedy = "for the other side turn `azimuth_deg` by 180°";
             return Err(DefinitionError::out_of_range("distance_mm", distance_mm, "from 0 to 1e6 mm", remedy));
         }
         let (sine, cosine) = error::finite("azimuth_deg", azimuth_rad)?.sin_cos();

@@ -71,7 +71,7 @@ fn a_diameter_and_half_a_radius_are_told() {
                 .unwrap();
             assert!((told / RADIUS_MM - 1.0).abs() < 0.2, "{words}");
             assert!(
-                words.contains(&format!("the {given_mm} mm given")) && words.contains("not its diameter"),
+                words.contains(&format!("the given {given_mm} mm")) && words.contains("not its diameter"),
                 "{words}"
             );
         }
@@ -103,10 +103,10 @@ fn a_fit_that_is_refused_for_its_radius_says_so() {
 #[test]
 fn few_points_of_the_part_are_told() {
     let words = said(&with_radius(RADIUS_MM, &measured(1, [25.0, 15.0])));
-    assert!(words.contains("1800 points used lie on 2") && words.contains("cut short"), "{words}");
+    assert!(words.contains("1800 points used cover only 2") && words.contains("cut short"), "{words}");
     // The first rows of a file that was cut.
     let words = said(&with_radius(RADIUS_MM, &whole(1)[..180]));
-    assert!(words.contains("180 points used lie on ") && words.contains("cut short"), "{words}");
+    assert!(words.contains("180 points used cover only ") && words.contains("cut short"), "{words}");
 }
 
 #[test]
@@ -119,12 +119,14 @@ fn many_outliers_are_told() {
     };
     let words = spoiled(31);
     assert!(
-        words.starts_with("59 points were left out, for no neighbour found the same: point 0 at (-50.0, -30.0) mm by "),
+        words.starts_with(
+            "59 points were rejected, because no neighbour confirms the deviation: point 0 at (-50.0, -30.0) mm by "
+        ),
         "{words}"
     );
-    assert!(words.contains("and 54 more; with what was left out PV is 0.") && !words.contains("%"), "{words}");
+    assert!(words.contains("and 54 more; with all points PV is 0.") && !words.contains("%"), "{words}");
     let words = spoiled(13);
-    assert!(words.contains("139 of 1800 points (8 %) are outliers"), "{words}");
+    assert!(words.contains("139 of 1800 points (8 %) are rejected as outliers"), "{words}");
 }
 
 #[test]

@@ -383,7 +383,7 @@ fn what_no_uncertainty_can_be_is_refused_in_words() {
         }
         let given = ModelInputs { datum: Some([0.0, wrong, 0.0, 0.0, 0.0, 0.0]), ..ModelInputs::default() };
         let error = Form::estimate(&part.found, &given).unwrap_err().to_string();
-        assert!(error.contains("place where the part is held") && error.contains(&wrong.to_string()), "{error}");
+        assert!(error.contains("pose of the fixture") && error.contains(&wrong.to_string()), "{error}");
     }
 }
 

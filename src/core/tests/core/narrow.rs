@@ -96,7 +96,7 @@ fn a_line_may_tell_what_it_can_where_the_rest_is_held() {
     let hold = |held: &[Coordinate]| Options { start, locked: Coordinate::locked(held), ..free() };
     assert!(matches!(found(&cloud, &hold(&[Coordinate::Y])), Err(RegistrationError::Narrow { .. })));
     let said = found(&cloud, &free()).unwrap_err().to_string();
-    assert!(said.contains("hold y and rx") && said.contains("measure a strip of"), "{said}");
+    assert!(said.contains("lock y and rx") && said.contains("measure a strip at least"), "{said}");
     let registration = found(&cloud, &hold(&[Coordinate::Y, Coordinate::Rx])).unwrap();
     assert!(registration.verdict.rms_mm < 1e-3);
 }
@@ -166,5 +166,5 @@ fn as_many_points_are_needed_as_directions_are_free_and_one() {
     let exact: Pose = found(&cloud[..4], &options).unwrap().cmm_from_model;
     assert!((truth.inverse() * exact).log().norm() < 1e-2);
     let said = found(&cloud[..3], &options).unwrap_err().to_string();
-    assert!(said.contains("at least 4 are needed"), "{said}");
+    assert!(said.contains("at least 4 are required"), "{said}");
 }

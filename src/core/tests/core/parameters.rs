@@ -72,7 +72,7 @@ fn what_is_planted_is_found_without_form() {
     assert!(found.rest_rms_mm < 1e-5 && found.rms_mm > 1e-3);
     let radius = &of(&found, ParameterKind::WheelRadius).message;
     assert!(radius.starts_with("wheel radius: 12.5900 mm instead of 12.5000 mm, off by "), "{radius}");
-    assert!(radius.contains("compensation.parameters.wheel_radius_um = its tolerance would take it back"), "{radius}");
+    assert!(radius.contains("set compensation.parameters.wheel_radius_um to its tolerance"), "{radius}");
 }
 
 #[test]

@@ -189,7 +189,7 @@ fn a_nominal_that_scatters_is_reported_and_a_smooth_one_is_not() {
     for (noise_mm, is_told) in [(0.0, false), (1e-3, true)] {
         let nominal = Nominal::from_points(scattered(|_| 0.5, noise_mm), Projection::Xy).unwrap();
         let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
-        assert_eq!(says(&found, "nominal points scatter"), is_told, "{noise_mm}: {:?}", found.verdict.warnings);
+        assert_eq!(says(&found, "nominal points have a noise"), is_told, "{noise_mm}: {:?}", found.verdict.warnings);
     }
 }
 

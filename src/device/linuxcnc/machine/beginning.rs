@@ -60,7 +60,7 @@ impl LinuxcncGrinder {
             }
             () if seen.interpreter == Interpreter::Running => Err(self.unready("it runs a program")),
             () if seen.interpreter == Interpreter::Paused => {
-                Err(self.unready("a program is paused at it: end it at the machine"))
+                Err(self.unready("a program is paused: end it at the machine"))
             }
             () if !seen.homed => Err(self.unready("it is not homed: home it at the machine")),
             () => Ok(()),
@@ -90,8 +90,8 @@ impl LinuxcncGrinder {
                 let (here, there) = (self.folders.local.display(), &self.folders.remote);
                 let errors = self.controller.errors().await?.join("; ");
                 let why = format!(
-                    "what the controller writes to {record} is not seen in {here}: is {there} the same folder, and may the account that \
-                     LinuxCNC runs by write there? {errors}"
+                    "the record {record} of the controller does not appear in {here}: check that {there} is the same \
+                     folder, and that the account of LinuxCNC has the right to write there. {errors}"
                 );
                 return Err(DeviceError::Folder { machine: self.machine(), reason: why });
             }

@@ -41,7 +41,7 @@ impl LinuxcncGrinder {
         match &self.last_motion {
             Some((line, at, since)) if (*line, at) == (seen.line, &seen.position) => {
                 if seen.interpreter == Interpreter::Running && since.elapsed() > STANDSTILL_AFTER {
-                    self.note("it says that it runs, and has not moved for 5 s: look at the machine".to_owned());
+                    self.note("it reports a running program, and has not moved for 5 s: check the machine".to_owned());
                 }
             }
             _ => self.last_motion = Some((seen.line, seen.position.clone(), Instant::now())),
@@ -93,8 +93,8 @@ impl LinuxcncGrinder {
                 }
             }
             Verdict::Unresolved => self.note(
-                "it stands, and its program wrote neither that it began nor that it ended: look at the machine, then regrind confirm done, or \
-                 regrind confirm still"
+                "it has stopped, and its program recorded neither its begin nor its end: check the machine, then \
+                 regrind confirm done, or regrind confirm still"
                     .to_owned(),
             ),
             Verdict::InState(_) | Verdict::Foreign(_) => {}

@@ -48,8 +48,8 @@ impl LinuxcncGrinder {
                 let (_, status) = self.read_status().await?;
                 Ok(Reconciled::NotStarted(status))
             }
-            Some(_) => Ok(unknown("its record says that it began, and it is not seen to have ended")),
-            None => Ok(unknown("the record of its preparation is not in the folder of programs any more")),
+            Some(_) => Ok(unknown("its record shows that it began, but not that it ended")),
+            None => Ok(unknown("the record of its preparation is no longer in the folder of programs")),
         }
     }
 

@@ -132,7 +132,7 @@ fn what_may_be_another_surface_than_it_seems_is_refused() {
     for (from, to, expected) in [
         ("SUR", "PRF", "found `PRF, a profile`"),
         ("<SizeZ>1", "<SizeZ>2", "expected one layer"),
-        ("</Axes>", turned, "a frame that is not turned"),
+        ("</Axes>", turned, "a frame that is not rotated"),
         ("</Axes>", "<Origin>SE</Origin></Axes>", "expected SW or NW"),
         ("<Increment>1<", "<Increment>1e-6<", "an increment of 1"),
         ("<DataType>D</DataType><Increment>1<", "<DataType>Q</DataType><Increment>1<", "expected I, L, F or D"),
@@ -147,8 +147,8 @@ fn what_may_be_another_surface_than_it_seems_is_refused() {
         ("<SizeX>3", "<SizeX>4000000000000", "samples of a map"),
         ("bindata/data.bin", "../data.bin", "an entry of this container"),
         ("bindata/data.bin", "bindata/none.bin", "no bindata/none.bin"),
-        ("<PointDataLink>", "<None>", "no readable XML"),
-        ("p:ISO5436_2 ", "!DOCTYPE x [<!ENTITY a \"b\">]><p:ISO5436_2 ", "no readable XML"),
+        ("<PointDataLink>", "<None>", "not readable as XML"),
+        ("p:ISO5436_2 ", "!DOCTYPE x [<!ENTITY a \"b\">]><p:ISO5436_2 ", "not readable as XML"),
         ("ISO5436_2", "other", "the root ISO5436_2"),
     ] {
         assert!(xml.contains(from), "{from}");

@@ -134,11 +134,11 @@ fn a_fault_is_named_with_place_finding_and_remedy() {
         ("x,y,z\n", "measured.csv: a header but no points after it"),
         (
             "x,y,z\n1,2,3\n1,abc,3\n",
-            "measured.csv, line 3, column 2: expected a number in millimetres, found `abc`; remove the text or give the column \
-             a header",
+            "measured.csv, line 3, column 2: expected a number in mm, found `abc`; remove the text or give the \
+             column a header",
         ),
-        ("1,2,3\n1,,3\n", "line 2, column 2: expected a number in millimetres, found nothing"),
-        ("1,2,3\n1,2,nan\n", "line 2, column 3: expected a finite number in millimetres, found `nan`"),
+        ("1,2,3\n1,,3\n", "line 2, column 2: expected a number in mm, found nothing"),
+        ("1,2,3\n1,2,nan\n", "line 2, column 3: expected a finite number in mm, found `nan`"),
         ("nan,nan,nan\n", "line 1, column 1: expected a finite number"),
         ("1,-inf,3\n", "line 1, column 2: expected a finite number"),
         ("1,2,1e300\n", "line 1, column 3: expected at most 1e7 mm in size, found `1e300`"),
@@ -153,12 +153,12 @@ fn a_fault_is_named_with_place_finding_and_remedy() {
         ),
         ("1,2\n", "line 1: expected three columns"),
         ("words of prose\nmore words\n", "line 2: expected three columns x, y, z"),
-        ("a title 1\nfoo bar baz\n1 2 3\n", "line 1, column 1: expected a number in millimetres, found `a`"),
+        ("a title 1\nfoo bar baz\n1 2 3\n", "line 1, column 1: expected a number in mm, found `a`"),
         ("1D0,2D0,3D0\n1,2,3\n", "line 1: the header names none of x, y and z"),
         ("left;right;up\n1;2;3\n", "line 1: the header names none of x, y and z"),
         ("x,y,height in um\n1,2,3\n", "line 1: expected coordinates in mm, found the unit `um`"),
         ("x,y,height\n1,2,3\n", "line 1: the header names 0 columns z"),
-        ("X_nom,Y_nom,Z_nom\n1,2,3\n", "line 1: the header names nominal columns alone"),
+        ("X_nom,Y_nom,Z_nom\n1,2,3\n", "line 1: the header names only nominal columns"),
         ("X_nom,Y_nom,Z_nom,X_act,Y_act,Z_act\n1,2,3,1,2,3\n", "line 1: the header names measured and nominal columns"),
         ("x,y,z,x_act,y_act,z_act\n1,2,3,1,2,3\n", "line 1: the header names plain and measured columns"),
         (
@@ -172,7 +172,7 @@ fn a_fault_is_named_with_place_finding_and_remedy() {
         ("Part 7, Zoll\nx,y,z\n1,2,3\n", "line 1: expected coordinates in mm, found the unit `zoll`"),
         ("x,y,z\nmm,mm,um\n1,2,3\n", "line 2: expected coordinates in mm, found the unit `um`"),
         ("1,2,3\n0x10,2,3\n", "found `0x10`"),
-        ("1,2,3\n1,2,3mm\n", "line 2, column 3: expected a number in millimetres, found `3mm`"),
+        ("1,2,3\n1,2,3mm\n", "line 2, column 3: expected a number in mm, found `3mm`"),
         ("1,2,3\n4,5", "line 2: the file is cut in the middle of a line, found `4,5`"),
         ("1,2,3\n4,5,-", "the file is cut in the middle of a line"),
         ("x,y,z\n1;2;3\n", "line 1: the header has 1 columns separated by semicolon, the data under it has 3"),
@@ -182,10 +182,10 @@ fn a_fault_is_named_with_place_finding_and_remedy() {
         ("x [inch];y [inch];z [inch]\n1;2;3\n", "found the unit `inch`"),
         ("x [mm];y [mm];z [\u{b5}m]\n1;2;3\n", "found the unit `\u{b5}m`"),
         ("# units: inch\n1 2 3\n", "line 1: expected coordinates in mm, found the unit `inch`"),
-        ("12,345;23,456;34,567\n", "line 1, column 1: `12,345` may have a decimal comma or a thousands comma"),
+        ("12,345;23,456;34,567\n", "line 1, column 1: `12,345` has either a decimal comma or a thousands comma"),
         ("1.5;2.5;3.5\n1,5;2,5;3,5\n", "line 2, column 1: expected a number with a decimal point like those before it"),
         ("1,5;2,5;3,5\n1.5;2.5;3.5\n", "line 2, column 1: expected a number with a decimal comma like those before it"),
-        ("1.5;2.5;3.5\n1.5;2,512;3.5\n", "line 2, column 2: `2,512` may have a decimal comma or a thousands comma"),
+        ("1.5;2.5;3.5\n1.5;2,512;3.5\n", "line 2, column 2: `2,512` has either a decimal comma or a thousands comma"),
         ("1,2,3\n1,\"2,3\n", "line 2"),
         ("1,2,3\n1,2,3\0\n", "line 2: expected text, found byte 0x00"),
     ];
@@ -644,12 +644,12 @@ fn a_last_line_without_an_end_is_noted_and_a_number_that_lacks_digits_more_so() 
     }
     for (cut, digits) in [("3.50", 2), ("3.5", 1), ("3.", 0), ("13", 0)] {
         let told = notes(&format!("{lines}1.500,2.500,{cut}"));
-        let words = format!("has {digits} digits where the lines above have 3 or more: the file is cut");
+        let words = format!("has {digits} digits; the lines above have 3 or more: the file is probably cut");
         assert!(told.len() == 1 && told[0].contains(&words) && told[0].contains("line 4: "), "{told:?}");
     }
     let exponents = "1e-05 2e-05 3.5e-05\n".repeat(4);
     let told = notes(&format!("{exponents}1e-05 2e-05 3.5e-0"));
-    assert!(told[0].contains("`3.5e-0` has 1 digits where the lines above have 2"), "{told:?}");
+    assert!(told[0].contains("`3.5e-0` has 1 digits; the lines above have 2"), "{told:?}");
     // Numbers that are written as short as they are show nothing.
     let told = notes("1.125,2,3\n1,2,3.25\n1,2,3.125\n1,2,3");
     assert!(told.len() == 1 && told[0].contains("would not show"), "{told:?}");

@@ -182,7 +182,7 @@ fn an_end_whose_seal_was_taken_away_is_told_and_another_seal_behind_it_is_found(
     );
     let found = verify(&folder);
     assert_eq!(place(&found), Some(607), "{found:?}");
-    assert!(found.unwrap_err().to_string().contains("behind the end"));
+    assert!(found.unwrap_err().to_string().contains("follows the end"));
 }
 
 #[test]
@@ -381,9 +381,9 @@ fn a_key_that_is_broken_or_open_to_others_is_refused_in_words() {
         ("", "no 64 hexadecimal digits"),
         (&text[..120], "no 64 hexadecimal digits"),
         (&text.replacen("secret = \"", "secret = \"0", 1), "no 64 hexadecimal digits"),
-        (&text[..text.len() - 40], "does not belong"),
-        (&text.replace("public", "other"), "does not belong"),
-        (&"x".repeat(5000), "no small file"),
+        (&text[..text.len() - 40], "does not match"),
+        (&text.replace("public", "other"), "does not match"),
+        (&"x".repeat(5000), "not a small file"),
     ] {
         fs::write(&path, text).unwrap();
         let refused = AuditKey::read(&path).unwrap_err().to_string();

@@ -284,7 +284,7 @@ fn a_folder_that_cannot_be_written_is_read_and_refuses_a_writer() {
     assert_eq!(verified.unwrap().head, anchor.head);
     for refused in refused {
         assert!(matches!(&refused, Err(JournalError::File { .. })), "{refused:?}");
-        assert!(refused.unwrap_err().to_string().contains("yours to write"));
+        assert!(refused.unwrap_err().to_string().contains("the right to write"));
     }
 }
 
