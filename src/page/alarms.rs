@@ -22,8 +22,15 @@ pub(crate) fn said(alarm: &Alarm, language: Language) -> Said<'_> {
         let remedy = alarm.remedy.iter().map(String::as_str).collect();
         return Said { what: Cow::Borrowed(&alarm.what), consequence: &alarm.consequence, remedy };
     };
-    let case = alarm.what.strip_prefix(alarm.id.head()).unwrap_or_default();
+    let case = case(&alarm.what, alarm.id.head());
     Said { what: Cow::Owned(format!("{head}{case}")), consequence, remedy: remedy.to_vec() }
+}
+
+/// Returns the part of an alarm's cause that follows its head: the values of the case. An older record has another
+/// wording of the head, with as many colons.
+fn case<'a>(what: &'a str, head: &str) -> &'a str {
+    let colons = head.matches(": ").count();
+    what.match_indices(": ").nth(colons).map_or(".", |(at, _)| &what[at..])
 }
 
 type Entry = (&'static str, &'static str, &'static [&'static str]);
@@ -393,6 +400,10 @@ mod tests {
                 assert_eq!(said.remedy.len(), alarm.remedy.len(), "{id:?} in {language:?}");
             }
             assert_eq!(said(&alarm, Language::En).what, alarm.what);
+            let older = id.head().replace(|letter: char| letter.is_alphabetic(), "#");
+            let older = Alarm { what: format!("{older}: grinder at 12 mm."), ..alarm };
+            assert!(said(&older, Language::De).what.ends_with(": grinder at 12 mm."), "{id:?}: its older wording");
+            assert!(!said(&older, Language::De).what.contains('#'), "{id:?}: its older wording");
         }
     }
 }

@@ -178,42 +178,42 @@ texts! {
     // Next actions.
     Nothing { "No action needed.", "Nichts: die Zelle arbeitet selbst.", "无：单元自动运行。" }
     Load {
-        "Load the part and clamp it. See that wheel and probe are clear of it. Then press THE PART IS LOADED.",
+        "Load the part and clamp it. Check that wheel and probe are clear of it. Then press THE PART IS LOADED.",
         "Teil laden und spannen. Prüfen, dass Scheibe und Taster frei sind. Dann TEIL IST GELADEN drücken.",
         "装上零件并夹紧。确认砂轮和测头已离开零件。然后按“零件已装好”。"
     }
     SeeClear {
-        "See that this machine is clear of the part, and confirm it:",
+        "Check that this machine is clear of the part, and confirm it:",
         "Prüfen, dass diese Maschine frei vom Teil ist, und bestätigen:",
         "确认此机器已离开零件："
     }
     SeeToAlarm {
-        "Do what the alarm says. The cell goes on by itself when it is gone.",
+        "Follow the steps of the alarm. The cell continues by itself when the alarm is cleared.",
         "Tun, was der Alarm sagt. Die Zelle macht selbst weiter, wenn er weg ist.",
         "按报警提示处理。报警消失后单元自动继续。"
     }
     ClearAlarm {
-        "Do what the alarm says. Then press RESUME, or END THE RUN.",
+        "Follow the steps of the alarm. Then press RESUME or END THE RUN.",
         "Tun, was der Alarm sagt. Dann FORTSETZEN drücken oder LAUF BEENDEN.",
         "按报警提示处理。然后按“继续”或“结束运行”。"
     }
     ResumeOrStop {
-        "Press RESUME to go on, or END THE RUN.",
+        "Press RESUME to continue, or END THE RUN.",
         "FORTSETZEN drücken, oder LAUF BEENDEN.",
         "按“继续”，或“结束运行”。"
     }
     SeeStands {
-        "See whether this machine stands. Then press RESUME, which asks it what became of its job; where it cannot tell, say so below:",
+        "Check that this machine is at rest. Then press RESUME: the cell asks the machine for the state of its job. If the machine does not know it, answer below:",
         "Prüfen, ob diese Maschine steht. Dann FORTSETZEN drücken: sie wird nach ihrem Auftrag gefragt; kann sie es nicht sagen, unten angeben:",
         "查看此机器是否静止。然后按“继续”，系统会询问其作业结果；若机器无法应答，请在下方说明："
     }
     KeepAway {
-        "Keep away from both machines: they run their safe sequence.",
+        "Keep away from both machines: they execute their safe sequence.",
         "Abstand halten von beiden Maschinen: sie fahren ihre sichere Folge.",
         "远离两台机器：正在执行安全动作。"
     }
     EmergencyCircuit {
-        "Use the emergency stop of each machine that has not confirmed that it stands.",
+        "Use the emergency stop of each machine that did not confirm that it is at rest.",
         "Not-Halt jeder Maschine betätigen, die ihren Stillstand nicht bestätigt hat.",
         "对未确认静止的机器使用急停。"
     }
