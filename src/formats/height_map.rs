@@ -220,9 +220,9 @@ mod tests {
         let full = [Some(0.0); 6];
         assert!(map(&full).is_ok());
         let told = |made: Result<HeightMap, FormatError>| made.unwrap_err().to_string();
-        assert!(told(map(&full[..5])).contains("expected 3 times 2 of them, found `5`"));
+        assert!(told(map(&full[..5])).contains("expected 3 times 2, found `5`"));
         assert!(told(map(&[Some(0.0); 9])).contains("found `more`"));
-        assert!(told(map(&[None; 6])).contains("no sample that was measured"));
+        assert!(told(map(&[None; 6])).contains("sample that was measured"));
         for bad in [f64::NAN, f64::INFINITY, -1e8] {
             let mut samples = full;
             samples[4] = Some(bad);

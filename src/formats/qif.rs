@@ -348,6 +348,6 @@ mod tests {
         }
         let cell = Content { coordinates: Some(Coordinates::Contacts), ..Content::default() };
         let error = parse_result(Path::new("x.qif"), document(SET).as_bytes(), &cell).unwrap_err().to_string();
-        assert!(error.contains("coordinates is centres, the cell file says contacts"), "{error}");
+        assert!(error.contains("coordinates is centres, in the cell file contacts"), "{error}");
     }
 }

@@ -484,7 +484,7 @@ mod tests {
         let mut long = honest.clone();
         let grid = Grid { columns: 1_500_000, rows: 1, first_mm: [0.0; 2], spacing_mm: [1e-9, 1.0] };
         long.mean = Some(Mean { grid, values_mm: vec![0.0; grid.len()] });
-        for (state, why) in [(certain, "without any doubt"), (huge, "1.000e200 mm"), (long, "1500000 x 1 nodes")] {
+        for (state, why) in [(certain, "no uncertainty"), (huge, "1.000e200 mm"), (long, "1500000 x 1 nodes")] {
             assert!(state.is_sound() && state.unfit_to_teach().unwrap().contains(why), "{:?}", state.unfit_to_teach());
         }
     }

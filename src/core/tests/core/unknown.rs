@@ -203,7 +203,7 @@ fn what_is_held_wrongly_is_no_mirror_image() {
     let locked = [true, true, false, false, false, true];
     let refused = register(&nominal, &measured, &Options { start, locked, ..Options::new(RADIUS_MM) }).unwrap_err();
     let RegistrationError::DoesNotFit { remedy, .. } = &refused else { panic!("{refused:?}") };
-    assert!(remedy.contains("held"), "{remedy}");
+    assert!(remedy.contains("locked pose"), "{remedy}");
     // A mirror image is one all the same.
     let mirrored: Vec<Point> = measured.iter().map(|p| Point::new(-p.x, p.y, p.z)).collect();
     let refused = register(&nominal, &mirrored, &Options { start, locked, ..Options::new(RADIUS_MM) }).unwrap_err();
