@@ -103,7 +103,7 @@ pub enum UsersError {
     #[error("{}: no list of users: {what}", .path.display())]
     Broken { path: PathBuf, what: String },
     #[error(
-        "the name of a user has 1 to {LONGEST_NAME} characters, none of them a control character or one that turns what is read"
+        "the name of a user must have 1 to {LONGEST_NAME} characters, without control characters and without characters that change the direction of the text"
     )]
     Name,
     #[error("the password has {found} bytes; it needs {SHORTEST_PASSWORD} to {LONGEST_PASSWORD}")]

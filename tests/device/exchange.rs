@@ -365,7 +365,7 @@ fn the_cell_may_say_what_the_file_does_not() {
     };
     let mut bench = Bench::new(CmmExchange { content, ..shop.cmm() });
     shop.put("SN_7_c2.csv", &three());
-    bench.refused("the file says that coordinates is centres, the cell file says contacts");
+    bench.refused("in the file coordinates is centres, in the cell file contacts");
     shop.put("SN_7_c2.csv", "1,000;2;3\n1.000,5;5;6\n7;8;9\n");
     let found = bench.settled().answer.unwrap();
     assert_eq!(found.coordinates, Coordinates::Contacts);

@@ -415,7 +415,7 @@ async fn further_signals_are_read_scaled_and_held_against_their_range() {
         let absent = Signal { address, kind, scale, ..temperature.clone() };
         let mut cmm = connected(ModbusSettings { signals: vec![absent], ..settings(&serving) }).await;
         let flaw = cmm.status().await.unwrap().signals[0].problem().unwrap();
-        assert!(flaw.starts_with("part_temperature: the machine gives no number: ") && flaw.contains(words), "{flaw}");
+        assert!(flaw.starts_with("part_temperature: the machine gives no value: ") && flaw.contains(words), "{flaw}");
     }
 }
 
