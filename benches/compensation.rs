@@ -24,7 +24,7 @@ const SPACINGS_MM: [f64; 2] = [1.0, 0.5];
 
 static CONTACTS: LazyLock<Vec<Contact>> = LazyLock::new(measured);
 static READINGS: LazyLock<Vec<Sample>> = LazyLock::new(|| {
-    let reading = |c: &Contact| Sample { at_mm: [c.point.x, c.point.y], deviation_mm: c.deviation_mm };
+    let reading = |c: &Contact| Sample { place_mm: [c.point.x, c.point.y], deviation_mm: c.deviation_mm };
     CONTACTS.iter().map(reading).collect()
 });
 
@@ -106,19 +106,19 @@ fn spline(bencher: Bencher, spacing_mm: f64) {
 fn correction(bencher: Bencher, spacing_mm: f64) {
     let options = MapOptions::new(CUTOFF_MM, spacing_mm);
     let error = error_map(&READINGS, &options).expect("a map");
-    let now = Correction::none(error.grid, 0.06);
+    let now = Correction::zero(error.grid, 0.06);
     let begin = LearningState::new(GainRule::Wavelength, &options, [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM], None);
-    let seen = Seen { correction: &now, error: &error, answer: None, smooth: None };
-    let known = begin.after(&seen);
+    let seen = Seen { correction: &now, error: &error, response: None, explained: None };
+    let known = begin.updated(&seen);
     let limits = CorrectionLimits {
         depth_of_cut_mm: 0.01,
-        least_depth_mm: 0.0005,
+        min_depth_mm: 0.0005,
         max_correction_mm: 0.1,
         allowance_mm: 0.06,
         removal_budget_mm: 1.0,
         max_depth_mm: 1.0,
     };
-    bencher.bench(|| now.next(&error, &black_box(&known).after(&seen), None, &limits).expect("a correction"));
+    bencher.bench(|| now.next_pass(&error, &black_box(&known).updated(&seen), None, &limits).expect("a correction"));
 }
 
 /// Measures the separation of wheel, setting and wear from form.

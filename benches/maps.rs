@@ -28,7 +28,7 @@ fn samples(points: usize) -> Vec<Sample> {
         ]
     };
     let rough = |[x, y]: [f64; 2]| 1e-3 * (0.2 * x).sin() * (0.3 * y).cos() + 1e-4 * (5.0 * x + 7.0 * y).sin();
-    (0..columns * rows).map(place).map(|at_mm| Sample { at_mm, deviation_mm: rough(at_mm) }).collect()
+    (0..columns * rows).map(place).map(|at_mm| Sample { place_mm: at_mm, deviation_mm: rough(at_mm) }).collect()
 }
 
 fn error_map(nodes: usize) -> ErrorMap {
@@ -40,7 +40,7 @@ fn error_map(nodes: usize) -> ErrorMap {
         spacing_mm: [102.0 / columns as f64, 62.0 / columns as f64],
     };
     let values_mm = (0..grid.len()).map(|k| 1e-3 * (k as f64 * 0.01).sin()).collect();
-    ErrorMap::known(grid, values_mm, (0..grid.len()).map(|k| k % 11 != 3).collect())
+    ErrorMap::exact(grid, values_mm, (0..grid.len()).map(|k| k % 11 != 3).collect())
 }
 
 fn written(map: &ErrorMap) -> PathBuf {

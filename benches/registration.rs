@@ -72,7 +72,7 @@ fn gridded(points: Vec<Point>) -> Nominal {
 }
 
 fn scattered(points: Vec<Point>) -> Nominal {
-    Nominal::scattered(points, Projection::Auto).expect("the free form is a surface")
+    Nominal::from_triangulated_points(points, Projection::Auto).expect("the free form is a surface")
 }
 
 fn found(nominal: &Nominal, measured: &[Point], start: Start) -> Registration {

@@ -78,7 +78,7 @@ fn points(bencher: Bencher, points: u64) {
     let path = path(points);
     bencher.counter(ItemsCount::new(points)).bench(|| {
         path.moves().fold(0.0, |sum, one| match one {
-            Move::Feed { at, .. } => sum + at.z,
+            Move::Feed { to, .. } => sum + at.z,
             _ => sum,
         })
     });
@@ -128,12 +128,12 @@ fn from_deviations_to_a_program(bencher: Bencher) {
     let file = folder.path().join("part.ngc");
     let readings: Vec<Sample> = (0..226 * 126)
         .map(|k| [(k % 226) as f64 * 100.0 / 225.0 - 50.0, (k / 226) as f64 * 60.0 / 125.0 - 30.0])
-        .map(|at_mm| Sample { at_mm, deviation_mm: error_mm(at_mm) + 3e-4 * (1e4 * (at_mm[0] + 3.0 * at_mm[1])).sin() })
+        .map(|at_mm| Sample { place_mm, deviation_mm: error_mm(at_mm) + 3e-4 * (1e4 * (at_mm[0] + 3.0 * at_mm[1])).sin() })
         .collect();
     let options = MapOptions::new(5.0, 1.0);
     let limits = CorrectionLimits {
         depth_of_cut_mm: 0.01,
-        least_depth_mm: 0.0005,
+        min_depth_mm: 0.0005,
         max_correction_mm: 0.1,
         allowance_mm: 0.06,
         removal_budget_mm: 1.0,
@@ -142,9 +142,9 @@ fn from_deviations_to_a_program(bencher: Bencher) {
     let begin = LearningState::new(GainRule::Wavelength, &options, [100.0, 60.0], None);
     bencher.bench(|| {
         let error = error_map(black_box(&readings), &options).expect("a map");
-        let now = Correction::none(error.grid, 0.06);
-        let known = begin.after(&Seen { correction: &now, error: &error, answer: None, smooth: None });
-        let step = now.next(&error, &known, None, &limits).expect("a correction");
+        let now = Correction::zero(error.grid, 0.06);
+        let known = begin.updated(&Seen { correction: &now, error: &error, response: None, explained: None });
+        let step = now.next_pass(&error, &known, None, &limits).expect("a correction");
         let path = path_of(nominal(), &step.correction, 1_000_000);
         write(&path, &path.summary().expect("a path"), &file);
     });

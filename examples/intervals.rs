@@ -180,7 +180,7 @@ fn told(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64
         Some(register(nominal, &cloud, &held).ok()?.deviations)
     };
     let heights = |of: &[Deviation]| DVector::from_iterator(of.len(), of.iter().map(|d| d.deviation_mm));
-    let used = found.deviations.iter().zip(&places).filter(|(d, _)| d.status == PointStatus::Used);
+    let used = found.deviations.iter().zip(&places).filter(|(d, _)| d.status == PointStatus::Inlier);
     let touched = true_at(&used.map(|(_, place)| *place).collect::<Vec<_>>())?;
     let factor = motions(&touched).qr();
     let moved = factor.r().solve_upper_triangular(&factor.q().tr_mul(&heights(&touched)))?;
@@ -206,7 +206,7 @@ fn told(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64
     // No touched place is left out.
     let aperture = between[between.len() - 1 - left_out].max(left.max()) - between[left_out].min(left.min());
     let pv = left.max() - left.min();
-    Some([(rms, told.figures.rms), (pv, told.figures.pv), (aperture, told.figures.pv_most_points)])
+    Some([(rms, told.figures.rms), (pv, told.figures.pv), (aperture, told.figures.pv_998)])
 }
 
 fn places(pattern: Pattern, count: usize, rng: &mut Rng) -> Vec<[f64; 2]> {

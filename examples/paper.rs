@@ -172,11 +172,11 @@ fn validity_of_the_distance(figures: &Path) -> Outcome {
         ),
     ];
     for (distance, radius_mm, name, what, paper) in cases {
-        let surface = OffsetSurface::new(&nominal, radius_mm, Side::Normal)?.with_distance(distance);
+        let surface = OffsetSurface::new(&nominal, radius_mm, Side::Normal)?.with_distance_model(distance);
         let residual = |&[x, y, e]: &[f64; 3]| {
             let (s, n) = (shape.point(x, y), shape.normal(x, y));
             let point = Point::from(std::array::from_fn::<f64, 3, _>(|k| s[k] + (radius_mm + e) * n[k]));
-            [x, y, surface.foot(&point, Place::UNKNOWN).distance_mm - e]
+            [x, y, surface.project(&point, Place::UNKNOWN).distance_mm - e]
         };
         let residuals: Vec<[f64; 3]> = exact.par_iter().map(residual).collect();
         row(what, paper, format!("{:.4}", 1e6 * pv(residuals.iter().map(|s| s[2]))));
@@ -206,7 +206,7 @@ fn as_in_the_paper(distance: Distance) -> Options {
         start: Start::Pose(Pose::identity()),
         side: ProbeSide::Above,
         outlier_sigmas: f64::INFINITY,
-        distance,
+        distance_model: distance,
         ..Options::new(PROBE_RADIUS_MM)
     }
 }
@@ -252,13 +252,13 @@ fn robustness(nominal: &Nominal, figures: &Path) -> Outcome {
 fn in_short(found: &Registration) -> String {
     let rises = found.trace.iter().filter(|i| i.taken).map(|i| i.objective_mm2).collect::<Vec<_>>();
     let rises = rises.windows(2).filter(|w| w[1] > w[0]).count();
-    format!("{:.1e} ({}, {rises})", 1e6 * found.verdict.pv_mm, found.verdict.iterations)
+    format!("{:.1e} ({}, {rises})", 1e6 * found.quality.pv_mm, found.quality.iterations)
 }
 
 /// Returns the objective before any step, in mm²: eq. (7) at the identity.
 fn objective_mm2(nominal: &Nominal, measured: &[Point], distance: Distance) -> Outcome<f64> {
-    let surface = OffsetSurface::new(nominal, PROBE_RADIUS_MM, Side::Normal)?.with_distance(distance);
-    Ok(measured.iter().map(|p| surface.foot(p, Place::UNKNOWN).distance_mm.powi(2)).sum())
+    let surface = OffsetSurface::new(nominal, PROBE_RADIUS_MM, Side::Normal)?.with_distance_model(distance);
+    Ok(measured.iter().map(|p| surface.project(p, Place::UNKNOWN).distance_mm.powi(2)).sum())
 }
 
 /// Simulated measurement of a ground part on the machine: the planted truth, and the points that the probe reports.
@@ -365,12 +365,12 @@ fn registered(nominal: &Nominal, measured: &Measurement, when: &str, paper: [&st
     let map_off = found.deviations.iter().zip(&left).map(|(d, e)| d.deviation_mm - e);
     let before = objective_mm2(nominal, &measured.centres, Distance::Curved)?;
     let um = |mm: f64| format!("{:.3}", 1e3 * mm);
-    row(&format!("{when}: surface error, PV / um"), paper[0], um(found.verdict.pv_mm));
-    row(&format!("{when}: surface error, RMS / um"), paper[1], um(found.verdict.rms_mm));
+    row(&format!("{when}: surface error, PV / um"), paper[0], um(found.quality.pv_mm));
+    row(&format!("{when}: surface error, RMS / um"), paper[1], um(found.quality.rms_mm));
     row(
         &format!("{when}: objective / mm^2 (iterations)"),
         if when.starts_with("after") { "3.2383 to 0.0566 (2)" } else { "-" },
-        format!("{before:.4} to {:.4} ({})", found.verdict.objective_mm2, found.verdict.iterations),
+        format!("{before:.4} to {:.4} ({})", found.quality.objective_mm2, found.quality.iterations),
     );
     row(&format!("{when}: pose against the exact best fit / um, urad"), "-", shift_and_turn(&off));
     row(&format!("{when}: map against the planted one, RMS / nm"), "-", format!("{:.2}", 1e6 * rms(map_off)));
@@ -393,7 +393,7 @@ fn closest_points(nominal: &Nominal, (measured, after): &(Measurement, Registrat
     let (mut pose, mut before, mut turns) = (Pose::identity(), f64::INFINITY, 0);
     loop {
         let inverse = pose.inverse();
-        let nearest = |y: &Point| tree.knn(1, &Entry::from(&inverse.point(y))).pop().expect("the cloud has points");
+        let nearest = |y: &Point| tree.knn(1, &Entry::from(&inverse.transform_point(y))).pop().expect("the cloud has points");
         let nearest: Vec<(Point, f64)> =
             measured.centres.par_iter().map(nearest).map(|n| (cloud[n.index as usize], *n.dist2)).collect();
         let objective = nearest.iter().map(|n| n.1).sum::<f64>();
@@ -414,7 +414,7 @@ fn closest_points(nominal: &Nominal, (measured, after): &(Measurement, Registrat
     let surface = OffsetSurface::new(nominal, PROBE_RADIUS_MM, Side::Normal)?;
     let inverse = pose.inverse();
     let map_off = measured.centres.iter().zip(&after.deviations);
-    let map_off = map_off.map(|(y, d)| surface.foot(&inverse.point(y), Place::UNKNOWN).distance_mm - d.deviation_mm);
+    let map_off = map_off.map(|(y, d)| surface.project(&inverse.transform_point(y), Place::UNKNOWN).distance_mm - d.deviation_mm);
     row("map against the right one, PV / um", "-", format!("{:.3}", 1e3 * pv(map_off)));
     Ok(())
 }
@@ -481,7 +481,7 @@ fn steps(found: &Registration) -> String {
 
 /// Returns the PV of the difference of two maps, over the points that both used.
 fn maps_apart(a: &Registration, b: &Registration) -> f64 {
-    let used = |(a, b): &(&Deviation, &Deviation)| a.status == PointStatus::Used && b.status == PointStatus::Used;
+    let used = |(a, b): &(&Deviation, &Deviation)| a.status == PointStatus::Inlier && b.status == PointStatus::Inlier;
     pv(a.deviations.iter().zip(&b.deviations).filter(used).map(|(a, b)| a.deviation_mm - b.deviation_mm))
 }
 
@@ -503,7 +503,7 @@ fn subtracting_the_radius(
                 continue;
             }
         };
-        row(&format!("{name}: surface error, PV / um"), "incorrect", format!("{:.3}", 1e3 * found.verdict.pv_mm));
+        row(&format!("{name}: surface error, PV / um"), "incorrect", format!("{:.3}", 1e3 * found.quality.pv_mm));
         row(
             &format!("{name}: map against the right one, PV / um"),
             "-",

@@ -153,7 +153,7 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
     };
     let adaptive = Adaptive { tolerance, accepted_risk: 0.025, max_cycles: 5 };
     let given =
-        ModelInputs { look_risk: adaptive.look_risk(), probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() };
+        ModelInputs { decision_risk: adaptive.look_risk(), probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() };
     let mut tried = vec![None; targets.len()];
     let mut touched: Vec<usize> = Vec::new();
     // As in a run: ten for the gates, then enough for a first stopping decision.
@@ -180,12 +180,12 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
             let whole = planted + without;
             let (rms_mm, pv_mm) = figures_mm(&whole);
             let conforms = rms_mm <= adaptive.tolerance.rms_mm && pv_mm <= adaptive.tolerance.pv_mm;
-            let is_accepted = decision.reason == Reason::Within;
+            let is_accepted = decision.reason == Reason::WithinLimits;
             return Seen {
                 touches: touched.len(),
                 covered: all.len(),
                 hit,
-                found: decision.reason == Reason::All || told > 0.5,
+                found: decision.reason == Reason::AllTargetsTried || told > 0.5,
                 conforms,
                 is_wrong: is_accepted && !conforms,
             };

@@ -110,7 +110,7 @@ pub const SCALLOP_SHARE: f64 = 0.2;
 /// cell.
 pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), SetupError> {
     let (nominal, nominal_file, part_identity) = nominal(recipe)?;
-    let side = recipe.measure.side.given().unwrap_or_default();
+    let side = recipe.measure.side.side().unwrap_or_default();
     let targets = lay(recipe, &nominal, side)?;
     check_limits(recipe, cell, &targets)?;
     let sphere = sphere(recipe, cell)?;
@@ -149,7 +149,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         coordinates: cell.cmm.link.wire.coordinates(),
         parameters,
         datum,
-        place: MapLimits { place_mm: recipe.compensation.max_displacement_mm, ..MapLimits::default() },
+        place: MapLimits { max_lateral_mm: recipe.compensation.max_displacement_mm, ..MapLimits::default() },
         map: map_options(recipe),
         gain: recipe.compensation.gain(),
         repeatability_mm: recipe.compensation.repeatability_um.map(Um::mm),
@@ -159,7 +159,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         targets,
         limits: CorrectionLimits {
             max_depth_mm: cell.grinder.limits.max_depth_mm,
-            least_depth_mm: recipe.compensation.min_depth_um.mm(),
+            min_depth_mm: recipe.compensation.min_depth_um.mm(),
             depth_of_cut_mm: recipe.compensation.depth_of_cut_um.mm(),
             max_correction_mm: recipe.compensation.max_correction_um.mm(),
             allowance_mm: recipe.grinding.allowance_um.mm(),
@@ -200,7 +200,7 @@ fn taken_back(
     // A program moves the centre of the wheel along the normals. A grinder with its own path is guided in height.
     let is_program = cell.grinder.link.wire.reads_run_folder();
     let wheel_term = if is_program { WheelTerm::AlongNormal } else { WheelTerm::InHeight };
-    Ok(Some(TakenBack { tolerances: parameters.tolerances(), wheel_term, nodes: Contact::under(field, &grid) }))
+    Ok(Some(TakenBack { tolerances: parameters.tolerances(), wheel_term, nodes: Contact::under_nodes(field, &grid) }))
 }
 
 /// Returns the standard uncertainty of the fixture's position in mm, and of its rotation in rad. The rotation moves the
@@ -253,7 +253,7 @@ fn map_options(recipe: &Recipe) -> MapOptions {
         contact_width_mm: contact_width_mm(wheel_radius_mm, compensation.depth_of_cut_um.mm()),
         smoothing: compensation.smoothing,
         order: compensation.filter_order,
-        roughness: compensation.roughness,
+        spline_smoothness: compensation.roughness,
         ..MapOptions::new(compensation.cutoff_mm, compensation.spacing_mm)
     }
 }
@@ -283,7 +283,7 @@ fn kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize) -> Stri
         grinding.spark_out_passes,
         map.depth_of_cut_um.mm(),
         measure.probe_radius_mm,
-        Coordinate::locked(&recipe.registration.lock),
+        Coordinate::locked_flags(&recipe.registration.lock),
         map.cutoff_mm,
         map.smoothing,
         map.gain()
@@ -420,7 +420,7 @@ fn sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Sphere>, SetupErr
 /// Checks that the probe does not search for the reference sphere inside the part. The part fills the box under its
 /// surface, in the pose of the fixture.
 fn check_sphere(recipe: &Recipe, cell: &CellConfig, nominal: &Nominal, sphere: &Sphere) -> Result<(), SetupError> {
-    let centre = cell.cmm.fixture_cmm_from_model.inverse().point(&sphere.centre);
+    let centre = cell.cmm.fixture_cmm_from_model.inverse().transform_point(&sphere.centre);
     let mut nearest = Point::from([f64::INFINITY; 3]);
     let mut farthest = -nearest;
     for p in nominal.points() {
@@ -478,7 +478,7 @@ fn check_travel(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     let reach = recipe.measure.probe_radius_mm + recipe.measure.approach_mm;
     let pose = &cell.cmm.fixture_cmm_from_model;
     let outside = |p: &Point| (0..3).any(|k| !(travel.least_mm[k]..=travel.most_mm[k]).contains(&p[k]));
-    let found = targets.iter().map(|t| pose.point(&(t.point + reach * t.normal))).enumerate().find(|(_, p)| outside(p));
+    let found = targets.iter().map(|t| pose.transform_point(&(t.point + reach * t.normal))).enumerate().find(|(_, p)| outside(p));
     match found {
         None => Ok(()),
         Some((k, at)) => Err(SetupError::Travel {
@@ -522,7 +522,7 @@ fn ground(recipe: &Recipe, nominal: &Nominal) -> Result<Ground, PathError> {
 
 /// Returns true if the part is machined from the side of -z. It is then also measured from that side.
 fn from_below(recipe: &Recipe) -> bool {
-    recipe.measure.side.given() == Some(Side::Opposite)
+    recipe.measure.side.side() == Some(Side::Opposite)
 }
 
 /// Returns the track distance, from the recipe or from the allowed scallops, and the scallops between the tracks.
@@ -542,7 +542,7 @@ fn tracks(
     };
     let [low, high] = outline.bounds();
     let size_mm = [high[0] - low[0], high[1] - low[1]];
-    let none = Correction::none(Grid { columns: 2, rows: 2, first_mm: low, spacing_mm: size_mm }, 0.0);
+    let none = Correction::zero(Grid { columns: 2, rows: 2, first_mm: low, spacing_mm: size_mm }, 0.0);
     let unknown = |source| SetupError::Tracks { recipe: recipe.path().to_owned(), source };
     let wanted = Wanted::new(field.clone(), &none, 1.0).map_err(unknown)?;
     let options =
@@ -596,7 +596,7 @@ fn programs(
         one_way: grinding.one_way,
         spacing: match grinding.scallop_nm {
             // A correction can bend the surface a little more than the nominal surface is bent.
-            Some(nm) => TrackSpacing::Scallop { height_mm: 1e-6 * nm, widest_mm: track_mm },
+            Some(nm) => TrackSpacing::Scallop { max_height_mm: 1e-6 * nm, max_track_mm: track_mm },
             None => TrackSpacing::Distance(track_mm),
         },
         chord_error_mm: grinding.chord_error_um.mm(),
@@ -633,7 +633,7 @@ fn tilted(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions
         };
         Rotary {
             letter,
-            about,
+            axis: about,
             reversed: head.reversed,
             range_rad: head.range_deg.map(f64::to_radians),
             rate_rad_s: head.max_rate_deg_min.to_radians() / 60.0,
@@ -645,7 +645,7 @@ fn tilted(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions
         (Leaning::Constant, angle_rad) => Lean::Constant { angle_rad },
         (Leaning::Following, lead_rad) => Lean::Following { lead_rad },
     });
-    PathOptions { rotary, lean, ..plain }
+    PathOptions { rotary, tilt: lean, ..plain }
 }
 
 /// Returns the wheel of a recipe in the form that paths use. A cup is tilted by more than the slope of the part, unless
@@ -663,7 +663,7 @@ fn path_wheel(wheel: &Wheel, nominal: &Nominal) -> PathWheel {
             },
         },
         Wheel::Cup { radius_mm, minor_radius_mm, tilt_deg } => {
-            let sloped = || nominal.steepest_rad() + BEYOND_THE_SLOPE_RAD;
+            let sloped = || nominal.max_slope_rad() + BEYOND_THE_SLOPE_RAD;
             PathWheel::tilted_cup(radius_mm, minor_radius_mm, tilt_deg.map_or_else(sloped, f64::to_radians))
         }
     }

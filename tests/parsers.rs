@@ -300,9 +300,9 @@ fn small_run() -> [(&'static str, Vec<u8>); 2] {
 /// Returns the knowledge that a run has learned of a grinder, on a small grid.
 fn what_was_learned() -> Learned {
     let grid = Grid { columns: 5, rows: 4, first_mm: [-2.0, -1.5], spacing_mm: [1.0, 1.0] };
-    let correction = Correction::none(grid, 0.05);
-    let error = ErrorMap::known(grid, (0..grid.len()).map(|k| 1e-3 * k as f64).collect(), vec![true; grid.len()]);
+    let correction = Correction::zero(grid, 0.05);
+    let error = ErrorMap::exact(grid, (0..grid.len()).map(|k| 1e-3 * k as f64).collect(), vec![true; grid.len()]);
     let begin = LearningState::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
-    let known = begin.after(&Seen { correction: &correction, error: &error, answer: None, smooth: None });
-    Learned::new(true, "a part".into(), "run-1".into(), correction.changed(&known, None), known)
+    let known = begin.updated(&Seen { correction: &correction, error: &error, response: None, explained: None });
+    Learned::new(true, "a part".into(), "run-1".into(), correction.compensating(&known, None), known)
 }

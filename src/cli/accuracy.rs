@@ -122,12 +122,12 @@ impl Kind {
             border_pv_nm,
             border_rms_nm,
             border_max_nm,
-            worst_at_mm: estimate.worst.at.into(),
-            worst_error_nm: 1e6 * estimate.worst.error_mm,
-            worst_near_border: estimate.worst.near_border,
+            worst_at_mm: estimate.max_error.point.into(),
+            worst_error_nm: 1e6 * estimate.max_error.error_mm,
+            worst_near_border: estimate.max_error.near_border,
             order: estimate.order,
             observed_order: estimate.observed_order,
-            trust: match estimate.trust {
+            trust: match estimate.reliability {
                 Trust::Extrapolated => "extrapolated",
                 Trust::Rounding => "rounding",
                 Trust::TooCoarse => "too-coarse",

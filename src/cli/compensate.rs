@@ -159,5 +159,5 @@ fn ground(file: &std::path::Path, table: &Table) -> Result<Wanted, Failure> {
     let failed = |source| Failure::Path { path: file.to_owned(), source };
     let (field, _) = height_of(&surface).map_err(failed)?;
     let grid = Grid { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [1.0; 2] };
-    Wanted::new(field, &Correction::none(grid, 0.0), 1.0).map_err(failed)
+    Wanted::new(field, &Correction::zero(grid, 0.0), 1.0).map_err(failed)
 }

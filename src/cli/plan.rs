@@ -121,8 +121,8 @@ impl ArcsTold {
         Self {
             arcs: arcs.arcs,
             lines: arcs.lines,
-            moves_per_second: (arcs.arcs + arcs.lines) as f64 / summary.seconds,
-            lines_alone_per_second: summary.points as f64 / summary.seconds,
+            moves_per_second: (arcs.arcs + arcs.lines) as f64 / summary.duration_s,
+            lines_alone_per_second: summary.points as f64 / summary.duration_s,
             largest_deviation_um: 1e3 * arcs.deviation_mm,
             within_um: 1e3 * within_mm,
             largest_corner_mrad,
@@ -160,14 +160,14 @@ struct TiltTold {
 
 impl TiltTold {
     fn of(path: &ToolPath, summary: &Summary) -> Option<Self> {
-        let turned = summary.turned?;
+        let turned = summary.head_rotation?;
         let on_scale = |peak: Peak| turned.rotary.on_scale_rad(peak.value).to_degrees();
-        let [a, b] = [on_scale(turned.least_rad), on_scale(turned.most_rad)];
+        let [a, b] = [on_scale(turned.min_tilt_rad), on_scale(turned.max_tilt_rad)];
         Some(Self {
             axis: turned.rotary.letter,
             least_deg: a.min(b),
             most_deg: a.max(b),
-            largest_rate_deg_min: 60.0 * turned.rate_rad_s.value.to_degrees(),
+            largest_rate_deg_min: 60.0 * turned.max_rate_rad_s.value.to_degrees(),
             least_lean_deg: path.least_lean_rad().to_degrees(),
         })
     }

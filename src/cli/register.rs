@@ -112,7 +112,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let (nominal, measured) = read_inputs(arguments)?;
     let mut registration = register(&nominal, &measured.points, &options)
         .map_err(|e| Failure::of_registration(e, &arguments.nominal, &arguments.measured))?;
-    registration.verdict.warnings.extend(measured.notes.iter().map(ToString::to_string));
+    registration.quality.warnings.extend(measured.notes.iter().map(ToString::to_string));
     let nominal_file =
         NominalInput { file: &arguments.nominal, points: nominal.len(), kind: kind_in_words(nominal.kind()) };
     let document = RegistrationDocument::new(&registration, &options, nominal_file, &arguments.measured);
@@ -150,10 +150,10 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
     };
     Ok(Options {
         method,
-        distance: arguments.distance,
+        distance_model: arguments.distance,
         loss: arguments.loss,
         side: arguments.side,
-        locked: Coordinate::locked(&arguments.lock),
+        locked: Coordinate::locked_flags(&arguments.lock),
         start: match &arguments.initial {
             Some(path) => Start::Pose(read_pose(path)?),
             None if arguments.lock.is_empty() => Start::Search,
@@ -237,13 +237,13 @@ fn form_in_words(form: &Form) -> String {
         0.0 => String::new(),
         drift => format!(", of which the next point along the path has {} %", (100.0 * drift).round()),
     };
-    let lay = hyperparameters.field.lay.angle_rad().map_or(String::new(), |angle_rad| {
-        let (times, degrees) = (three_digits(hyperparameters.field.lay.stretch), angle_rad.to_degrees().round());
+    let lay = hyperparameters.field.anisotropy.angle_rad().map_or(String::new(), |angle_rad| {
+        let (times, degrees) = (three_digits(hyperparameters.field.anisotropy.stretch), angle_rad.to_degrees().round());
         format!(", {times} times as wide along {degrees} degrees from x as across")
     });
     let sigma = [0, 1, 2].map(|k| um(frame_covariance[(k, k)].sqrt())).join(", ");
     let areas = area_in_words(form);
-    let few = match form.is_of_few {
+    let few = match form.is_underdetermined {
         true => format!(
             "warning     {} degrees of freedom are too few to tell the form from the scatter, 20 do: the upper ends are those of a form that is all \
              of what was found; touch more points\n",
@@ -256,7 +256,7 @@ fn form_in_words(form: &Form) -> String {
          frame       known to {sigma} um along x, y, z beside that form\n",
         within(&figures.rms),
         within(&figures.pv),
-        within(&figures.pv_most_points),
+        within(&figures.pv_998),
         um(hyperparameters.field.sigma_mm),
         three_digits(hyperparameters.field.range_mm),
         um(hyperparameters.noise_sigma_mm),

@@ -202,11 +202,11 @@ impl SimulatedCell {
         let stands_mm = self.world.deviations_mm(&places);
         let level_mm = stands_mm.iter().sum::<f64>() / stands_mm.len().max(1) as f64;
         let points: Vec<_> = (task.targets.iter().zip(&stands_mm))
-            .map(|(target, mm)| task.fixture_cmm_from_model.point(&(target.point + *mm * target.normal)))
+            .map(|(target, mm)| task.fixture_cmm_from_model.transform_point(&(target.point + *mm * target.normal)))
             .collect();
         let failed = |source| Failure::of_registration(source, recipe.path(), recipe.path());
         let (found, _) = task.register(&points, level_mm).map_err(failed)?;
-        let [pv_um, rms_um] = [found.verdict.pv_mm, found.verdict.rms_mm].map(|mm| 1e3 * mm);
+        let [pv_um, rms_um] = [found.quality.pv_mm, found.quality.rms_mm].map(|mm| 1e3 * mm);
         let truth = serde_json::json!({ "pv_um": pv_um, "rms_um": rms_um });
         Ok(regrind::formats::write_json_atomic(path, &truth)?)
     }

@@ -107,7 +107,7 @@ impl Cycles {
         let of_this_cell = task.learned.as_ref().filter(|learned| learned.taught_by.is_none());
         let mut taught = of_this_cell.map(|learned| learned.fields).unwrap_or_default();
         for is_corrected in [false, true] {
-            let alike = |cycle: &&Cycle| cycle.is_judged() && cycle.correction.is_none() != is_corrected;
+            let alike = |cycle: &&Cycle| cycle.is_judged() && cycle.correction.is_zero() != is_corrected;
             if let Some(field) = self.0.values().filter(alike).filter_map(|cycle| cycle.field).next_back() {
                 taught.update(is_corrected, &field);
             }

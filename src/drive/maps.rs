@@ -92,16 +92,16 @@ pub(super) fn contacts(found: &Registration) -> Vec<Contact> {
 fn document(task: &Task, told: &Parameters) -> Value {
     let um = |mm: f64| 1e3 * mm;
     let parameter = |p: &Parameter| {
-        let units = p.kind.units();
+        let units = p.kind.display_units_per_unit();
         json!({
             "kind": p.kind, "unit": p.kind.unit(), "value": units * p.value, "expanded": 2.0 * units * p.sigma,
-            "own_share": p.own_share, "alike": p.alike, "offered": p.offered, "taken": units * p.taken, "beyond": p.beyond,
-            "removes_rms_um": um(p.removes_rms_mm), "words": p.message,
+            "own_share": p.own_share, "alike": p.inseparable_from, "offered": p.is_offered, "taken": units * p.compensated, "beyond": p.exceeds_tolerance,
+            "removes_rms_um": um(p.rms_reduction_mm), "words": p.message,
         })
     };
     json!({
-        "simulation": task.simulation, "rms_um": um(told.rms_mm), "rest_rms_um": um(told.rest_rms_mm),
-        "parameters": told.found.iter().map(parameter).collect::<Vec<_>>(),
+        "simulation": task.simulation, "rms_um": um(told.rms_mm), "rest_rms_um": um(told.residual_rms_mm),
+        "parameters": told.estimates.iter().map(parameter).collect::<Vec<_>>(),
     })
 }
 
@@ -110,11 +110,11 @@ pub(super) fn set(task: &Task, cycle: &Cycle, contacts: &[Contact], told: &Param
     let taken = task.parameters.as_ref()?;
     let before = cycle.correction.set.as_ref();
     let mut values = before.map_or([0.0; ParameterKind::COUNT], |set| set.values);
-    values.iter_mut().zip(&told.found).for_each(|(value, of)| *value += of.taken);
+    values.iter_mut().zip(&told.estimates).for_each(|(value, of)| *value += of.compensated);
     if before.is_some_and(|before| before.values == values) {
         return before.cloned();
     }
-    Set::of(values, cycle.correction.cycle + 1, [contacts, &taken.nodes], &task.parameter_options(before))
+    Set::from_values(values, cycle.correction.cycle + 1, [contacts, &taken.nodes], &task.parameter_options(before))
 }
 
 /// Returns a function that extracts, from values at the nodes of the correction, the part that parameters and slides
@@ -138,7 +138,7 @@ pub(super) fn save(
     map: &ErrorMap,
     found: &Registration,
 ) -> Result<(), Unfinished<String>> {
-    let ground_with = (!cycle.correction.is_none()).then(|| task.map_identity(&cycle.correction));
+    let ground_with = (!cycle.correction.is_zero()).then(|| task.map_identity(&cycle.correction));
     let origin = ErrorMapOrigin { part: task.part_identity, cycle: number, ground_with };
     let date = utc_to_the_second(SystemTime::now());
     write_error_map(&files.place("error_map.csv"), map, &origin, task.simulation)

@@ -212,7 +212,7 @@ impl Programs {
         map_identity: [u8; 32],
         path: &ToolPath,
     ) -> Result<(), ProgramError> {
-        if self.options.lean.is_some() {
+        if self.options.tilt.is_some() {
             return Err(PathError::TableOfTilted.into());
         }
         let none = Correction { values_mm: vec![0.0; correction.grid.len()], ..correction.clone() };
@@ -238,13 +238,13 @@ impl Programs {
             cycle: correction.cycle,
             base_identity: self.part_identity,
             map_identity,
-            uncorrected: correction.is_none(),
+            uncorrected: correction.is_zero(),
             level_mm: correction.level_mm,
             wheel: if self.options.from_below { self.wheel(correction).mirrored() } else { self.wheel(correction) }
                 .description(),
             from_below: self.options.from_below,
             rotary: self.options.leaning().copied(),
-            lean: lean_in_words(self.options.lean),
+            lean: lean_in_words(self.options.tilt),
             parameters: set_in_words(correction, self.options.wheel.reach_mm()),
             tracks: tracks_in_words(path),
             spark_out_passes: self.spark_out_passes,
@@ -269,7 +269,7 @@ pub(super) fn set_in_words(correction: &Correction, wheel_radius_mm: f64) -> Vec
     let Some(set) = &correction.set else { return Vec::new() };
     let taken = ParameterKind::ALL.into_iter().zip(set.values).filter(|(_, value)| *value != 0.0);
     let line = |(kind, value): (ParameterKind, f64)| {
-        let said = format!("{}: off by {:.3} {}", kind.name(), kind.units() * value, kind.unit());
+        let said = format!("{}: off by {:.3} {}", kind.name(), kind.display_units_per_unit() * value, kind.unit());
         let since = set.since_cycle;
         match kind {
             ParameterKind::WheelRadius => {
@@ -300,7 +300,7 @@ fn tracks_in_words(path: &ToolPath) -> String {
         (Pattern::Spiral, _) => "spiral inwards",
     };
     let scallop = match options.spacing {
-        TrackSpacing::Scallop { height_mm, .. } => format!(", ridges of {:.3} um at most", 1e3 * height_mm),
+        TrackSpacing::Scallop { max_height_mm: height_mm, .. } => format!(", ridges of {:.3} um at most", 1e3 * height_mm),
         TrackSpacing::Distance(_) => String::new(),
     };
     format!(

@@ -148,7 +148,7 @@ impl Adaptive {
             PvOf::MostPoints => (f64::INFINITY, pv_mm),
         };
         let correction_mm = Self::KNOWN * rms_mm.min(Self::RMS_OF_PV * pv_mm.min(pv_most_points_mm));
-        StoppingCriteria { pv_mm, pv_most_points_mm, rms_mm, correction_mm, may_grind }
+        StoppingCriteria { pv_mm, pv_998_mm: pv_most_points_mm, rms_mm, correction_sigma_mm: correction_mm, may_grind }
     }
 }
 
@@ -373,7 +373,7 @@ impl Task {
 
     fn uncorrected(&self) -> Correction {
         let grid = correction_grid([self.pass.x_mm, self.pass.y_mm], self.map.spacing_mm);
-        Correction::none(grid, self.limits.allowance_mm)
+        Correction::zero(grid, self.limits.allowance_mm)
     }
 
     /// Returns the estimated disk space of a cycle, including the journal.
@@ -442,7 +442,7 @@ impl Task {
         let method = if probe_radius_mm == 0.0 { Method::Contact } else { self.registration.method };
         let options = Options { probe_radius_mm, method, start, ..self.registration };
         let found = register(&self.nominal, points, &options)?;
-        if start_at_fixture || !found.verdict.weak_directions.iter().any(|weak| weak.held) {
+        if start_at_fixture || !found.quality.weak_directions.iter().any(|weak| weak.held) {
             return Ok((found, options));
         }
         let options = Options { start: at_fixture, ..options };
@@ -462,7 +462,7 @@ impl Task {
     pub fn parameter_options(&self, told: Option<&Set>) -> ParameterOptions {
         ParameterOptions {
             free_motions: self.registration.locked.map(|locked| !locked),
-            datum: self.datum,
+            locked_sigmas: self.datum,
             tolerances: self.parameters.as_ref().map_or([None; ParameterKind::COUNT], |taken| taken.tolerances),
             wheel_term: self.parameters.as_ref().map_or(WheelTerm::default(), |taken| taken.wheel_term),
             ..ParameterOptions::new(self.wheel_radius_mm(told))
@@ -532,8 +532,8 @@ impl Task {
         let sphere = sphere.flat_map(|s| sphere_targets(s.centre, s.radius_mm, s.points));
         let sphere = sphere.map(|t| (TargetKind::ReferenceSphere, t.point, t.normal));
         let on_part = |t: &measuring::Target| {
-            let point = cmm_from_model.point(&(t.point + level_mm * t.normal));
-            (TargetKind::Part, point, cmm_from_model.direction(&t.normal))
+            let point = cmm_from_model.transform_point(&(t.point + level_mm * t.normal));
+            (TargetKind::Part, point, cmm_from_model.transform_direction(&t.normal))
         };
         let begin = first.iter().map(|t| on_part(t));
         let rest = rest.iter().map(|t| on_part(t));
@@ -600,10 +600,10 @@ const CAREFUL_SHARE: f64 = 0.2;
 
 /// Returns the points used in a registration.
 pub(super) fn used(found: &Registration) -> impl Iterator<Item = &Deviation> {
-    found.deviations.iter().filter(|d| d.status == PointStatus::Used)
+    found.deviations.iter().filter(|d| d.status == PointStatus::Inlier)
 }
 
 /// Returns their deviations at x and y of the model frame.
 pub(super) fn readings(found: &Registration) -> Vec<Sample> {
-    used(found).map(|d| Sample { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect()
+    used(found).map(|d| Sample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect()
 }

@@ -44,7 +44,7 @@ pub(super) fn look(
     }
     let so_far = PartialMeasurement { targets: &places, tried: &tried, touched: &points.of };
     let purpose = adaptive.purpose(u32::from(cycle.correction.cycle) < adaptive.max_cycles);
-    let given = ModelInputs { look_risk: adaptive.look_risk(), probability: adaptive.tolerance.probability, ..given };
+    let given = ModelInputs { decision_risk: adaptive.look_risk(), acceptance_probability: adaptive.tolerance.probability, ..given };
     match model::decide(found, &given, &so_far, &purpose, u64::from(number)) {
         Ok(look) => {
             let next = (!look.next.is_empty()).then(|| (look.next, in_words(look.reason)));
@@ -76,7 +76,7 @@ pub(super) fn again(task: &Task, found: &Registration, points: &Points, noise_si
     const SHARE: f64 = 0.4;
     /// Cosine of the angle between two directions, above which a neighbour is in the same direction as another one.
     const SAME_WAY: f64 = 0.7;
-    let alone: Vec<usize> = found.left_out().map(|(k, _)| k).collect();
+    let alone: Vec<usize> = found.outliers().map(|(k, _)| k).collect();
     if task.targets.is_empty() || alone.is_empty() || alone.len() > MOST || points.rounds + 2 >= BatchId::MAX_BATCHES {
         return None;
     }
@@ -86,7 +86,7 @@ pub(super) fn again(task: &Task, found: &Registration, points: &Points, noise_si
     let mut targets: Vec<Target> = Vec::new();
     let mut around: Vec<Target> = Vec::new();
     let used: Vec<usize> =
-        (0..found.deviations.len()).filter(|&k| found.deviations[k].status == PointStatus::Used).collect();
+        (0..found.deviations.len()).filter(|&k| found.deviations[k].status == PointStatus::Inlier).collect();
     let places: Vec<_> = used.iter().map(|&k| (foot(&found.deviations[k]), found.deviations[k].normal)).collect();
     let controls = farthest_points(&places, CONTROLS);
     for &k in &alone {
@@ -94,7 +94,7 @@ pub(super) fn again(task: &Task, found: &Registration, points: &Points, noise_si
         let at = foot(lone);
         targets.push(Target { point: at, normal: lone.normal });
         let mut near: Vec<(&Deviation, Vector)> = on_part.iter().map(|d| (*d, foot(d) - at)).collect();
-        near.retain(|(d, way)| way.norm() > 0.0 && d.status == PointStatus::Used);
+        near.retain(|(d, way)| way.norm() > 0.0 && d.status == PointStatus::Inlier);
         near.sort_by(|a, b| a.1.norm_squared().total_cmp(&b.1.norm_squared()));
         let mut ways: Vec<Vector> = Vec::new();
         for (neighbour, way) in near {
@@ -108,7 +108,7 @@ pub(super) fn again(task: &Task, found: &Registration, points: &Points, noise_si
     }
     targets.extend(controls.iter().map(|&k| Target { point: places[k].0, normal: places[k].1 }));
     targets.append(&mut around);
-    let direction = |k: usize| found.cmm_from_model.direction(&places[k].1);
+    let direction = |k: usize| found.cmm_from_model.transform_direction(&places[k].1);
     let controls = controls.iter().map(|&k| ControlPoint { point: used[k], normal: direction(k) }).collect();
     let max_control_change_mm = (CONTROL_SIGMAS * 2f64.sqrt() * noise_sigma_mm).max(MIN_CHANGE_MM);
     Some(Again { points: alone, controls, max_control_change_mm, targets })
@@ -118,7 +118,7 @@ pub(super) fn again(task: &Task, found: &Registration, points: &Points, noise_si
 fn on_nominal(task: &Task, near: &Target) -> Target {
     match OffsetSurface::new(&task.nominal, 0.0, Side::Normal) {
         Ok(surface) => {
-            let foot = surface.foot(&near.point, Place::UNKNOWN);
+            let foot = surface.project(&near.point, Place::UNKNOWN);
             Target { point: near.point - foot.normal * foot.distance_mm, normal: near.normal }
         }
         Err(_) => *near,
@@ -127,24 +127,24 @@ fn on_nominal(task: &Task, near: &Target) -> Target {
 
 fn in_words(why: Reason) -> &'static str {
     match why {
-        Reason::Within => "the part is in tolerance",
-        Reason::Known => "the form is known well enough for a correction",
-        Reason::Enough => "another pass improves more than further touches",
-        Reason::All => "every target was touched",
-        Reason::Few => "too few touches for a decision",
-        Reason::Surprised => "the last touches deviate from the prediction",
-        Reason::Around => "a touch is an outlier, and its surroundings are unknown",
-        Reason::Feature => "the part has a narrow feature, so every target is touched",
+        Reason::WithinLimits => "the part is in tolerance",
+        Reason::FormKnown => "the form is known well enough for a correction",
+        Reason::CorrectionPreferred => "another pass improves more than further touches",
+        Reason::AllTargetsTried => "every target was touched",
+        Reason::TooFewTouches => "too few touches for a decision",
+        Reason::LargeInnovations => "the last touches deviate from the prediction",
+        Reason::UnconfirmedOutlier => "a touch is an outlier, and its surroundings are unknown",
+        Reason::NarrowFeature => "the part has a narrow feature, so every target is touched",
         Reason::Undecided => "it is undecided whether the part is in tolerance",
-        Reason::Unknown => "the form is not known well enough for a correction",
-        Reason::Beyond => "the part is out of tolerance, and no pass is left",
-        Reason::Late => "the limit of batches is reached, so all other targets are touched",
+        Reason::FormUnknown => "the form is not known well enough for a correction",
+        Reason::BeyondLimit => "the part is out of tolerance, and no pass is left",
+        Reason::MaxBatchesReached => "the limit of batches is reached, so all other targets are touched",
     }
 }
 
 /// Interpolates the form on the grid of the error map.
 pub(super) fn map(task: &Task, form: &Form) -> Option<ErrorMap> {
-    let of = |p: &model::FormPoint| (Sample { at_mm: p.at_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
+    let of = |p: &model::FormPoint| (Sample { place_mm: p.place_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
     let told: Vec<_> = form.points.iter().map(of).collect();
     told_map(&told, &task.map, form.hyperparameters.noise_sigma_mm).ok()
 }

@@ -367,7 +367,7 @@ fn registered(
     let (ball_mm, part, scale_sigma) = match grown {
         Some((expansion, told_c)) => {
             let part = Cow::Owned(expansion.at_reference(&points.part, told_c));
-            (ball_mm / expansion.measured(told_c), part, expansion.sigma(told_c))
+            (ball_mm / expansion.length_factor(told_c), part, expansion.length_factor_sigma(told_c))
         }
         None => (ball_mm, Cow::Borrowed(&points.part), 0.0),
     };
@@ -375,17 +375,17 @@ fn registered(
     // The first few touches show only if the right part is in the right place. A search on them would be a guess.
     let at_fixture = task.start_at_fixture || points.tried.len() == 1;
     let (mut found, options) = task.register_from(&part, probe_radius_mm, at_fixture).map_err(unfinished)?;
-    if let Some(why) = found.no_verdict() {
+    if let Some(why) = found.unjudgeable_reason() {
         return Err(Unfinished::For(why));
     }
-    found.allow_for_radius(points.radius_sigma_mm.hypot(task.machine.reference_sphere_mm));
+    found.add_radius_uncertainty(points.radius_sigma_mm.hypot(task.machine.reference_sphere_mm));
     let given = ModelInputs {
         machine: task.machine,
-        priors: priors(task, cycle, before),
+        prior: priors(task, cycle, before),
         radius_sigma_mm: points.radius_sigma_mm,
         scale_sigma,
-        datum: task.held(),
-        is_corrected: !cycle.correction.is_none(),
+        locked_sigmas: task.held(),
+        is_corrected: !cycle.correction.is_zero(),
         probe_noise_mm: points.probe_scatter_mm,
         area: maps::area(task),
         ..ModelInputs::default()
@@ -451,7 +451,7 @@ fn registered(
     let next = next.map(|(next, _)| next);
     // Without a model, the residuals of the fit bound the noise from above.
     let noise_sigma_mm =
-        form.as_ref().map_or(found.verdict.residual_sigma_mm, |form| form.hyperparameters.noise_sigma_mm);
+        form.as_ref().map_or(found.quality.residual_sigma_mm, |form| form.hyperparameters.noise_sigma_mm);
     let again = if looked_at { None } else { touches::again(task, &found, points, noise_sigma_mm) };
     if let Some(left_out) = figures.left_out.as_mut() {
         left_out.again = again.is_some();
@@ -469,15 +469,15 @@ fn registered(
 
 /// Returns the messages for the offered parameters.
 fn offered(told: &compensation::Parameters) -> impl Iterator<Item = String> {
-    told.found.iter().filter(|p| p.offered).map(|p| p.message.clone())
+    told.estimates.iter().filter(|p| p.is_offered).map(|p| p.message.clone())
 }
 
 /// Returns the prior for the error field of a cycle: from earlier parts for passes of its kind, or else from the
 /// previous pass of this run if it is of the same kind.
 fn priors(task: &Task, cycle: &Cycle, before: Option<&Cycle>) -> Option<Prior> {
-    let is_corrected = !cycle.correction.is_none();
+    let is_corrected = !cycle.correction.is_zero();
     let taught = task.learned.as_ref().and_then(|learned| learned.fields.fit(is_corrected));
-    let alike = before.filter(|before| before.correction.is_none() != is_corrected);
+    let alike = before.filter(|before| before.correction.is_zero() != is_corrected);
     let of_this_part = || Some(PartFit::updated(None, &alike?.field?));
     taught.or_else(of_this_part).map(|lesson| lesson.priors())
 }
@@ -493,7 +493,7 @@ fn learned_from(
     let earlier = before.and_then(|before| before.known.as_deref().cloned()).unwrap_or_else(|| task.beginning());
     let smoother = maps::smoother(task, cycle, contacts);
     let smooth = smoother.as_ref().map(|smoother| smoother as compensation::Smoother<'_>);
-    earlier.after(&Seen { correction: &cycle.correction, error, answer, smooth })
+    earlier.updated(&Seen { correction: &cycle.correction, error, response: answer, explained: smooth })
 }
 
 fn save(task: &Task, files: &mut Files, found: &Registration, options: &Options) -> Result<(), FormatError> {
@@ -519,7 +519,7 @@ fn figures(
     answer: Option<compensation::Response>,
     forecast: Option<compensation::Forecast>,
 ) -> Figures {
-    let verdict = &found.verdict;
+    let verdict = &found.quality;
     let moved = task.fixture_cmm_from_model.inverse() * found.cmm_from_model;
     let outliers = found.deviations.iter().filter(|d| d.status == Fate::Outlier).count() as u32;
     // The filter removes the noise of a point: noise of the probe and the finest texture.
@@ -551,11 +551,11 @@ fn figures(
         pv_expanded_mm,
         rms_expanded_mm: by_points.rms.expanded_mm(),
         coverage: verdict.coverage,
-        points: verdict.used as u32,
+        points: verdict.inliers as u32,
         outliers,
         left_out: found
-            .with_left_out()
-            .map(|of| Box::new(LeftOut { pv_mm: of.pv_mm, rms_mm: of.rms_mm, places: of.places, again: false })),
+            .figures_with_outliers()
+            .map(|of| Box::new(LeftOut { pv_mm: of.pv_mm, rms_mm: of.rms_mm, places: of.description, again: false })),
         shift_mm: moved.translation_mm.norm(),
         turn_rad: moved.angle_rad(),
         weak_directions: verdict.weak_directions.iter().map(|w| w.words.clone()).collect(),
@@ -603,14 +603,14 @@ fn form_figures(of: &model::FormFigures, scatter_mm: f64) -> FormFigures {
         let model::Interval { median_mm, low_mm, high_mm, quantiles_mm, .. } = of;
         Interval { median_mm, low_mm, high_mm, quantiles_mm: Some(quantiles_mm) }
     };
-    FormFigures { pv: interval(of.pv), pv_robust: interval(of.pv_most_points), rms: interval(of.rms), scatter_mm }
+    FormFigures { pv: interval(of.pv), pv_robust: interval(of.pv_998), rms: interval(of.rms), scatter_mm }
 }
 
 /// Returns the root mean square without the noise s of n points, of which the registration used p degrees of freedom:
 /// F^2 = RMS^2 - s^2 (1 - p/n). Its uncertainty is u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n; k = 2.
 fn rms_without(scatter_mm: f64, verdict: &Verdict) -> Interval {
     const MOTIONS: f64 = 6.0;
-    let n = (verdict.used as f64).max(MOTIONS + 1.0);
+    let n = (verdict.inliers as f64).max(MOTIONS + 1.0);
     let scatter2 = scatter_mm * scatter_mm;
     let form2 = (verdict.rms_mm.powi(2) - scatter2 * (1.0 - MOTIONS / n)).max(0.0);
     let expanded2 = 2.0 * ((4.0 * form2 * scatter2 + 2.0 * scatter2 * scatter2) / n).sqrt();
@@ -658,7 +658,7 @@ fn compensated(
     let found =
         cycle.registration.as_ref().ok_or_else(|| failed(&"the measurement of this cycle is not registered"))?;
     // If the part may slide within its own surface, the place of the map on the part is unknown.
-    let covariance = cycle.form.as_ref().map_or(&found.verdict.covariance, |form| &form.frame_covariance);
+    let covariance = cycle.form.as_ref().map_or(&found.quality.covariance, |form| &form.frame_covariance);
     if let Some(why) = weak_for_compensation(found, covariance, &task.place) {
         return Err(Unfinished::For(CompensationRefusal::WeakDirections(vec![why])));
     }
@@ -671,7 +671,7 @@ fn compensated(
         None => Arc::new(learned_from(task, cycle, None, &map, (None, &maps::contacts(found)))),
     };
     let step =
-        cycle.correction.next(&map, &known, cycle.set.as_deref(), &task.limits).map_err(|error| match error {
+        cycle.correction.next_pass(&map, &known, cycle.set.as_deref(), &task.limits).map_err(|error| match error {
             NextPassError::BudgetSpent { .. } => Unfinished::For(CompensationRefusal::BudgetSpent(error.to_string())),
             error => failed(&error),
         })?;
@@ -686,7 +686,7 @@ fn compensated(
     })?;
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let told = cycle.figures.as_ref().and_then(|figures| figures.form);
-    let [pv_mm, rms_mm, scatter_mm] = told.map_or([found.verdict.pv_mm, found.verdict.rms_mm, 0.0], |form| {
+    let [pv_mm, rms_mm, scatter_mm] = told.map_or([found.quality.pv_mm, found.quality.rms_mm, 0.0], |form| {
         [form.pv_robust.median_mm, form.rms.median_mm, form.scatter_mm]
     });
     let expected_mm = without(scatter_mm, known.forecast(&map, task.scallops_rms_mm()).rms_mm);
@@ -710,18 +710,18 @@ fn compensated(
 /// change.
 pub(super) fn parameters_told(task: &Task, cycle: &Cycle) -> Vec<ParameterTold> {
     let Some(taken) = &task.parameters else { return Vec::new() };
-    let told = cycle.parameters.iter().flat_map(|told| told.found.iter().enumerate());
-    let wanted = told.filter(|(k, p)| taken.tolerances[*k].is_some() && p.alike.is_empty());
+    let told = cycle.parameters.iter().flat_map(|told| told.estimates.iter().enumerate());
+    let wanted = told.filter(|(k, p)| taken.tolerances[*k].is_some() && p.inseparable_from.is_empty());
     let told = |(k, p): (usize, &compensation::Parameter)| {
-        let units = p.kind.units();
+        let units = p.kind.display_units_per_unit();
         ParameterTold {
             name: p.kind.name().to_owned(),
             unit: p.kind.unit().to_owned(),
             off: units * p.value,
             expanded: 2.0 * units * p.sigma,
-            taken: units * p.taken,
+            taken: units * p.compensated,
             told: units * cycle.set.as_ref().map_or(0.0, |set| set.values[k]),
-            removes_rms_um: 1e3 * p.removes_rms_mm,
+            removes_rms_um: 1e3 * p.rms_reduction_mm,
         }
     };
     wanted.map(told).collect()
@@ -733,16 +733,16 @@ fn rms(values: &[f64]) -> f64 {
 
 /// Returns the questions to a person before the next pass: parameters with an error beyond the tolerance of the recipe.
 fn asks(cycle: &Cycle) -> Vec<String> {
-    let beyond = cycle.parameters.iter().flat_map(|told| &told.found).filter(|p| p.beyond);
+    let beyond = cycle.parameters.iter().flat_map(|told| &told.estimates).filter(|p| p.exceeds_tolerance);
     let question = |p: &compensation::Parameter| {
-        let (units, unit) = (p.kind.units(), p.kind.unit());
-        let key = p.kind.key().unwrap_or_default();
+        let (units, unit) = (p.kind.display_units_per_unit(), p.kind.unit());
+        let key = p.kind.recipe_key().unwrap_or_default();
         format!(
             "{}: error {:.2} \u{b1} {:.2} {unit}; its compensation of {:.2} {unit} exceeds compensation.parameters.{key}",
             p.kind.name(),
             units * p.value,
             2.0 * units * p.sigma,
-            units * p.taken
+            units * p.compensated
         )
     };
     beyond.map(question).collect()
@@ -757,7 +757,7 @@ pub(super) fn learned(task: &Task, run: String, (cycle, fields): (&Cycle, PartPr
         return None;
     }
     let (setting, simulation) = (task.setting.clone(), task.simulation);
-    let correction = cycle.correction.changed(known, cycle.set.as_deref());
+    let correction = cycle.correction.compensating(known, cycle.set.as_deref());
     Some(
         Learned::new(simulation, setting, run, correction, known.clone())
             .with_fields(fields)

@@ -124,7 +124,7 @@ impl<'a> RegistrationDocument<'a> {
         nominal: NominalInput<'a>,
         measured_file: &'a Path,
     ) -> Self {
-        let verdict = &registration.verdict;
+        let verdict = &registration.quality;
         let covariance: [[f64; 6]; 6] = std::array::from_fn(|i| std::array::from_fn(|j| verdict.covariance[(i, j)]));
         let [x_mm, y_mm, z_mm, rx_rad, ry_rad, rz_rad] = std::array::from_fn(|k| covariance[k][k].max(0.0).sqrt());
         let with = |status| {
@@ -140,7 +140,7 @@ impl<'a> RegistrationDocument<'a> {
             nominal,
             measured: MeasuredInput { file: measured_file },
             method: options.method,
-            distance: options.distance,
+            distance: options.distance_model,
             loss: options.loss,
             probe_radius_mm: (options.probe_radius_mm > 0.0).then_some(options.probe_radius_mm),
             locked: names.into_iter().zip(options.locked).filter(|(_, locked)| *locked).map(|(name, _)| name).collect(),
@@ -155,7 +155,7 @@ impl<'a> RegistrationDocument<'a> {
             iterations: verdict.iterations,
             objective_mm2: registration.trace.iter().filter(|i| i.taken).map(|i| i.objective_mm2).collect(),
             points: registration.deviations.len(),
-            used: verdict.used,
+            used: verdict.inliers,
             rms_mm: verdict.rms_mm,
             pv_mm: verdict.pv_mm,
             residual_sigma_mm: verdict.residual_sigma_mm,
@@ -164,8 +164,8 @@ impl<'a> RegistrationDocument<'a> {
             outliers: with(PointStatus::Outlier),
             off_part: with(PointStatus::OffPart),
             left_out: registration.deviations.iter().enumerate().filter_map(left_out).collect(),
-            rms_with_left_out_mm: registration.with_left_out().map(|with| with.rms_mm),
-            pv_with_left_out_mm: registration.with_left_out().map(|with| with.pv_mm),
+            rms_with_left_out_mm: registration.figures_with_outliers().map(|with| with.rms_mm),
+            pv_with_left_out_mm: registration.figures_with_outliers().map(|with| with.pv_mm),
             trace: &registration.trace,
         }
     }
@@ -232,6 +232,6 @@ fn row(deviation: &Deviation) -> DeviationRow {
         point_mm: deviation.point.into(),
         normal: deviation.normal.into(),
         deviation_mm: deviation.deviation_mm,
-        used: deviation.status == PointStatus::Used,
+        used: deviation.status == PointStatus::Inlier,
     }
 }

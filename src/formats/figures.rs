@@ -100,7 +100,7 @@ pub fn write_figures(
         Some(_) => {}
     }
     let wavelength_nm = found.map_or(FormOptions::default().wavelength_nm, |found| found.iso_10110.wavelength_nm);
-    let removed = taken_out.removed(found.map_or(&[], |f| &f.removed));
+    let removed = taken_out.describe(found.map_or(&[], |f| &f.removed));
     let document = FiguresDocument {
         simulation,
         frame: "model",
@@ -127,7 +127,7 @@ fn series(fit: &Fit) -> SeriesDocument {
     };
     let pairs = fit.coefficients_mm.iter().zip(&fit.orthogonal_mm).enumerate();
     let term = |(k, (coefficient, orthogonal)): (usize, (&f64, &f64))| TermDocument {
-        term: fit.basis.term(k),
+        term: fit.basis.term_name(k),
         coefficient_nm: 1e6 * coefficient,
         orthogonal_nm: 1e6 * orthogonal,
     };

@@ -73,20 +73,20 @@ pub fn save_form(
         form_sigma_mm: form.hyperparameters.field.sigma_mm,
         form_range_mm: form.hyperparameters.field.range_mm,
         form_smoothness: form.hyperparameters.field.smoothness.name(),
-        form_lay_stretch: form.hyperparameters.field.lay.stretch,
-        form_lay_deg: form.hyperparameters.field.lay.angle_rad().map(f64::to_degrees),
+        form_lay_stretch: form.hyperparameters.field.anisotropy.stretch,
+        form_lay_deg: form.hyperparameters.field.anisotropy.angle_rad().map(f64::to_degrees),
         scatter_mm: form.hyperparameters.noise_sigma_mm,
         scatter_drift: form.hyperparameters.noise_autocorrelation,
-        form_is_seen: form.is_seen,
+        form_is_seen: form.is_detected,
         degrees_of_freedom: form.degrees_of_freedom,
         rms: form.figures.rms,
         pv: form.figures.pv,
-        pv_99_8: form.figures.pv_most_points,
+        pv_99_8: form.figures.pv_998,
         budget: &form.budget,
         slope: form.slope,
         iso_10110_5: form.iso,
-        raw_rms_mm: registration.verdict.rms_mm,
-        raw_pv_mm: registration.verdict.pv_mm,
+        raw_rms_mm: registration.quality.rms_mm,
+        raw_pv_mm: registration.quality.pv_mm,
         frame_standard_uncertainty: StandardUncertainty {
             x_mm: sigma(0),
             y_mm: sigma(1),
@@ -98,7 +98,7 @@ pub fn save_form(
         frame_covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
     };
     write_json_atomic(folder.join("model.json"), &document)?;
-    let row = |of: &FormPoint| [of.at_mm[0], of.at_mm[1], of.form.mean_mm, of.form.sigma_mm];
+    let row = |of: &FormPoint| [of.place_mm[0], of.place_mm[1], of.form.mean_mm, of.form.sigma_mm];
     let rows: Vec<[f64; 4]> = form.points.iter().map(row).collect();
     write_rows(&folder.join("form.csv"), FORM_HEADER, &rows, |row| (*row, None))
 }

@@ -104,11 +104,11 @@ impl Learned {
         (fresh, none): (&LearningState, Correction),
     ) -> Option<Self> {
         let known: Vec<&LearningState> = others.iter().map(|(_, other)| &other.known).collect();
-        let Shared { known, differ } = fresh.begun_with(&known, alike, none.grid)?;
+        let Shared { state: known, own_shares: differ } = fresh.begun_with(&known, alike, none.grid)?;
         let runs: Vec<CellRun> = others.iter().map(|(from, _)| from.clone()).collect();
         let fields: Vec<PartPriors> = others.iter().map(|(_, other)| other.fields).collect();
         let named: Vec<String> = runs.iter().map(|CellRun { cell, run }| format!("{run} of {cell}")).collect();
-        let correction = none.changed(&known, None);
+        let correction = none.compensating(&known, None);
         let taught_by = Some(TaughtBy { runs, differ, comparisons: alike.comparisons() });
         let learned = Self::new(simulation, setting, named.join(" and "), correction, known);
         Some(Self { taught_by, ..learned.with_fields(PartPriors::pooled(&fields)) })
@@ -186,7 +186,7 @@ impl Learned {
     /// Returns the first impossible value, in words.
     fn flaw(&self) -> Option<String> {
         let Correction { grid, values_mm, level_mm, .. } = &self.correction;
-        if !grid.is_sound() || values_mm.len() != grid.len() {
+        if !grid.is_valid() || values_mm.len() != grid.len() {
             let [dx, dy] = grid.spacing_mm;
             let found = format!(
                 "{} values for a grid of {} x {} nodes, {dx} x {dy} mm apart",
@@ -199,13 +199,13 @@ impl Learned {
         if !values_mm.iter().all(|v| v.is_finite()) || !level_mm.is_finite() {
             return Some("a number of its correction is not finite".into());
         }
-        if self.correction.set.as_ref().is_some_and(|set| !set.is_sound(grid.len())) {
+        if self.correction.set.as_ref().is_some_and(|set| !set.is_valid(grid.len())) {
             return Some("a parameter of its correction is impossible, or belongs to another grid".into());
         }
         if !self.fields.is_valid() {
             return Some("a hyperparameter of its error fields is impossible".into());
         }
-        (!self.known.is_sound()).then(|| "a number of its knowledge of the grinder is impossible".into())
+        (!self.known.is_valid()).then(|| "a number of its knowledge of the grinder is impossible".into())
     }
 
     /// Returns the correction of the first pass of another part: the error that repeated in every pass of this one, on
@@ -233,12 +233,12 @@ mod tests {
     const GRID: Grid = Grid { columns: 5, rows: 4, first_mm: [-2.0, -1.5], spacing_mm: [1.0, 1.0] };
 
     fn learned() -> Learned {
-        let correction = Correction::none(GRID, 0.05);
+        let correction = Correction::zero(GRID, 0.05);
         let values = (0..GRID.len()).map(|k| 1e-3 * k as f64).collect();
-        let error = ErrorMap::known(GRID, values, vec![true; GRID.len()]);
+        let error = ErrorMap::exact(GRID, values, vec![true; GRID.len()]);
         let begin = LearningState::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
-        let known = begin.after(&Seen { correction: &correction, error: &error, answer: None, smooth: None });
-        Learned::new(true, "a part".into(), "run-1".into(), correction.changed(&known, None), known)
+        let known = begin.updated(&Seen { correction: &correction, error: &error, response: None, explained: None });
+        Learned::new(true, "a part".into(), "run-1".into(), correction.compensating(&known, None), known)
     }
 
     fn read(text: &str) -> Result<Option<(Learned, Vec<u8>)>, LearnedError> {
@@ -261,7 +261,7 @@ mod tests {
         // Another grid of the same part: values between the nodes are interpolated, and the level is that of the new
         // part.
         let finer = Grid { columns: 9, rows: 7, spacing_mm: [0.5, 0.5], ..GRID };
-        let first = back.first_correction(Correction::none(finer, 0.06));
+        let first = back.first_correction(Correction::zero(finer, 0.06));
         assert_eq!((first.level_mm, first.cycle, first.values_mm.len()), (0.06, 1, 63));
         assert_eq!(first.values_mm[2], back.correction.values_mm[1]);
     }
@@ -279,7 +279,7 @@ mod tests {
         };
         let others = [of("cell-1"), of("cell-3")];
         let fresh = LearningState::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
-        let none = Correction::none(GRID, 0.05);
+        let none = Correction::zero(GRID, 0.05);
         let begun = Learned::from_others(&others, &alike, (true, "mine".into()), (&fresh, none.clone())).unwrap();
         assert_eq!(begun.run, "run-cell-1 of cell-1 and run-cell-3 of cell-3");
         let told = begun.taught_by.as_ref().unwrap();

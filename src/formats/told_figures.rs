@@ -38,7 +38,7 @@ const RMS_VARYING: &str = "of the part of that which is not symmetric about the 
 /// Returns the figures of a form, in the order of a report: in micrometres, those of ISO 10110-5 in nanometres, slopes
 /// in microradians.
 pub(super) fn told(form: &Form, raw: Option<&Figures>, slope: Option<&Slope>, taken_out: &TakenOut) -> Vec<Told> {
-    let removed = taken_out.removed(raw.map_or(&[], |raw| &raw.removed));
+    let removed = taken_out.describe(raw.map_or(&[], |raw| &raw.removed));
     let row = |name, [median, low, high]: [f64; 3], raw, unit, made: &str| Told {
         name,
         median,
@@ -56,7 +56,7 @@ pub(super) fn told(form: &Form, raw: Option<&Figures>, slope: Option<&Slope>, ta
     let most = "of the form over the aperture, without the outermost 0.1 % between the points at either end";
     let mut rows = vec![
         um("PV", figures.pv, raw.map(|raw| raw.pv_mm), POINTS),
-        um("PV 99.8 %", figures.pv_most_points, raw.map(|raw| raw.pv998_mm), most),
+        um("PV 99.8 %", figures.pv_998, raw.map(|raw| raw.pv_998_mm), most),
         um("RMS", figures.rms, raw.map(|raw| raw.rms_mm), POINTS),
     ];
     if let Some(of) = form.slope {

@@ -297,7 +297,7 @@ fn registration(written: &RegistrationSettings, document: &mut Document) {
             "write `start = \"fixture\"`, or lock no direction",
         );
     }
-    if Coordinate::locked(&written.lock) == [true; 6] {
+    if Coordinate::locked_flags(&written.lock) == [true; 6] {
         document.report("registration.lock", "locks all six directions", "at least one must be free", "remove one");
     }
 }
@@ -400,7 +400,7 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
         );
     }
     let registration = &written.registration;
-    let held = Coordinate::locked(&registration.lock);
+    let held = Coordinate::locked_flags(&registration.lock);
     let names = [
         ("wheel_x_um", "x"),
         ("wheel_y_um", "y"),

@@ -202,13 +202,13 @@ impl Recipe {
     pub fn registration_options(&self, fixture_cmm_from_model: Pose) -> registration::Options {
         let settings = &self.registration;
         registration::Options {
-            distance: settings.distance,
+            distance_model: settings.distance,
             start: match settings.start {
                 StartAt::Search => Start::Search,
                 StartAt::Fixture => Start::Pose(fixture_cmm_from_model),
             },
             side: self.measure.side,
-            locked: Coordinate::locked(&settings.lock),
+            locked: Coordinate::locked_flags(&settings.lock),
             loss: settings.loss,
             outlier_sigmas: settings.outlier_sigmas,
             rms_limit_mm: settings.max_rms_um.map(Um::mm),

@@ -86,7 +86,7 @@ impl HeatMap {
     /// # Errors
     /// Fails as [`HeatMap::new`] does.
     pub fn of_deviations(title: &str, deviations: &[Deviation]) -> Result<Self, ReportError> {
-        let used = deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let used = deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         let samples: Vec<[f64; 3]> = used.map(|d| [d.point.x, d.point.y, d.deviation_mm]).collect();
         Self::of_lengths(title, "deviation", &samples)
     }

@@ -221,7 +221,7 @@ fn the_telescope_holds_what_it_cannot_see() {
     // opt_global -> mirror frame is p' = Rx (p - s), Rx = [[1, 0, 0], [0, c, -s], [0, s, c]] with tan = 1/2.
     let (sine, cosine) = (0.5f64.atan().sin(), 0.5f64.atan().cos());
     let p = Point::new(2401.0905, -2698.6984, 4819.4921);
-    let back = cell.cmm.fixture_cmm_from_model.inverse().point(&p);
+    let back = cell.cmm.fixture_cmm_from_model.inverse().transform_point(&p);
     let (y, z) = (p.y, p.z - 3600.0);
     assert!((back - Point::new(p.x, cosine * y - sine * z, sine * y + cosine * z)).norm() < 1e-9);
     let Wire::FileExchange(files) = &cell.cmm.link.wire else { panic!("files") };

@@ -314,7 +314,7 @@ fn our_x3p_opens_in_another_reader_with_equal_values() {
     let grid = Grid { columns: 31, rows: 17, first_mm: [-51.0, -31.0], spacing_mm: [3.4, 3.875] };
     let values_mm: Vec<f64> = (0..grid.len()).map(|k| 1e-3 * (0.37 * k as f64).sin() + 1e-9 * k as f64).collect();
     let valid: Vec<bool> = (0..grid.len()).map(|k| k % 7 != 3).collect();
-    let map = ErrorMap::known(grid, values_mm, valid);
+    let map = ErrorMap::exact(grid, values_mm, valid);
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("error_map.x3p");
     write_error_map_x3p(&path, &map, "2026-03-01T12:00:00Z", true).unwrap();

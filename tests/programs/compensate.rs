@@ -29,7 +29,7 @@ impl Shop {
     /// Writes the map as a run does.
     fn save_error(&self, error: impl Fn(f64, f64) -> f64, ground_with: Option<[u8; 32]>) {
         let values_mm = (0..GRID.len()).map(|k| GRID.place_mm(k)).map(|[x, y]| error(x, y)).collect();
-        let map = ErrorMap::known(GRID, values_mm, vec![true; GRID.len()]);
+        let map = ErrorMap::exact(GRID, values_mm, vec![true; GRID.len()]);
         let origin = ErrorMapOrigin { part: PART, cycle: 1, ground_with };
         write_error_map(&self.path("map.csv"), &map, &origin, true).unwrap();
     }
@@ -37,7 +37,7 @@ impl Shop {
     /// Writes a correction as a run does, with this map's identity.
     fn save_correction(&self, map: [u8; 32]) {
         let identities = CorrectionIdentities { part: PART, map, replaces: [1; 32] };
-        write_correction(&self.path("map.csv"), &Correction::none(GRID, 0.02), (&identities, &[]), true).unwrap();
+        write_correction(&self.path("map.csv"), &Correction::zero(GRID, 0.02), (&identities, &[]), true).unwrap();
     }
 
     fn folder(&self) -> &std::path::Path {

@@ -61,7 +61,7 @@ fn every_control_reads_the_path_of_the_plan_to_half_of_the_last_digit() {
                     None
                 }
                 Move::RapidTilted { .. } | Move::FeedTilted { .. } => unreachable!("the wheel stays upright"),
-                Move::Feed { at: to, feed_mm_min } => {
+                Move::Feed { to, feed_mm_min } => {
                     at = to.into();
                     Some(feed_mm_min)
                 }
@@ -115,7 +115,7 @@ fn along_its_arcs_every_control_passes_all_points_of_the_plan_within_the_toleran
         // The points in their order: each block passes some of them and ends at the last.
         let mut points = path
             .moves()
-            .filter_map(|one| if let Move::Feed { at, feed_mm_min } = one { Some((at, feed_mm_min)) } else { None });
+            .filter_map(|one| if let Move::Feed { to: at, feed_mm_min } = one { Some((at, feed_mm_min)) } else { None });
         let mut last = [f64::NAN; 3];
         for stop in &program.waypoints {
             let mut ended = stop.feed_mm_min.is_none();

@@ -44,7 +44,7 @@ fn a_header_says_what_a_person_needs_and_counts_right() {
     assert!(text.lines().all(|line| line.len() < 256 && line.matches('(').count() <= 1 && line.is_ascii()));
     let steps = read(&text);
     for k in 0..3 {
-        let within = |v: f64| v >= summary.least_mm[k] - 1e-6 && v <= summary.most_mm[k] + 1e-6;
+        let within = |v: f64| v >= summary.min_mm[k] - 1e-6 && v <= summary.max_mm[k] + 1e-6;
         assert!(steps.iter().all(|s| s.at[k].is_nan() || within(s.at[k])));
     }
     // The wheel lowers and lifts beyond the edge of the part, and travels above it.

@@ -141,7 +141,7 @@ fn programs_of_a_wheel_that_tilts_are_read_point_by_point_with_their_angles() {
         let letter = if about == TurnAxis::X { 'A' } else { 'B' };
         let rotary = Rotary {
             letter,
-            about,
+            axis: about,
             reversed: false,
             range_rad: [-2.0, 2.0],
             rate_rad_s: 1e3,
@@ -149,7 +149,7 @@ fn programs_of_a_wheel_that_tilts_are_read_point_by_point_with_their_angles() {
             pivot_mm,
         };
         let lean = Some(Lean::Following { lead_rad });
-        part.programs.options = PathOptions { rotary: Some(rotary), lean, ..with(&plain, wheels(0.8)[0].1, 6.0) };
+        part.programs.options = PathOptions { rotary: Some(rotary), tilt: lean, ..with(&plain, wheels(0.8)[0].1, 6.0) };
         let file = folder.path().join("part.ngc");
         part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();
         let calls = interpret(&file).unwrap_or_else(|said| panic!("{letter}: {said}"));

@@ -170,7 +170,7 @@ fn between_tracks_the_ridges_are_as_high_as_stated_and_nothing_is_cut_deeper() {
     for (name, (wheel_name, wheel)) in parts_and_wheels() {
         let mut part = part(name);
         part.programs.options = with(&part.programs.options, wheel, 4.0);
-        part.programs.options.spacing = TrackSpacing::Scallop { height_mm, widest_mm: 20.0 };
+        part.programs.options.spacing = TrackSpacing::Scallop { max_height_mm: height_mm, max_track_mm: 20.0 };
         let (swept, track_mm) = program(&part);
         let mut highest = f64::NEG_INFINITY;
         for beside in [0.1, 0.3, 0.5] {
@@ -274,7 +274,7 @@ fn with_the_normals_of_the_nominal_surface_it_would_not_hold() {
     let steps = path
         .moves()
         .filter_map(|one| match one {
-            regrind::compensation::path::Move::Feed { at, .. } => {
+            regrind::compensation::path::Move::Feed { to: at, .. } => {
                 Some(ProgramStep { at: [at.x, at.y, at.z + crate::path::error_mm(at.x, at.y)], feed: true })
             }
             _ => None,

@@ -19,7 +19,7 @@ const PIVOT_MM: [f64; 3] = [12.0, -7.0, 180.0];
 fn head(about: TurnAxis, pivot_mm: Option<[f64; 3]>, angle_decimals: i32) -> Rotary {
     Rotary {
         letter: if about == TurnAxis::X { 'A' } else { 'B' },
-        about,
+        axis: about,
         reversed: about == TurnAxis::X,
         range_rad: [-2.0, 2.0],
         rate_rad_s: 1e3,
@@ -91,7 +91,7 @@ fn clearance(wheel: &Wheel, pivot_mm: Option<[f64; 3]>, program: &Program, q: [f
 }
 
 fn leaning(part: &Part, wheel: Wheel, rotary: Rotary, lean: Lean, track_mm: f64) -> PathOptions {
-    PathOptions { rotary: Some(rotary), lean: Some(lean), ..with(&part.programs.options, wheel, track_mm) }
+    PathOptions { rotary: Some(rotary), tilt: Some(lean), ..with(&part.programs.options, wheel, track_mm) }
 }
 
 #[test]
@@ -270,7 +270,7 @@ fn a_feed_by_time_takes_as_long_as_the_wheel_at_its_feed() {
     let (_, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
     // The header has the time without the descent, a millimetre for each track.
     let down = part.programs.path(&correction(part.half_mm)).unwrap().0.tracks() as f64 / summary.feed_mm_min;
-    assert!((minutes - down - summary.seconds / 60.0).abs() < 1e-6 * minutes, "{minutes} {}", summary.seconds / 60.0);
+    assert!((minutes - down - summary.duration_s / 60.0).abs() < 1e-6 * minutes, "{minutes} {}", summary.duration_s / 60.0);
     // The slides themselves travel far while the head turns.
     assert!(
         program.waypoints.iter().filter_map(|stop| stop.feed_mm_min).fold(0.0, f64::max) > 1.2 * summary.feed_mm_min

@@ -89,7 +89,7 @@ impl Bench {
 
     fn accepts(&self, figures: &FormFigures) -> bool {
         let [pv, most, rms] = self.limits_mm();
-        figures.pv.high_mm <= pv && figures.pv_most_points.high_mm <= most && figures.rms.high_mm <= rms
+        figures.pv.high_mm <= pv && figures.pv_998.high_mm <= most && figures.rms.high_mm <= rms
     }
 
     fn truth(&self, truth_mm: &[f64]) -> ([f64; 2], bool) {
@@ -154,7 +154,7 @@ impl Line<'_> {
         let (tolerance, max_cycles) = (self.bench.plan.tolerance, self.bench.plan.max_cycles);
         let adaptive = Adaptive { tolerance, accepted_risk: 0.025, max_cycles };
         let purpose = adaptive.purpose(cycle < max_cycles);
-        let given = ModelInputs { look_risk: adaptive.look_risk(), ..self.given() };
+        let given = ModelInputs { decision_risk: adaptive.look_risk(), ..self.given() };
         let mut tried = vec![None; targets.len()];
         let (mut all, mut seconds, mut path) = (Vec::new(), 0.0, Vec::new());
         let mut next = model::short_tour(targets, model::farthest_points(targets, FIRST_BATCH));
@@ -178,7 +178,7 @@ impl Line<'_> {
             path.push(format!("{}{:?}", all.len(), look.reason));
             if look.next.is_empty() {
                 let form = &look.form;
-                let of = |p: &FormPoint| (Sample { at_mm: p.at_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
+                let of = |p: &FormPoint| (Sample { place_mm: p.place_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
                 let told: Vec<_> = form.points.iter().map(of).collect();
                 let error = told_map(&told, &self.bench.task.map, form.hyperparameters.noise_sigma_mm).unwrap();
                 let why = path.join(" ");

@@ -118,11 +118,11 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
         assert_eq!(found.probe_radius_mm, Some(REFLECTOR_MM));
         let cloud: Vec<Point> = found.points.iter().map(|p| Point::from(p.position_mm)).collect();
         let free = registered(&nominal, &cloud, [false; 6]);
-        let v = &free.verdict;
+        let v = &free.quality;
         let said: Vec<&str> = v.weak_directions.iter().map(|w| w.words.as_str()).collect();
         println!(
             "{} of {points} used, rms {:.2} um, PV {:.1} um; {}",
-            v.used,
+            v.inliers,
             v.rms_mm * 1e3,
             v.pv_mm * 1e3,
             said.join("; ")
@@ -132,8 +132,8 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
         for k in [0, 1] {
             assert!((v.covariance[(k, k)].sqrt() / in_plane_mm[k] - 1.0).abs() < 0.1, "{session}: axis {k}");
         }
-        let lateral = lateral_error(&free, &free.verdict.covariance, 2.0);
-        let why = weak_for_compensation(&free, &free.verdict.covariance, &MapLimits::default());
+        let lateral = lateral_error(&free, &free.quality.covariance, 2.0);
+        let why = weak_for_compensation(&free, &free.quality.covariance, &MapLimits::default());
         println!("{lateral:?}\n{}", why.as_deref().unwrap_or("a map may be made"));
         let why = why.expect("refused");
         assert!(
@@ -145,10 +145,10 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
         let held = registered(&nominal, &cloud, [true, true, false, false, false, true]);
         println!(
             "held: rms {:.2} um, {:?}",
-            held.verdict.rms_mm * 1e3,
-            lateral_error(&held, &held.verdict.covariance, 2.0)
+            held.quality.rms_mm * 1e3,
+            lateral_error(&held, &held.quality.covariance, 2.0)
         );
-        assert_eq!(weak_for_compensation(&held, &held.verdict.covariance, &MapLimits::default()), None);
+        assert_eq!(weak_for_compensation(&held, &held.quality.covariance, &MapLimits::default()), None);
     }
 }
 
@@ -186,7 +186,7 @@ fn session(data: &Path, nominal: &Nominal, name: &str) -> (Vec<Point>, Registrat
 /// Returns the RMS of the difference in µm, and the share within the 95 % interval, which includes the noise of the
 /// tracker.
 fn told(by: &Registration, of: &Registration) -> (f64, f64) {
-    let used: Vec<_> = of.deviations.iter().filter(|d| d.status == PointStatus::Used).collect();
+    let used: Vec<_> = of.deviations.iter().filter(|d| d.status == PointStatus::Inlier).collect();
     let places: Vec<(Point, Vector)> = used.iter().map(|d| (d.point, d.normal)).collect();
     let form = Form::estimate_at(by, &ModelInputs::default(), &places).unwrap();
     let off: Vec<[f64; 2]> = used
@@ -210,7 +210,7 @@ fn one_session_tells_little_of_another_and_a_fifth_of_it_no_less() {
         let few: Vec<Point> = cloud.iter().step_by(5).copied().collect();
         let whole = told(by, of);
         let fifth = told(&registered(&nominal, &few, [false; 6]), of);
-        let rms_um = 1e3 * of.verdict.rms_mm;
+        let rms_um = 1e3 * of.quality.rms_mm;
         println!(
             "session {a} tells session {b}, {rms_um:.1} um rms, but for {:.1} um, {:.1} % within 95 %; {} points of it but for {:.1} um, {:.1} %",
             whole.0,
@@ -277,7 +277,7 @@ fn a_session_that_was_not_seen_is_foretold_with_what_its_stations_will_differ_by
         let alone = Sessions::from_registrations(&[(&days[a].0, &one)])
             .unwrap()
             .between_session_variance(&Prior::for_size(3000.0));
-        assert_eq!(alone.err(), Some(ModelError::TooFewSessions { sessions: 1, least: 2 }));
+        assert_eq!(alone.err(), Some(ModelError::TooFewSessions { sessions: 1, min_sessions: 2 }));
     }
     println!("{:.1} % of {count} points of both days within 95 %", 100.0 * hits as f64 / count as f64);
 }
@@ -293,10 +293,10 @@ fn a_fifth_of_the_points_says_what_all_say_of_a_session() {
         println!(
             "{name}: {} points, {:.1} um rms, {:.1} um PV",
             cloud.len(),
-            1e3 * whole.verdict.rms_mm,
-            1e3 * whole.verdict.pv_mm
+            1e3 * whole.quality.rms_mm,
+            1e3 * whole.quality.pv_mm
         );
-        println!("  form of all: RMS {}; PV {}", um(of_all.figures.rms), um(of_all.figures.pv_most_points));
+        println!("  form of all: RMS {}; PV {}", um(of_all.figures.rms), um(of_all.figures.pv_998));
         for first in 0..5 {
             let few: Vec<Point> = cloud.iter().skip(first).step_by(5).copied().collect();
             let fifth = registered(&nominal, &few, [false; 6]);
@@ -304,13 +304,13 @@ fn a_fifth_of_the_points_says_what_all_say_of_a_session() {
             println!(
                 "  {} of them: {:.1} um rms, {:.1} um PV; form RMS {}; PV {}",
                 few.len(),
-                1e3 * fifth.verdict.rms_mm,
-                1e3 * fifth.verdict.pv_mm,
+                1e3 * fifth.quality.rms_mm,
+                1e3 * fifth.quality.pv_mm,
                 um(form.figures.rms),
-                um(form.figures.pv_most_points)
+                um(form.figures.pv_998)
             );
-            assert!((fifth.verdict.rms_mm / whole.verdict.rms_mm - 1.0).abs() < 0.15, "{name}: {first}");
-            assert!(fifth.verdict.pv_mm <= 1.02 * whole.verdict.pv_mm, "{name}: {first}");
+            assert!((fifth.quality.rms_mm / whole.quality.rms_mm - 1.0).abs() < 0.15, "{name}: {first}");
+            assert!(fifth.quality.pv_mm <= 1.02 * whole.quality.pv_mm, "{name}: {first}");
         }
     }
 }

@@ -34,7 +34,7 @@ fn a_reference_sphere_in_the_part_is_refused_with_place_and_gap() {
     let mut cell = cell("config/modbus-tcp.toml", &[]);
     setup::prepare(&recipe, &cell).unwrap();
     let sphere = cell.cmm.reference_sphere.as_mut().unwrap();
-    sphere.centre = cell.cmm.fixture_cmm_from_model.point(&regrind::geometry::Point::new(3.0, 2.0, 0.0));
+    sphere.centre = cell.cmm.fixture_cmm_from_model.transform_point(&regrind::geometry::Point::new(3.0, 2.0, 0.0));
     let at = format!("{:.1}, {:.1}, {:.1}", sphere.centre.x, sphere.centre.y, sphere.centre.z);
     let refused = setup::prepare(&recipe, &cell).unwrap_err().to_string();
     assert!(refused.contains(&at), "{at} is missing in: {refused}");

@@ -142,7 +142,7 @@ impl<'a> Line<'a> {
         let grid = Grid::over(corners.into_iter(), task.map.spacing_mm).unwrap();
         let size_mm = [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]];
         let rule = if let Way::Regrind(rule) = way { rule } else { GainRule::Fixed(1.0) };
-        let none = Correction::none(grid, task.limits.allowance_mm);
+        let none = Correction::zero(grid, task.limits.allowance_mm);
         let (correction, known) = match learned {
             Some((correction, known)) => {
                 (Correction { values_mm: correction.values_mm, ..none }, known.for_next_part())
@@ -183,7 +183,7 @@ impl<'a> Line<'a> {
         }
         let difference: Vec<f64> = whole.iter().zip(&alone).map(|(a, b)| a - b).collect();
         let found = self.register(level_mm);
-        let seen_um = 1e3 * found.verdict.rms_mm;
+        let seen_um = 1e3 * found.quality.rms_mm;
         let after = After {
             rms_um: rms_um(&whole),
             repeatable_um: rms_um(&self.without_motion(&difference)),
@@ -219,8 +219,8 @@ impl<'a> Line<'a> {
         let task = &self.bench.task;
         let target = |(index, k): (usize, &usize)| {
             let (p, n) = self.bench.plan_of[*k];
-            let at = task.fixture_cmm_from_model.point(&(p + level_mm * n));
-            let normal = task.fixture_cmm_from_model.direction(&n);
+            let at = task.fixture_cmm_from_model.transform_point(&(p + level_mm * n));
+            let normal = task.fixture_cmm_from_model.transform_direction(&n);
             Target { index: index as u32, feature: Feature::Part, point_mm: at.into(), normal: normal.into() }
         };
         let plan = Plan {
@@ -252,9 +252,9 @@ impl<'a> Line<'a> {
 
     fn error(&self, found: &Registration) -> ErrorMap {
         let task = &self.bench.task;
-        let used = || found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let used = || found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         let readings: Vec<Sample> =
-            used().map(|d| Sample { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
+            used().map(|d| Sample { place_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
         match self.way {
             Way::Regrind(_) => error_map(&readings, &task.map).unwrap(),
             Way::Plain => unfiltered(&readings, &task.map),
@@ -263,7 +263,7 @@ impl<'a> Line<'a> {
 
     fn correct_by(&mut self, found: &Registration, error: ErrorMap) {
         let task = &self.bench.task;
-        let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let used = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         let places: Vec<(Point, Vector)> = used.map(|d| (d.point, d.normal)).collect();
         let answer = self.before.as_ref().map(|(correction, earlier)| {
             let scatter_mm = earlier.point_sigma_mm.hypot(error.point_sigma_mm);
@@ -278,15 +278,15 @@ impl<'a> Line<'a> {
             .as_ref()
             .map(|taken| move |values: &[f64]| smooth_of(values, &grid, [&contacts, &taken.nodes], &options));
         let smooth = smoother.as_ref().map(|smoother| smoother as Smoother<'_>);
-        let seen = Seen { correction: &self.correction, error: &error, answer, smooth };
-        self.known = self.known.after(&seen);
+        let seen = Seen { correction: &self.correction, error: &error, response: answer, explained: smooth };
+        self.known = self.known.updated(&seen);
         let forecast = self.known.forecast(&error, 0.0);
         self.forecast = Some([1e3 * forecast.rms_mm, 1e3 * forecast.sigma_mm]);
-        let next = match self.correction.next(&error, &self.known, set.as_ref(), &task.limits) {
+        let next = match self.correction.next_pass(&error, &self.known, set.as_ref(), &task.limits) {
             Ok(step) => step.correction,
             // The study goes on where the material budget of a recipe would be spent. Here only the form counts.
             Err(NextPassError::BudgetSpent { .. }) => {
-                let changed = self.correction.changed(&self.known, set.as_ref());
+                let changed = self.correction.compensating(&self.known, set.as_ref());
                 Correction {
                     level_mm: changed.level_mm - task.limits.depth_of_cut_mm,
                     cycle: changed.cycle + 1,
@@ -302,7 +302,7 @@ impl<'a> Line<'a> {
     /// corrections that the next pass uses.
     fn tell(&mut self, found: &Registration) -> (Vec<Contact>, Option<Set>) {
         let task = &self.bench.task;
-        let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let used = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         let contact = |d: &Deviation| Contact { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
         let contacts: Vec<Contact> = used.map(contact).collect();
         let before = self.correction.set.clone();
@@ -310,8 +310,8 @@ impl<'a> Line<'a> {
         let options = task.parameter_options(before.as_ref());
         let told = parameters(&contacts, None, &options).unwrap();
         let mut values = before.map_or([0.0; ParameterKind::COUNT], |set| set.values);
-        values.iter_mut().zip(&told.found).for_each(|(value, of)| *value += of.taken);
-        let set = Set::of(values, self.correction.cycle + 1, [&contacts, &taken.nodes], &options);
+        values.iter_mut().zip(&told.estimates).for_each(|(value, of)| *value += of.compensated);
+        let set = Set::from_values(values, self.correction.cycle + 1, [&contacts, &taken.nodes], &options);
         self.told = Some(told);
         (contacts, set)
     }
@@ -393,9 +393,9 @@ pub fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass
 
 /// Returns the measured deviations as a map, by the nearest point.
 fn unfiltered(readings: &[Sample], options: &MapOptions) -> ErrorMap {
-    let grid = Grid::over(readings.iter().map(|r| r.at_mm), options.spacing_mm).unwrap();
+    let grid = Grid::over(readings.iter().map(|r| r.place_mm), options.spacing_mm).unwrap();
     let nearest = |[x, y]: [f64; 2]| {
-        let distance = |r: &&Sample| (r.at_mm[0] - x).powi(2) + (r.at_mm[1] - y).powi(2);
+        let distance = |r: &&Sample| (r.place_mm[0] - x).powi(2) + (r.place_mm[1] - y).powi(2);
         readings.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap().deviation_mm
     };
     let values_mm = (0..grid.len()).map(|k| nearest(grid.place_mm(k))).collect();

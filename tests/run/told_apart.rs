@@ -126,18 +126,18 @@ impl Bench {
         let mut line = Line::new(self, Way::Regrind(GainRule::Wavelength), &world, &twin, None, 1);
         line.still = Some((&still, still.grinder()));
         let after = (1..=passes).map(|cycle| line.pass(cycle)).collect();
-        let told = line.told.iter().flat_map(|told| &told.found);
-        let told = told.filter(|p| p.alike.is_empty() && p.kind != ParameterKind::Wear).map(|p| {
+        let told = line.told.iter().flat_map(|told| &told.estimates);
+        let told = told.filter(|p| p.inseparable_from.is_empty() && p.kind != ParameterKind::Wear).map(|p| {
             let drift_um = if p.kind == ParameterKind::SettingZ { self.drift_um(spec) } else { 0.0 };
-            let truth = (truth(of, p.kind) + drift_um) / p.kind.units();
-            let units = p.kind.units();
+            let truth = (truth(of, p.kind) + drift_um) / p.kind.display_units_per_unit();
+            let units = p.kind.display_units_per_unit();
             Told {
                 kind: p.kind,
                 off: (p.value - truth) / (2.0 * p.sigma),
                 expanded: 2.0 * units * p.sigma,
                 truth: units * truth,
-                taken: units * p.taken,
-                is_beyond: p.beyond,
+                taken: units * p.compensated,
+                is_beyond: p.exceeds_tolerance,
             }
         });
         (told.collect(), after)
@@ -173,7 +173,7 @@ impl Bench {
         let task = &mut bench.task;
         let corners = [[task.pass.x_mm[0], task.pass.y_mm[0]], [task.pass.x_mm[1], task.pass.y_mm[1]]];
         let grid = Grid::over(corners.into_iter(), task.map.spacing_mm).unwrap();
-        let nodes = Contact::under(&height_of(&task.nominal).unwrap().0, &grid);
+        let nodes = Contact::under_nodes(&height_of(&task.nominal).unwrap().0, &grid);
         let [mm, rad] = [1e-3, 1e-6];
         let [radius, setting, tilt] = [mm * RADIUS_UM, mm * SETTING_UM, rad * TILT_URAD].map(Some);
         task.parameters = Some(TakenBack {

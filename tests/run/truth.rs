@@ -47,7 +47,7 @@ pub fn truth(world: &World, seen: &Snapshot, used: &[bool], radius_mm: f64, leve
         let (mut gram, mut right) = (Matrix6::zeros(), Vector6::zeros());
         let mut deviations_mm = Vec::with_capacity(centres.len());
         for (c, used) in centres.iter().zip(used) {
-            let q: Vec3 = pose.inverse().point(&(*c).into()).into();
+            let q: Vec3 = pose.inverse().transform_point(&(*c).into()).into();
             let (_, n, distance) = foot(world, q);
             let deviation = distance - radius_mm - level_mm;
             let row = -Vector6::new(

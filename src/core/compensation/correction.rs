@@ -29,26 +29,26 @@ pub struct Correction {
 
 impl Correction {
     /// Returns the correction for the first pass of a part, before anything is known: 0 everywhere.
-    pub fn none(grid: Grid, level_mm: f64) -> Self {
+    pub fn zero(grid: Grid, level_mm: f64) -> Self {
         Self { grid, values_mm: vec![0.0; grid.len()], cycle: 1, level_mm, set: None }
     }
 
     /// Returns true if the map is 0 everywhere and no parameter is compensated.
-    pub fn is_none(&self) -> bool {
+    pub fn is_zero(&self) -> bool {
         self.set.is_none() && self.values_mm.iter().all(|value| *value == 0.0)
     }
 
     /// Returns the joint effect of map and parameters as it appears after registration, at every node, in
     /// millimetres.
-    pub fn seen_mm(&self) -> Cow<'_, [f64]> {
-        self.with(|set| &set.seen_mm)
+    pub fn apparent_mm(&self) -> Cow<'_, [f64]> {
+        self.add_parameter_effect(|set| &set.seen_mm)
     }
 
     /// Returns the displacement of the surface by map and parameters together, at every node, in millimetres.
     ///
     /// This is the displacement that decides how much material is removed.
-    pub fn displaced_mm(&self) -> Cow<'_, [f64]> {
-        self.with(|set| &set.displaced_mm)
+    pub fn displacement_mm(&self) -> Cow<'_, [f64]> {
+        self.add_parameter_effect(|set| &set.displaced_mm)
     }
 
     /// Returns the map that the grinder receives, at every node, in millimetres.
@@ -56,10 +56,10 @@ impl Correction {
     /// It is the sum of `values_mm` and of the displacement by wheel setting and tilt, which the grinder can apply
     /// only in its map.
     pub fn map_mm(&self) -> Cow<'_, [f64]> {
-        self.with(|set| &set.setting_mm)
+        self.add_parameter_effect(|set| &set.setting_mm)
     }
 
-    fn with(&self, of: impl Fn(&Set) -> &Vec<f64>) -> Cow<'_, [f64]> {
+    fn add_parameter_effect(&self, of: impl Fn(&Set) -> &Vec<f64>) -> Cow<'_, [f64]> {
         match &self.set {
             None => Cow::Borrowed(&self.values_mm),
             Some(set) => self.values_mm.iter().zip(of(set)).map(|(value, of)| value + of).collect(),

@@ -35,13 +35,13 @@ pub enum MapError {
         "the cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the contact width of the wheel, \
          {contact_width_mm:.3} mm: the wheel cannot grind shorter waves; choose a longer cut-off or a smaller wheel"
     )]
-    CutoffBelowContact { cutoff_mm: f64, least_mm: f64, contact_width_mm: f64 },
+    CutoffBelowContact { cutoff_mm: f64, min_mm: f64, contact_width_mm: f64 },
     #[error(
         "the cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the distance between measured points, \
          {point_spacing_mm:.3} mm: the points do not show shorter waves; choose a longer cut-off or measure more \
          densely"
     )]
-    CutoffBelowSpacing { cutoff_mm: f64, least_mm: f64, point_spacing_mm: f64 },
+    CutoffBelowSpacing { cutoff_mm: f64, min_mm: f64, point_spacing_mm: f64 },
     #[error("{found} values are given for a grid of {nodes} nodes; give one for each node")]
     Shape { found: usize, nodes: usize },
 }

@@ -70,7 +70,7 @@ impl Order {
     }
 
     /// Returns the share of a wave's amplitude that passes in the open, for a wavelength in cut-offs.
-    pub fn passes(self, wavelength_in_cutoffs: f64) -> f64 {
+    pub fn transmission(self, wavelength_in_cutoffs: f64) -> f64 {
         let u = PI * (self.alpha() / wavelength_in_cutoffs).powi(2);
         if self == Self::Quadric { (1.0 + u) * (-u).exp() } else { (-u).exp() }
     }
@@ -142,7 +142,7 @@ impl Gaussian {
 
     /// Filters values at arbitrary places and returns the result on a grid; `weights` holds a factor from 0 to 1 for
     /// each value.
-    pub fn scattered(&self, places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, grid: &Grid) -> Filtered {
+    pub fn filter_scattered(&self, places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, grid: &Grid) -> Filtered {
         let degree = self.order.degree();
         let trend = Trend::fit(places, values, degree);
         let sigma_mm = self.sigma_mm();
@@ -152,12 +152,12 @@ impl Gaussian {
         let channels = spread_out(places, &rest, weights, grid, taps);
         let counts = Counts::new(places, grid);
         let mut filtered = self.solve(&channels, spread, taps, grid, &counts);
-        filtered.add(&trend);
+        filtered.add_trend(&trend);
         filtered
     }
 
     /// Filters values at the nodes of a grid; uses only the nodes with a weight above 0.
-    pub fn on_grid(&self, values: &[f64], weights: &[f64], grid: &Grid) -> Filtered {
+    pub fn filter_nodes(&self, values: &[f64], weights: &[f64], grid: &Grid) -> Filtered {
         let degree = self.order.degree();
         let (places, known): (Vec<[f64; 2]>, Vec<f64>) =
             (0..grid.len()).filter(|&k| weights[k] > 0.0).map(|k| (grid.place_mm(k), values[k])).unzip();
@@ -173,7 +173,7 @@ impl Gaussian {
         }
         let counts = Counts::new(&places, grid);
         let mut filtered = self.solve(&channels, [0.0; 2], taps, grid, &counts);
-        filtered.add(&trend);
+        filtered.add_trend(&trend);
         filtered
     }
 
@@ -566,7 +566,7 @@ impl Trend {
 }
 
 impl Filtered {
-    fn add(&mut self, trend: &Trend) {
+    fn add_trend(&mut self, trend: &Trend) {
         let supported = &self.supported;
         trend.put_back(&self.grid, |k| supported[k], &mut self.values, &mut self.slopes);
     }

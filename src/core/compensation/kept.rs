@@ -9,17 +9,17 @@ pub(super) struct Kept {
 }
 
 impl Kept {
-    pub fn all(readings: &[Sample]) -> Self {
+    pub fn from_all(readings: &[Sample]) -> Self {
         Self {
-            places: readings.iter().map(|r| r.at_mm).collect(),
+            places: readings.iter().map(|r| r.place_mm).collect(),
             values: readings.iter().map(|r| r.deviation_mm).collect(),
         }
     }
 
-    pub fn without(readings: &[Sample], outliers: &[usize]) -> Self {
+    pub fn without_outliers(readings: &[Sample], outliers: &[usize]) -> Self {
         let mut left_out = vec![false; readings.len()];
         outliers.iter().for_each(|&k| left_out[k] = true);
         let used: Vec<Sample> = (0..readings.len()).filter(|&k| !left_out[k]).map(|k| readings[k]).collect();
-        Self::all(&used)
+        Self::from_all(&used)
     }
 }

@@ -143,10 +143,10 @@ pub struct Seen<'a> {
     /// Error that the pass left.
     pub error: &'a ErrorMap,
     /// Response of the part to the change of the correction; `None` for the first pass.
-    pub answer: Option<Response>,
+    pub response: Option<Response>,
     /// Function that extracts the part of a repeatable error that parameters and slides of the machine explain;
     /// `None` if these are not estimated.
-    pub smooth: Option<Smoother<'a>>,
+    pub explained: Option<Smoother<'a>>,
 }
 
 /// Function of values at the nodes of the correction, in millimetres, that returns the part of them that parameters
@@ -192,31 +192,31 @@ impl LearningState {
     /// Updates the state with the error of a pass; afterwards [`Self::wanted_mm`] returns the next correction.
     ///
     /// From a pass that was not ground as commanded nothing is learned, and the same correction is commanded again.
-    pub fn after(&self, seen: &Seen) -> Self {
+    pub fn updated(&self, seen: &Seen) -> Self {
         let mut known = self.clone();
-        if seen.answer.is_some_and(|answer| !matches!(answer.sense, Sense::AsCommanded | Sense::Unclear)) {
-            known.wanted_mm = Some(seen.correction.seen_mm().into_owned());
+        if seen.response.is_some_and(|answer| !matches!(answer.sense, Sense::AsCommanded | Sense::Unclear)) {
+            known.wanted_mm = Some(seen.correction.apparent_mm().into_owned());
             return known;
         }
-        let told = ErrorOnGrid::of(seen.error, seen.correction.grid);
-        if let Some(answer) = seen.answer.filter(|answer| answer.sense == Sense::AsCommanded) {
+        let told = ErrorOnGrid::resampled(seen.error, seen.correction.grid);
+        if let Some(answer) = seen.response.filter(|answer| answer.sense == Sense::AsCommanded) {
             known.response = combined(self.response, &answer, self.bands[0].independent(&told));
         }
         let response = known.response[0];
-        let mut mean = Mean::on(self.mean.as_ref(), told.grid, response / self.response[0]);
-        let u = seen.correction.seen_mm();
+        let mut mean = Mean::resampled(self.mean.as_ref(), told.grid, response / self.response[0]);
+        let u = seen.correction.apparent_mm();
         let news: Vec<f64> =
             told.error_mm.iter().zip(u.iter()).zip(&mean.values_mm).map(|((e, u), m)| e - response * u - m).collect();
-        known.whole.take_in(told.mean_square(&news), known.whole.independent(&told));
-        for (band, news) in known.bands.iter_mut().zip(self.split(&told, news)) {
-            band.take_in(told.mean_square(&news), band.independent(&told));
+        known.whole.update(told.mean_square(&news), known.whole.independent(&told));
+        for (band, news) in known.bands.iter_mut().zip(self.split_bands(&told, news)) {
+            band.update(told.mean_square(&news), band.independent(&told));
             add(&mut mean.values_mm, band.gain, &news);
         }
         // All points together determine the smooth part: it is used in full, and the bands shrink only the rest.
-        let mut believed = seen.smooth.map_or_else(|| vec![0.0; told.grid.len()], |smooth| smooth(&mean.values_mm));
+        let mut believed = seen.explained.map_or_else(|| vec![0.0; told.grid.len()], |smooth| smooth(&mean.values_mm));
         let rest: Vec<f64> = mean.values_mm.iter().zip(&believed).map(|(mean, smooth)| mean - smooth).collect();
-        let noise = known.noise_mm2(told.noise_mm2);
-        for ((band, mean), noise_mm2) in known.bands.iter_mut().zip(self.split(&told, rest)).zip(noise) {
+        let noise = known.band_noise_mm2(told.noise_mm2);
+        for ((band, mean), noise_mm2) in known.bands.iter_mut().zip(self.split_bands(&told, rest)).zip(noise) {
             band.shrink(told.mean_square(&mean), noise_mm2);
             add(&mut believed, band.share, &mean);
         }
@@ -234,7 +234,7 @@ impl LearningState {
 
     /// Returns the correction of the next pass, in millimetres, at each node of the grid of the last one; `None`
     /// before a pass of this part was processed.
-    pub fn wanted_mm(&self) -> Option<&[f64]> {
+    pub fn next_correction_mm(&self) -> Option<&[f64]> {
         self.wanted_mm.as_deref()
     }
 
@@ -258,14 +258,14 @@ impl LearningState {
     pub fn forecast(&self, error: &ErrorMap, scallops_mm: f64) -> Forecast {
         let rest2 = error.residual_sigma_mm.max(scallops_mm).powi(2);
         let (mut left2, mut scatter2, mut independent) = (0.0, 0.0, 0.0);
-        let told = ErrorOnGrid::of(error, error.grid);
-        let noise = self.noise_mm2(told.noise_mm2);
-        for ((band, values), noise_mm2) in self.bands.iter().zip(self.split(&told, told.error_mm.clone())).zip(noise) {
+        let told = ErrorOnGrid::resampled(error, error.grid);
+        let noise = self.band_noise_mm2(told.noise_mm2);
+        for ((band, values), noise_mm2) in self.bands.iter().zip(self.split_bands(&told, told.error_mm.clone())).zip(noise) {
             let seen2 = told.mean_square(&values);
-            let [n2, taken] = [band.scatter_mm2().unwrap_or(noise_mm2), self.taken(band)];
+            let [n2, taken] = [band.noise_mm2().unwrap_or(noise_mm2), self.compensated_share(band)];
             // Sum of: the repeatable error that is not compensated, the noise that the correction grinds in, the
             // noise of the next pass, and the error from the uncertainty of the response.
-            let left = match (self.rule, band.scatter_mm2(), band.belief) {
+            let left = match (self.rule, band.noise_mm2(), band.belief) {
                 (GainRule::Adaptive | GainRule::Wavelength, Some(_), Some(belief)) => n2 * (1.0 + band.share * belief),
                 _ => (1.0 - taken).powi(2) * (seen2 - n2).max(0.0) + n2 * (1.0 + taken * taken),
             };
@@ -275,7 +275,7 @@ impl LearningState {
         }
         // Bands overlap, so their mean squares do not add up to that of the whole; the ratio of the noise corrects
         // for this.
-        let whole2 = self.whole.scatter_mm2().unwrap_or(scatter2);
+        let whole2 = self.whole.noise_mm2().unwrap_or(scatter2);
         let in_common = if scatter2 > 0.0 { whole2 / scatter2 } else { 1.0 };
         let rms_mm = (rest2 + in_common * left2).sqrt();
         // The rms of m independent values varies by 1 / sqrt(2 m), relatively. While N is a guess, so is the
@@ -288,11 +288,11 @@ impl LearningState {
     /// Returns the share of the newest error that is compensated in each band, with the shortest wavelength of the
     /// band in millimetres first: `[from_mm, share]`, from the shortest waves to the longest.
     pub fn gains(&self) -> Vec<[f64; 2]> {
-        self.bands.iter().map(|band| [band.from_mm, self.taken(band)]).collect()
+        self.bands.iter().map(|band| [band.from_mm, self.compensated_share(band)]).collect()
     }
 
     /// Returns the share of the newest error that is compensated in a band.
-    fn taken(&self, band: &Band) -> f64 {
+    fn compensated_share(&self, band: &Band) -> f64 {
         if let GainRule::Fixed(share) = self.rule { share } else { band.gain * band.share }
     }
 
@@ -303,8 +303,8 @@ impl LearningState {
 
     /// Returns the rms of the non-repeatable error of a pass, in millimetres; `None` while it is neither stated nor
     /// estimated.
-    pub fn scatter_mm(&self) -> Option<f64> {
-        self.whole.scatter_mm2().map(f64::sqrt)
+    pub fn repeatability_mm(&self) -> Option<f64> {
+        self.whole.noise_mm2().map(f64::sqrt)
     }
 
     /// Returns the number of passes that this state was learned from.
@@ -313,7 +313,7 @@ impl LearningState {
     }
 
     /// Returns true if every number is in its valid range, for a state read from a file.
-    pub fn is_sound(&self) -> bool {
+    pub fn is_valid(&self) -> bool {
         let number = |v: f64| v.is_finite() && v >= 0.0;
         let [least, most] = RESPONSE_LIMITS;
         let of_band = |b: &Band| {
@@ -325,7 +325,7 @@ impl LearningState {
                 && (0.0..=1.0).contains(&b.borrowed)
         };
         let of_mean = |m: &Mean| {
-            m.grid.is_sound() && m.values_mm.len() == m.grid.len() && m.values_mm.iter().all(|v| v.is_finite())
+            m.grid.is_valid() && m.values_mm.len() == m.grid.len() && m.values_mm.iter().all(|v| v.is_finite())
         };
         (least..=most).contains(&self.response[0])
             && number(self.response[1])
@@ -336,11 +336,11 @@ impl LearningState {
     }
 
     /// Splits values on the grid of an error into their parts in each band; the parts add up to the values.
-    pub(super) fn split(&self, told: &ErrorOnGrid, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
+    pub(super) fn split_bands(&self, told: &ErrorOnGrid, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
         let whole = rest.clone();
         for longer in &self.bands[1..] {
-            let smooth = told.low_passed(&whole, longer.from_mm);
+            let smooth = told.low_pass(&whole, longer.from_mm);
             parts.push(rest.iter().zip(&smooth).map(|(value, smooth)| value - smooth).collect());
             rest = smooth;
         }
@@ -354,7 +354,7 @@ impl LearningState {
     /// widths s and t its power is 1 / s^2 + 1 / t^2 - 4 / (s^2 + t^2). The map has already passed the Gaussian of
     /// the cut-off, so that the squares of the widths add up. This holds in the open; near the border the longest
     /// waves contain up to twice as much.
-    fn noise_mm2(&self, whole_mm2: f64) -> Vec<f64> {
+    fn band_noise_mm2(&self, whole_mm2: f64) -> Vec<f64> {
         let first2 = self.bands[0].from_mm.powi(2);
         let width2 = |k: usize| if k == 0 { 1.0 } else { 1.0 + self.bands[k].from_mm.powi(2) / first2 };
         let last = self.bands.len() - 1;
@@ -366,7 +366,7 @@ impl LearningState {
 impl Mean {
     /// Returns the mean times a factor on a grid: unchanged on its own grid, interpolated on another one, 0 if there
     /// is no mean.
-    fn on(mean: Option<&Self>, grid: Grid, factor: f64) -> Self {
+    fn resampled(mean: Option<&Self>, grid: Grid, factor: f64) -> Self {
         let mut values_mm = mean.map_or_else(|| vec![0.0; grid.len()], |m| m.grid.resample(&m.values_mm, &grid));
         values_mm.iter_mut().for_each(|value| *value *= factor);
         Self { grid, values_mm }
@@ -378,7 +378,7 @@ impl ErrorOnGrid {
     ///
     /// All learned values are on the grid of the correction, so that only the error, which becomes small, is ever
     /// interpolated.
-    fn of(error: &ErrorMap, grid: Grid) -> Self {
+    fn resampled(error: &ErrorMap, grid: Grid) -> Self {
         let noise_mm2 = mean_square(&error.valid, &error.sigma_mm);
         let valid = (0..grid.len()).map(|k| error.grid.nearest(grid.place_mm(k)).is_some_and(|node| error.valid[node]));
         Self { grid, error_mm: error.grid.resample(&error.values_mm, &grid), valid: valid.collect(), noise_mm2 }
@@ -389,7 +389,7 @@ impl ErrorOnGrid {
     }
 
     /// Returns values without the waves that are shorter than `cutoff_mm`.
-    fn low_passed(&self, values: &[f64], cutoff_mm: f64) -> Vec<f64> {
+    fn low_pass(&self, values: &[f64], cutoff_mm: f64) -> Vec<f64> {
         match filter_grid(&self.grid, values, &self.valid, cutoff_mm, Order::default(), false) {
             Ok(smooth) => smooth.values,
             // A map too small for this wavelength contains no longer waves.
@@ -399,7 +399,7 @@ impl ErrorOnGrid {
 }
 
 impl Band {
-    pub(super) fn scatter_mm2(&self) -> Option<f64> {
+    pub(super) fn noise_mm2(&self) -> Option<f64> {
         let [sum, count] = self.scatter;
         (count > 0.0).then(|| sum / count)
     }
@@ -411,14 +411,14 @@ impl Band {
     }
 
     /// Updates the band with the mean square of the innovation of a pass, from `independent` independent values.
-    fn take_in(&mut self, news_mm2: f64, independent: f64) {
-        let expected = self.belief.zip(self.scatter_mm2()).map(|(belief, n2)| (1.0 + belief) * n2);
+    fn update(&mut self, news_mm2: f64, independent: f64) {
+        let expected = self.belief.zip(self.noise_mm2()).map(|(belief, n2)| (1.0 + belief) * n2);
         let changed = 1.0 + CHANGED_SIGMAS * (2.0 / independent * (1.0 + 1.0 / self.scatter[1].max(1.0))).sqrt();
         let stands_out = expected.is_some_and(|expected| news_mm2 > changed * expected);
         match self.belief {
             // This exceeds the known noise: the machine has changed, and the earlier estimate of R counts for little.
             Some(_) if stands_out && !self.changed => {
-                self.belief = self.scatter_mm2().map(|n2| news_mm2 / n2 - 1.0).filter(|belief| belief.is_finite());
+                self.belief = self.noise_mm2().map(|n2| news_mm2 / n2 - 1.0).filter(|belief| belief.is_finite());
             }
             // A second outlying pass is no change: the noise was underestimated.
             Some(belief) if stands_out => self.scatter = [news_mm2 / (1.0 + belief), 1.0],
@@ -440,7 +440,7 @@ impl Band {
     /// Computes the share of the mean that remains, from its mean square; `noise_mm2` is the noise of the points
     /// alone.
     fn shrink(&mut self, mean_mm2: f64, noise_mm2: f64) {
-        let of_mean_mm2 = self.scatter_mm2().unwrap_or(noise_mm2) * self.belief.unwrap_or(1.0);
+        let of_mean_mm2 = self.noise_mm2().unwrap_or(noise_mm2) * self.belief.unwrap_or(1.0);
         let over = mean_mm2 / of_mean_mm2;
         let share = if self.is_guessed() { 1.0 + (-over).exp_m1() / over } else { 1.0 - over.recip() };
         // 0 / 0: of a mean of 0 all may remain.
@@ -500,15 +500,15 @@ mod tests {
 
     fn map(value: impl Fn([f64; 2]) -> f64) -> ErrorMap {
         let values = (0..GRID.len()).map(|k| value(GRID.place_mm(k))).collect();
-        ErrorMap::known(GRID, values, vec![true; GRID.len()])
+        ErrorMap::exact(GRID, values, vec![true; GRID.len()])
     }
 
     fn none() -> Correction {
-        Correction::none(GRID, 0.0)
+        Correction::zero(GRID, 0.0)
     }
 
     fn after(known: &LearningState, correction: &Correction, error: &ErrorMap) -> LearningState {
-        known.after(&Seen { correction, error, answer: None, smooth: None })
+        known.updated(&Seen { correction, error, response: None, explained: None })
     }
 
     fn rms(values: &[f64]) -> f64 {
@@ -554,7 +554,7 @@ mod tests {
         let known = after(&begin(GainRule::Wavelength, None), &none(), &short);
         let shares: Vec<f64> = known.gains().iter().map(|[_, gain]| *gain).collect();
         assert!(shares[0] < 0.05, "{shares:?}");
-        assert!(rms(known.wanted_mm().unwrap()) < 0.1 * rms(&short.values_mm));
+        assert!(rms(known.next_correction_mm().unwrap()) < 0.1 * rms(&short.values_mm));
         let long = noisy(map(|[x, _]| 5e-3 * (x * std::f64::consts::TAU / 30.0).cos()));
         let known = after(&begin(GainRule::Wavelength, None), &none(), &long);
         assert!(known.gains().last().unwrap()[1] > 0.98, "{:?}", known.gains());
@@ -576,8 +576,8 @@ mod tests {
         // The estimates of the passes soon outweigh it: 1,200 mm^2 are 48 squares of 5 mm, and the guess weighs as
         // one of these.
         let mut band = Band { belief: Some(1.0), ..known.bands[0] };
-        band.take_in(0.0, 3.0);
-        assert!((band.scatter_mm2().unwrap() - 1e-6 / 3.0 / 49.0).abs() < 1e-12, "{:?}", band.scatter);
+        band.update(0.0, 3.0);
+        assert!((band.noise_mm2().unwrap() - 1e-6 / 3.0 / 49.0).abs() < 1e-12, "{:?}", band.scatter);
         assert!(!band.is_guessed());
     }
 
@@ -590,7 +590,7 @@ mod tests {
         let before = known.bands[0].gain;
         let changed = after(&known, &none(), &map(|_| 0.02));
         assert!(before < 0.35 && changed.bands[0].gain > 0.95, "{before} then {}", changed.bands[0].gain);
-        assert_eq!(changed.scatter_mm(), known.scatter_mm(), "a change is no scatter");
+        assert_eq!(changed.repeatability_mm(), known.repeatability_mm(), "a change is no scatter");
         let next_part = known.for_next_part();
         let first = after(&next_part, &none(), &of(scatter(5, 1e-3)));
         assert!(first.bands[0].gain > before, "another part is believed more than another pass");
@@ -604,7 +604,7 @@ mod tests {
             for pass in 0..3 {
                 let error = map(|[x, _]| 1e-3 + correction.at([x, 0.0]));
                 known = after(&known, &correction, &error);
-                let next = correction.changed(&known, None);
+                let next = correction.compensating(&known, None);
                 for ((now, next), e) in correction.values_mm.iter().zip(&next.values_mm).zip(&error.values_mm) {
                     assert_eq!(*next, now - share * e, "pass {pass}");
                 }
@@ -621,18 +621,18 @@ mod tests {
         let (known, form) = (begin(GainRule::Adaptive, None), map(|[x, y]| 1e-3 * (0.1 * x).sin() + 2e-5 * y));
         let answer =
             Response { slope: 0.9, correlation: 1.0, asked_mm: 1e-3, unexplained_mm: 0.0, sense: Sense::AsCommanded };
-        let known = known.after(&Seen { correction: &none(), error: &form, answer: Some(answer), smooth: None });
+        let known = known.updated(&Seen { correction: &none(), error: &form, response: Some(answer), explained: None });
         assert!((known.response()[0] - 0.9).abs() < 1e-3, "{:?}", known.response());
-        for (u, e) in known.wanted_mm().unwrap().iter().zip(&form.values_mm) {
+        for (u, e) in known.next_correction_mm().unwrap().iter().zip(&form.values_mm) {
             assert!((u + e / known.response()[0]).abs() < 1e-15);
         }
         // Four times the commanded change is no answer to it.
         let wild = Response { slope: 4.0, ..answer };
-        let known = begin(GainRule::Adaptive, None).after(&Seen {
+        let known = begin(GainRule::Adaptive, None).updated(&Seen {
             correction: &none(),
             error: &form,
-            answer: Some(wild),
-            smooth: None,
+            response: Some(wild),
+            explained: None,
         });
         assert_eq!(known.response(), [1.0, RESPONSE_SIGMA]);
     }
@@ -641,14 +641,14 @@ mod tests {
     fn what_was_not_ground_as_it_was_commanded_teaches_nothing() {
         let form = map(|[x, y]| 1e-3 * (0.2 * x + 0.1 * y).sin());
         let first = after(&begin(GainRule::Wavelength, None), &none(), &form);
-        let asked = none().changed(&first, None);
+        let asked = none().compensating(&first, None);
         for sense in
             [Sense::NoEffect, Sense::Flipped, Sense::MirroredX, Sense::MirroredY, Sense::Turned, Sense::Doubled]
         {
             let answer = Response { slope: 0.0, correlation: 0.0, asked_mm: 1e-3, unexplained_mm: 1e-3, sense };
-            let twice = first.after(&Seen { correction: &asked, error: &form, answer: Some(answer), smooth: None });
-            assert_eq!((twice.wanted_mm(), twice.passes()), (Some(&asked.values_mm[..]), 1), "{sense:?}");
-            assert_eq!(twice.scatter_mm(), None);
+            let twice = first.updated(&Seen { correction: &asked, error: &form, response: Some(answer), explained: None });
+            assert_eq!((twice.next_correction_mm(), twice.passes()), (Some(&asked.values_mm[..]), 1), "{sense:?}");
+            assert_eq!(twice.repeatability_mm(), None);
         }
     }
 
@@ -668,7 +668,7 @@ mod tests {
             let at = |place| form(place) + 0.8 * correction.at(place);
             let hole = |[x, y]: [f64; 2]| x.hypot(y) > 4.0;
             let places: Vec<[f64; 2]> = (0..grid.len()).map(|k| grid.place_mm(k)).collect();
-            let error = ErrorMap::known(
+            let error = ErrorMap::exact(
                 grid,
                 places.iter().map(|p| at(*p)).collect(),
                 places.iter().map(|p| hole(*p)).collect(),
@@ -681,8 +681,8 @@ mod tests {
                 unexplained_mm: 0.0,
                 sense: Sense::AsCommanded,
             });
-            known = known.after(&Seen { correction: &correction, error: &error, answer, smooth: None });
-            correction = correction.changed(&known, None);
+            known = known.updated(&Seen { correction: &correction, error: &error, response: answer, explained: None });
+            correction = correction.compensating(&known, None);
         }
         for (left_mm, expected) in left.windows(2).map(|w| w[1] / w[0]).zip([0.2, 0.5525, 0.634]) {
             assert!((left_mm - expected).abs() < 0.01, "{left:?}");
@@ -695,7 +695,7 @@ mod tests {
         for pass in 1..=5 {
             known = after(&known, &none(), &of(scatter(pass, 1e-3)));
         }
-        let told = known.scatter_mm().unwrap();
+        let told = known.repeatability_mm().unwrap();
         assert!((0.6e-3..1.5e-3).contains(&told), "{told}");
         assert!(known.bands[0].gain < 0.4, "{}", known.bands[0].gain);
     }
@@ -705,14 +705,14 @@ mod tests {
         let known = begin(GainRule::Wavelength, None);
         assert_eq!(known.bands.iter().map(|b| b.from_mm).collect::<Vec<_>>(), [2.5, 5.0, 10.0]);
         let error = map(|[x, y]| (1.3 * x).sin() + 0.1 * y + (0.2 * x * y).cos());
-        let parts = known.split(&ErrorOnGrid::of(&error, GRID), error.values_mm.clone());
+        let parts = known.split_bands(&ErrorOnGrid::resampled(&error, GRID), error.values_mm.clone());
         for (k, value) in error.values_mm.iter().enumerate() {
             assert!((parts.iter().map(|part| part[k]).sum::<f64>() - value).abs() < 1e-12);
         }
         // A long wave is in the last band, a short one in the first.
         let share = |wavelength_mm: f64, band: usize| {
             let wave = map(|[x, _]| (x * std::f64::consts::TAU / wavelength_mm).cos());
-            rms(&known.split(&ErrorOnGrid::of(&wave, GRID), wave.values_mm.clone())[band]) / rms(&wave.values_mm)
+            rms(&known.split_bands(&ErrorOnGrid::resampled(&wave, GRID), wave.values_mm.clone())[band]) / rms(&wave.values_mm)
         };
         assert!(share(30.0, 2) > 0.85 && share(3.0, 0) > 0.8, "{} {}", share(30.0, 2), share(3.0, 0));
     }
@@ -727,9 +727,9 @@ mod tests {
             point[node] = 1.0;
             let smooth =
                 filter_grid(&GRID, &point, &vec![true; GRID.len()], CUTOFF_MM, Order::default(), false).unwrap();
-            let told = ErrorOnGrid::of(&of(smooth.values.clone()), GRID);
+            let told = ErrorOnGrid::resampled(&of(smooth.values.clone()), GRID);
             let power = |values: &[f64]| values.iter().map(|v| v * v).sum::<f64>();
-            let parts = known.split(&told, smooth.values.clone());
+            let parts = known.split_bands(&told, smooth.values.clone());
             [power(&parts[0]), power(&parts[1]), power(&parts[2]), power(&smooth.values)]
         };
         let share = |nodes: &mut dyn Iterator<Item = usize>| {
@@ -738,7 +738,7 @@ mod tests {
         };
         let (inside, everywhere) = (share(&mut [15 * 41 + 20].into_iter()), share(&mut (0..GRID.len()).step_by(7)));
         // By hand: 1 + 1/5 - 4/6, 1/5 + 1/17 - 4/22, 1/17.
-        let shares = known.noise_mm2(1.0);
+        let shares = known.band_noise_mm2(1.0);
         for (share, by_hand) in shares.iter().zip([0.533_333, 0.077_005, 0.058_824]) {
             assert!((share - by_hand).abs() < 1e-6, "{shares:?}");
         }
@@ -756,14 +756,14 @@ mod tests {
                 for value in [0.0, 0.0, 1e-3, 0.0, 1e6, 1e-300] {
                     let error = map(|_| value);
                     known = after(&known, &none(), &error);
-                    assert!(known.is_sound(), "{known:?}");
+                    assert!(known.is_valid(), "{known:?}");
                     let forecast = known.forecast(&error, 0.0);
-                    assert!(forecast.rms_mm.is_finite() && known.wanted_mm().unwrap().iter().all(|v| v.is_finite()));
+                    assert!(forecast.rms_mm.is_finite() && known.next_correction_mm().unwrap().iter().all(|v| v.is_finite()));
                 }
             }
         }
         let all = after(&begin(GainRule::Adaptive, None), &none(), &map(|_| 0.0));
-        assert!(all.wanted_mm().unwrap().iter().all(|v| *v == 0.0) && all.forecast(&map(|_| 0.0), 0.0).rms_mm == 0.0);
+        assert!(all.next_correction_mm().unwrap().iter().all(|v| *v == 0.0) && all.forecast(&map(|_| 0.0), 0.0).rms_mm == 0.0);
     }
 
     #[test]
@@ -788,11 +788,11 @@ mod tests {
     #[test]
     fn numbers_that_cannot_be_are_seen() {
         let known = after(&begin(GainRule::Wavelength, None), &none(), &map(|[x, _]| 1e-3 * x));
-        assert!(known.is_sound());
+        assert!(known.is_valid());
         let broken = |change: fn(&mut LearningState)| {
             let mut known = known.clone();
             change(&mut known);
-            !known.is_sound()
+            !known.is_valid()
         };
         assert!(broken(|k| k.response[0] = 9.0));
         assert!(broken(|k| k.response[1] = f64::NAN));

@@ -50,7 +50,7 @@ pub struct MapOptions {
     /// Order of the polynomial that the Gaussian filters pass unchanged.
     pub order: Order,
     /// Choice of the spline's smoothness.
-    pub roughness: Roughness,
+    pub spline_smoothness: Roughness,
     /// Number of standard deviations beyond which a reading is an outlier; `None` keeps all readings.
     pub outlier_limit: Option<f64>,
 }
@@ -66,7 +66,7 @@ impl MapOptions {
             contact_width_mm: 0.0,
             smoothing: Smoothing::default(),
             order: Order::default(),
-            roughness: Roughness::default(),
+            spline_smoothness: Roughness::default(),
             outlier_limit: Some(5.0),
         }
     }
@@ -113,13 +113,13 @@ pub struct ErrorMap {
 /// Deviations that are not finite, too few of them for the cut-off, options out of range, and an invalid grid.
 pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, MapError> {
     check(readings, options)?;
-    let grid = Grid::over(readings.iter().map(|r| r.at_mm), options.spacing_mm)?;
+    let grid = Grid::over(readings.iter().map(|r| r.place_mm), options.spacing_mm)?;
     let gaussian = Gaussian { cutoff_mm: options.cutoff_mm, order: options.order };
     let worked = worked_grid(&grid, &gaussian)?;
     let apart_mm = point_spacings_mm(readings);
     let wide = Gaussian { cutoff_mm: options.cutoff_mm.max(WIDE * apart_mm[0].max(apart_mm[1])), ..gaussian };
-    let wide = Wide { gaussian: wide, grid: worked_grid(&grid, &wide)?, same: wide == gaussian };
-    let mut kept = Kept::all(readings);
+    let wide = Wide { gaussian: wide, grid: worked_grid(&grid, &wide)?, is_map_filter: wide == gaussian };
+    let mut kept = Kept::from_all(readings);
     let (mut outliers, mut features, mut found, mut advice) = (Vec::new(), Vec::new(), None, Vec::new());
     if let Some(limit) = options.outlier_limit {
         let all = wide.robust(&kept);
@@ -130,17 +130,17 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
             Far::default()
         });
         outliers = far.outliers;
-        kept = Kept::without(readings, &outliers);
+        kept = Kept::without_outliers(readings, &outliers);
         let before = |k: usize| outliers.partition_point(|outlier| *outlier < k);
-        features = far.features.into_iter().map(|k| (k - before(k), all.plain[k])).collect();
+        features = far.features.into_iter().map(|k| (k - before(k), all.residuals[k])).collect();
         found = Some(all).filter(|_| outliers.is_empty());
     }
     let (filtered, point_sigma) = if options.smoothing == Smoothing::RobustGaussian {
         let found = found.unwrap_or_else(|| wide.robust(&kept));
-        let with_weights = || gaussian.scattered(&kept.places, &kept.values, Some(&found.weights), &worked);
-        (if wide.same { found.filtered.clone() } else { with_weights() }, found.sigma)
+        let with_weights = || gaussian.filter_scattered(&kept.places, &kept.values, Some(&found.weights), &worked);
+        (if wide.is_map_filter { found.filtered.clone() } else { with_weights() }, found.sigma)
     } else {
-        let mut filtered = gaussian.scattered(&kept.places, &kept.values, None, &worked);
+        let mut filtered = gaussian.filter_scattered(&kept.places, &kept.values, None, &worked);
         let point_sigma = wide.point_sigma(&kept, &filtered);
         hold_features(&mut filtered, &gaussian, &kept, &features);
         (filtered, point_sigma)
@@ -166,17 +166,17 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
 fn hold_features(filtered: &mut Filtered, gaussian: &Gaussian, kept: &Kept, features: &[(usize, f64)]) {
     /// Maximum number of repetitions: enough for a feature of which an eighth passes at a time. Where readings are
     /// denser, less of it remains.
-    const MOST_TIMES: usize = 8;
+    const MAX_ROUNDS: usize = 8;
     /// Share of the height to keep: more than half, since between the nodes of the map there is less than at the
     /// readings.
-    const HELD: f64 = 0.65;
-    for _ in 0..MOST_TIMES {
+    const KEPT_HEIGHT_SHARE: f64 = 0.65;
+    for _ in 0..MAX_ROUNDS {
         let mut left = vec![0.0; kept.values.len()];
         let mut all_held = true;
         for &(k, height) in features {
             let own = kept.values[k] - filtered.at(kept.places[k]).map_or(kept.values[k], |[value, ..]| value);
             // A feature that is complete does not grow while others do.
-            if own * height.signum() > (1.0 - HELD) * height.abs() {
+            if own * height.signum() > (1.0 - KEPT_HEIGHT_SHARE) * height.abs() {
                 left[k] = own;
                 all_held = false;
             }
@@ -184,7 +184,7 @@ fn hold_features(filtered: &mut Filtered, gaussian: &Gaussian, kept: &Kept, feat
         if all_held {
             return;
         }
-        let more = gaussian.scattered(&kept.places, &left, None, &filtered.grid);
+        let more = gaussian.filter_scattered(&kept.places, &left, None, &filtered.grid);
         filtered.values.iter_mut().zip(more.values).for_each(|(value, more)| *value += more);
         filtered.slopes.iter_mut().zip(more.slopes).for_each(|(slope, more)| (0..2).for_each(|k| slope[k] += more[k]));
     }
@@ -216,7 +216,7 @@ struct Wide {
     gaussian: Gaussian,
     grid: Grid,
     /// True if it is the filter of the map.
-    same: bool,
+    is_map_filter: bool,
 }
 
 impl Wide {
@@ -226,10 +226,10 @@ impl Wide {
 
     /// Returns the standard deviation of one reading; `filtered` is the result of the map's own filter.
     fn point_sigma(&self, kept: &Kept, filtered: &Filtered) -> f64 {
-        if self.same {
+        if self.is_map_filter {
             return residuals(filtered, &kept.places, &kept.values, None).sigma();
         }
-        let wide = self.gaussian.scattered(&kept.places, &kept.values, None, &self.grid);
+        let wide = self.gaussian.filter_scattered(&kept.places, &kept.values, None, &self.grid);
         residuals(&wide, &kept.places, &kept.values, None).sigma()
     }
 }
@@ -307,7 +307,7 @@ impl Smooth {
 
     /// Replaces the surface of the filter by that of the spline; `valid` stays unchanged.
     fn with_spline(self, grid: &Grid, kept: &Kept, density: f64, options: &MapOptions) -> Result<Self, MapError> {
-        let fitted = spline(kept, grid, density, options.cutoff_mm, options.roughness)?;
+        let fitted = spline(kept, grid, density, options.cutoff_mm, options.spline_smoothness)?;
         Ok(Self {
             values: fitted.values,
             slopes: fitted.slopes,
@@ -337,7 +337,7 @@ impl Smooth {
 
 impl ErrorMap {
     /// Returns a map with exactly known values: no noise, no outliers.
-    pub fn known(grid: Grid, values_mm: Vec<f64>, valid: Vec<bool>) -> Self {
+    pub fn exact(grid: Grid, values_mm: Vec<f64>, valid: Vec<bool>) -> Self {
         Self {
             grid,
             sigma_mm: vec![0.0; values_mm.len()],
@@ -416,7 +416,7 @@ pub fn filter_grid(
     }
     let gaussian = Gaussian { cutoff_mm, order };
     let mask: Vec<f64> = valid.iter().map(|v| f64::from(u8::from(*v))).collect();
-    let plain = gaussian.on_grid(values, &mask, grid);
+    let plain = gaussian.filter_nodes(values, &mask, grid);
     let (filtered, rounds) = if robust_form { robust_grid(&gaussian, plain, values, &mask, grid) } else { (plain, 1) };
     let count = filtered.supported.iter().filter(|s| **s).count();
     if count == 0 {
@@ -428,11 +428,11 @@ pub fn filter_grid(
 
 fn robust_grid(gaussian: &Gaussian, plain: Filtered, values: &[f64], mask: &[f64], grid: &Grid) -> (Filtered, usize) {
     let masked = |weights: &[f64]| weights.iter().zip(mask).map(|(w, m)| w * m).collect::<Vec<f64>>();
-    let again = |weights: &[f64]| gaussian.on_grid(values, &masked(weights), grid);
+    let again = |weights: &[f64]| gaussian.filter_nodes(values, &masked(weights), grid);
     let compare = |filtered: &Filtered, _: Option<&[f64]>| {
         let known = |k: usize| mask[k] > 0.0 && filtered.supported[k];
         let plain = (0..grid.len()).map(|k| if known(k) { values[k] - filtered.values[k] } else { f64::NAN }).collect();
-        Residuals { plain, freedom: vec![1.0; grid.len()] }
+        Residuals { values: plain, freedom: vec![1.0; grid.len()] }
     };
     let found = super::robust::iterate(plain, grid.len(), again, compare);
     (found.filtered, found.rounds)

@@ -13,7 +13,7 @@ pub struct CorrectionLimits {
     /// Depth of a pass below the one before, in millimetres; a pass is deeper where it must be to cut everywhere.
     pub depth_of_cut_mm: f64,
     /// Minimum depth of removal at any place, in millimetres.
-    pub least_depth_mm: f64,
+    pub min_depth_mm: f64,
     /// Maximum correction at any place, in millimetres.
     pub max_correction_mm: f64,
     /// Level of the first pass, in millimetres; removal is counted from it.
@@ -73,9 +73,9 @@ impl Correction {
     /// limits.
     ///
     /// The map leaves out the part that the parameters in `set` compensate.
-    pub fn changed(&self, known: &LearningState, set: Option<&Set>) -> Self {
-        let seen_mm = self.seen_mm();
-        let mut values_mm = known.wanted_mm().unwrap_or(&seen_mm).to_vec();
+    pub fn compensating(&self, known: &LearningState, set: Option<&Set>) -> Self {
+        let seen_mm = self.apparent_mm();
+        let mut values_mm = known.next_correction_mm().unwrap_or(&seen_mm).to_vec();
         if let Some(set) = set {
             values_mm.iter_mut().zip(&set.seen_mm).for_each(|(value, seen)| *value -= seen);
         }
@@ -94,7 +94,7 @@ impl Correction {
             return Err(NextPassError::TooLarge { found_mm: self.values_mm[k], x_mm, y_mm, limit_mm });
         }
         // Negative values of the correction and of the parameters increase the removal.
-        let max_depth_mm = self.displaced_mm().iter().copied().fold(0.0, f64::min);
+        let max_depth_mm = self.displacement_mm().iter().copied().fold(0.0, f64::min);
         let removed_mm = limits.allowance_mm - self.level_mm - max_depth_mm;
         // A picometre is rounding, not removal.
         if removed_mm > limits.removal_budget_mm + 1e-9 {
@@ -115,21 +115,21 @@ impl Correction {
     ///
     /// # Errors
     /// A correction above its limit, a pass deeper than the machine may cut, and a removal above the budget.
-    pub fn next(
+    pub fn next_pass(
         &self,
         error: &ErrorMap,
         known: &LearningState,
         set: Option<&Set>,
         limits: &CorrectionLimits,
     ) -> Result<NextPass, NextPassError> {
-        let changed = self.changed(known, set);
+        let changed = self.compensating(known, set);
         let on_grid: Vec<f64> =
-            changed.displaced_mm().iter().zip(self.displaced_mm().iter()).map(|(next, now)| next - now).collect();
+            changed.displacement_mm().iter().zip(self.displacement_mm().iter()).map(|(next, now)| next - now).collect();
         // At the nodes of the measured map: only there the depth of the next cut can be predicted.
         let changes_mm = self.grid.resample(&on_grid, &error.grid);
-        let (response, scatter_mm) = (known.response()[0], known.scatter_mm().unwrap_or(0.0));
+        let (response, scatter_mm) = (known.response()[0], known.repeatability_mm().unwrap_or(0.0));
         let rise_mm = on_grid.iter().map(|change| response * change).fold(0.0, f64::max);
-        let depth_mm = limits.depth_of_cut_mm.max(rise_mm + 2.0 * scatter_mm + limits.least_depth_mm);
+        let depth_mm = limits.depth_of_cut_mm.max(rise_mm + 2.0 * scatter_mm + limits.min_depth_mm);
         let fall_mm = on_grid.iter().map(|change| response * change).fold(0.0, f64::min);
         let (found_mm, limit_mm) = (depth_mm - fall_mm, limits.max_depth_mm);
         if found_mm > limit_mm {
@@ -166,7 +166,7 @@ mod tests {
 
     const LIMITS: CorrectionLimits = CorrectionLimits {
         depth_of_cut_mm: 0.01,
-        least_depth_mm: 0.0005,
+        min_depth_mm: 0.0005,
         max_correction_mm: 0.05,
         allowance_mm: 0.06,
         removal_budget_mm: 0.06,
@@ -175,17 +175,17 @@ mod tests {
 
     fn map(values_mm: [f64; 4]) -> ErrorMap {
         let grid = Grid { columns: 2, rows: 2, first_mm: [0.0, 0.0], spacing_mm: [1.0, 1.0] };
-        ErrorMap::known(grid, values_mm.to_vec(), vec![true; 4])
+        ErrorMap::exact(grid, values_mm.to_vec(), vec![true; 4])
     }
 
     fn first() -> Correction {
-        Correction::none(map([0.0; 4]).grid, 0.06)
+        Correction::zero(map([0.0; 4]).grid, 0.06)
     }
 
     fn next(correction: &Correction, error: &ErrorMap, gain: f64) -> Result<NextPass, NextPassError> {
         let options = MapOptions::new(1.0, 1.0);
         let known = LearningState::new(GainRule::Fixed(gain), &options, [1.0; 2], None);
-        correction.next(error, &known.after(&Seen { correction, error, answer: None, smooth: None }), None, &LIMITS)
+        correction.next_pass(error, &known.updated(&Seen { correction, error, response: None, explained: None }), None, &LIMITS)
     }
 
     #[test]

@@ -77,7 +77,7 @@ pub fn response(
     let over =
         |value: &dyn Fn([f64; 2]) -> f64| unseen.without(places.iter().map(|(p, _)| value([p.x, p.y])).collect());
     // Parameters move the surface as a map does, and the part responds to them in the same way.
-    let asked = corrections.map(|correction| (correction.grid, correction.seen_mm()));
+    let asked = corrections.map(|correction| (correction.grid, correction.apparent_mm()));
     let [earlier, later] = asked.each_ref().map(|(grid, values)| move |place| grid.interpolate(values, place));
     let changed = |place: [f64; 2]| later(place) - earlier(place);
     let answer = over(&|place| after.at(place) - before.at(place));
@@ -100,14 +100,14 @@ pub fn response(
     Response {
         slope: straight.slope,
         correlation: straight.correlation,
-        asked_mm: straight.asked_rms,
+        asked_mm: straight.commanded_rms,
         unexplained_mm: straight.unexplained_rms,
         sense: sense(&straight, &mirrored, scatter_mm),
     }
 }
 
 fn sense(straight: &Fit, mirrored: &[(Sense, Fit)], scatter_mm: f64) -> Sense {
-    if straight.asked_rms < 2.0 * scatter_mm || straight.asked_rms == 0.0 {
+    if straight.commanded_rms < 2.0 * scatter_mm || straight.commanded_rms == 0.0 {
         return Sense::Unclear;
     }
     let best = mirrored.iter().max_by(|a, b| a.1.correlation.total_cmp(&b.1.correlation)).expect("five ways are tried");
@@ -132,7 +132,7 @@ fn sense(straight: &Fit, mirrored: &[(Sense, Fit)], scatter_mm: f64) -> Sense {
 struct Fit {
     slope: f64,
     correlation: f64,
-    asked_rms: f64,
+    commanded_rms: f64,
     unexplained_rms: f64,
 }
 
@@ -144,7 +144,7 @@ fn regress(asked: &[f64], answer: &[f64]) -> Fit {
     Fit {
         slope,
         correlation: or_zero(ab / (aa * bb).sqrt()),
-        asked_rms: (aa / count).sqrt(),
+        commanded_rms: (aa / count).sqrt(),
         unexplained_rms: ((bb - slope * ab).max(0.0) / count).sqrt(),
     }
 }
@@ -193,7 +193,7 @@ mod tests {
 
     fn map(f: impl Fn(f64, f64) -> f64) -> ErrorMap {
         let values_mm = (0..GRID.len()).map(|k| GRID.place_mm(k)).map(|[x, y]| f(x, y)).collect();
-        ErrorMap::known(GRID, values_mm, vec![true; GRID.len()])
+        ErrorMap::exact(GRID, values_mm, vec![true; GRID.len()])
     }
 
     /// Returns an error without any symmetry, in millimetres.
@@ -203,7 +203,7 @@ mod tests {
 
     fn answered(seen: impl Fn(f64, f64) -> f64) -> Response {
         let before = map(error);
-        let none = Correction::none(GRID, 0.0);
+        let none = Correction::zero(GRID, 0.0);
         let asked = Correction { values_mm: before.values_mm.iter().map(|e| -e).collect(), ..none.clone() };
         response([&before, &map(|x, y| error(x, y) + seen(x, y))], [&none, &asked], &places(), 2e-4)
     }
@@ -231,7 +231,7 @@ mod tests {
     #[test]
     fn a_change_within_the_scatter_tells_nothing() {
         let flat = map(|_, _| 1e-5);
-        let none = Correction::none(GRID, 0.0);
+        let none = Correction::zero(GRID, 0.0);
         assert_eq!(response([&flat, &flat], [&none, &none], &places(), 1e-4).sense, Sense::Unclear);
         assert_eq!(response([&flat, &flat], [&none, &none], &places(), 0.0).sense, Sense::Unclear);
     }

@@ -50,9 +50,9 @@ pub(super) struct Robust {
     /// Weight of every reading.
     pub weights: Vec<f64>,
     /// Residual of every reading; `NaN` where there is no surface.
-    pub plain: Vec<f64>,
+    pub residuals: Vec<f64>,
     /// Residual over the square root of its freedom; `NaN` if the freedom is too small.
-    pub scaled: Vec<f64>,
+    pub scaled_residuals: Vec<f64>,
     /// Standard deviation of one reading.
     pub sigma: f64,
     /// Number of times that the filter was applied.
@@ -62,7 +62,7 @@ pub(super) struct Robust {
 /// Residuals of readings from a filtered surface.
 pub(super) struct Residuals {
     /// Reading minus surface; `NaN` where there is no surface.
-    pub plain: Vec<f64>,
+    pub values: Vec<f64>,
     /// Variance of a residual over that of a reading.
     pub freedom: Vec<f64>,
 }
@@ -83,29 +83,29 @@ pub(super) fn residuals(
         None => (f64::NAN, 0.0),
     };
     let (plain, freedom) = (0..places.len()).into_par_iter().with_min_len(512).map(each).unzip();
-    Residuals { plain, freedom }
+    Residuals { values: plain, freedom }
 }
 
 impl Residuals {
     fn scaled(&self) -> Vec<f64> {
         let each = |(r, f): (&f64, &f64)| if *f < LEAST_FREEDOM { f64::NAN } else { r / f.sqrt() };
-        self.plain.iter().zip(&self.freedom).map(each).collect()
+        self.values.iter().zip(&self.freedom).map(each).collect()
     }
 
     /// Returns the standard deviation of one reading: the square root of the residuals' sum of squares over their
     /// freedom.
     pub fn sigma(&self) -> f64 {
-        let known = (0..self.plain.len()).filter(|&k| self.freedom[k] > LEAST_FREEDOM && self.plain[k].is_finite());
-        let (squares, freedom) = known.fold((0.0, 0.0), |(s, f), k| (s + self.plain[k].powi(2), f + self.freedom[k]));
+        let known = (0..self.values.len()).filter(|&k| self.freedom[k] > LEAST_FREEDOM && self.values[k].is_finite());
+        let (squares, freedom) = known.fold((0.0, 0.0), |(s, f), k| (s + self.values[k].powi(2), f + self.freedom[k]));
         if freedom > 0.0 { (squares / freedom).sqrt() } else { 0.0 }
     }
 }
 
 /// Applies the robust filter.
 pub(super) fn robust(gaussian: &Gaussian, places: &[[f64; 2]], values: &[f64], grid: &Grid) -> Robust {
-    let again = |weights: &[f64]| gaussian.scattered(places, values, Some(weights), grid);
+    let again = |weights: &[f64]| gaussian.filter_scattered(places, values, Some(weights), grid);
     let compare = |filtered: &Filtered, weights: Option<&[f64]>| residuals(filtered, places, values, weights);
-    iterate(gaussian.scattered(places, values, None, grid), values.len(), again, compare)
+    iterate(gaussian.filter_scattered(places, values, None, grid), values.len(), again, compare)
 }
 
 /// Alternates filtering and weighting, starting from the result of the plain filter.
@@ -121,7 +121,7 @@ pub(super) fn iterate(
     let mut scale = f64::NAN;
     let mut rounds = 1;
     while rounds < ROUNDS {
-        let c = BIWEIGHT * median_size(&found.plain);
+        let c = BIWEIGHT * median_size(&found.values);
         // NaN, at first, is not converged; a surface without residuals is.
         if c == 0.0 || (c - scale).abs() <= SETTLED * c {
             break;
@@ -129,14 +129,14 @@ pub(super) fn iterate(
         scale = c;
         let weigh = |r: &f64| if r.abs() < c { (1.0 - (r / c).powi(2)).powi(2) } else { 0.0 };
         // A reading without a surface around it keeps its weight: it may be the first of one.
-        weights = found.plain.iter().map(|r| if r.is_nan() { 1.0 } else { weigh(r) }).collect();
+        weights = found.values.iter().map(|r| if r.is_nan() { 1.0 } else { weigh(r) }).collect();
         filtered = again(&weights);
         found = compare(&filtered, Some(&weights));
         rounds += 1;
     }
     let scaled = found.scaled();
     let sigma = SIGMA_OVER_MEDIAN * median_size(&scaled);
-    Robust { filtered, weights, plain: found.plain, scaled, sigma, rounds }
+    Robust { filtered, weights, residuals: found.values, scaled_residuals: scaled, sigma, rounds }
 }
 
 /// Readings far from the filtered surface, by their indices, ascending.
@@ -158,7 +158,7 @@ impl Robust {
             return Some(Far::default());
         }
         let limit = limit * self.sigma.max(LEAST_SCALE_MM);
-        let size = |k: usize| self.scaled[k].abs();
+        let size = |k: usize| self.scaled_residuals[k].abs();
         let mut off: Vec<usize> = (0..places.len()).filter(|&k| size(k) > SHARE_OF_LIMIT * limit).collect();
         off.sort_by(|&a, &b| places[a][0].total_cmp(&places[b][0]));
         let far = (0..off.len()).filter(|&n| size(off[n]) > limit);
@@ -167,10 +167,10 @@ impl Robust {
         features.iter_mut().for_each(|n| *n = off[*n]);
         let mut outliers = Vec::new();
         if !alone.is_empty() {
-            let around = Around { places, values, tree: Nearest::of(places.iter().map(on_plane)), apart };
+            let around = Around { places, values, tree: Nearest::new(places.iter().map(on_plane)), apart };
             let least = SHARE_OF_LIMIT * limit;
             for k in alone.into_iter().map(|n| off[n]) {
-                if around.agrees(k, self.scaled[k].signum(), least) { features.push(k) } else { outliers.push(k) }
+                if around.agrees(k, self.scaled_residuals[k].signum(), least) { features.push(k) } else { outliers.push(k) }
             }
         }
         features.sort_unstable();
@@ -184,7 +184,7 @@ impl Robust {
         let away = |j: usize| [0, 1].map(|axis| places[j][axis] - places[k][axis]);
         let agrees = |j: &usize| {
             is_beside(away(*j), apart)
-                && self.scaled[*j] * self.scaled[k].signum() >= SHARE_OF_HEIGHT * self.scaled[k].abs()
+                && self.scaled_residuals[*j] * self.scaled_residuals[k].signum() >= SHARE_OF_HEIGHT * self.scaled_residuals[k].abs()
         };
         let in_reach = |j: &&usize| away(**j)[0].abs() <= NEIGHBOUR * apart[0];
         let mut before = off[..n].iter().rev().take_while(in_reach);
@@ -215,7 +215,7 @@ impl Around<'_> {
     /// `least` and a quarter of the reading's height; `side` is the sign of up.
     fn agrees(&self, k: usize, side: f64, least: f64) -> bool {
         let own = on_plane(&self.places[k]);
-        let near = self.tree.to(&own, AROUND as u32 + 1).map(|(other, _)| other).filter(|other| *other != k);
+        let near = self.tree.nearest(&own, AROUND as u32 + 1).map(|(other, _)| other).filter(|other| *other != k);
         let away = |other: usize| [0, 1].map(|a| self.places[other][a] - self.places[k][a]);
         let (near, around): (Vec<usize>, Vec<usize>) =
             near.partition(|other| is_within(away(*other), self.apart, NEIGHBOUR));

@@ -32,9 +32,9 @@ pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_
         return Ok(());
     }
     Err(if contact_width_mm > point_spacing_mm {
-        MapError::CutoffBelowContact { cutoff_mm, least_mm, contact_width_mm }
+        MapError::CutoffBelowContact { cutoff_mm, min_mm: least_mm, contact_width_mm }
     } else {
-        MapError::CutoffBelowSpacing { cutoff_mm, least_mm, point_spacing_mm }
+        MapError::CutoffBelowSpacing { cutoff_mm, min_mm: least_mm, point_spacing_mm }
     })
 }
 
@@ -54,7 +54,7 @@ pub(super) fn point_spacings_mm(readings: &[Sample]) -> [f64; 2] {
     let chosen: Vec<&Sample> = readings.iter().step_by(step).collect();
     let same_mm = SAME_PLACE * square_spacing_mm(readings);
     let nearest: Vec<[f64; 4]> =
-        chosen.par_iter().map(|from| nearest_by_sector(from.at_mm, readings, same_mm)).collect();
+        chosen.par_iter().map(|from| nearest_by_sector(from.place_mm, readings, same_mm)).collect();
     let median = |sectors: [usize; 2]| {
         let mut found: Vec<f64> =
             nearest.iter().flat_map(|n| sectors.map(|s| n[s])).filter(|d| d.is_finite()).collect();
@@ -67,7 +67,7 @@ pub(super) fn point_spacings_mm(readings: &[Sample]) -> [f64; 2] {
 /// Returns the spacing that the same number of readings would have on a square grid over the same box.
 fn square_spacing_mm(readings: &[Sample]) -> f64 {
     let [width, depth] = [0, 1].map(|axis| {
-        let along = readings.iter().map(|r| r.at_mm[axis]);
+        let along = readings.iter().map(|r| r.place_mm[axis]);
         along.clone().fold(f64::NEG_INFINITY, f64::max) - along.fold(f64::INFINITY, f64::min)
     });
     (width.max(0.0) * depth.max(0.0) / readings.len().max(1) as f64).sqrt()
@@ -77,7 +77,7 @@ fn square_spacing_mm(readings: &[Sample]) -> f64 {
 fn nearest_by_sector([x, y]: [f64; 2], readings: &[Sample], same_mm: f64) -> [f64; 4] {
     let mut nearest2 = [f64::INFINITY; 4];
     for r in readings {
-        let (dx, dy) = (r.at_mm[0] - x, r.at_mm[1] - y);
+        let (dx, dy) = (r.place_mm[0] - x, r.place_mm[1] - y);
         let sector = if dx.abs() >= dy.abs() { usize::from(dx < 0.0) } else { 2 + usize::from(dy < 0.0) };
         let distance2 = dx * dx + dy * dy;
         if distance2 > same_mm * same_mm && distance2 < nearest2[sector] {
@@ -93,7 +93,7 @@ mod tests {
 
     fn grid(columns: usize, rows: usize, step_mm: [f64; 2]) -> Vec<Sample> {
         let place = |k: usize| [(k % columns) as f64 * step_mm[0], (k / columns) as f64 * step_mm[1]];
-        (0..columns * rows).map(|k| Sample { at_mm: place(k), deviation_mm: 0.0 }).collect()
+        (0..columns * rows).map(|k| Sample { place_mm: place(k), deviation_mm: 0.0 }).collect()
     }
 
     #[test]
@@ -110,7 +110,7 @@ mod tests {
         assert!((point_spacing_mm(&grid(500, 12, [0.1, 4.0])) - 4.0).abs() < 1e-12);
         assert_eq!(point_spacing_mm(&grid(1, 1, [1.0, 1.0])), 0.0);
         assert_eq!(point_spacing_mm(&[]), 0.0);
-        let again = |r: Sample| [0.0, 0.3, 0.6].map(|beside| Sample { at_mm: r.at_mm.map(|x| x + beside), ..r });
+        let again = |r: Sample| [0.0, 0.3, 0.6].map(|beside| Sample { place_mm: r.place_mm.map(|x| x + beside), ..r });
         let thrice: Vec<Sample> = grid(20, 20, [260.0, 260.0]).into_iter().flat_map(again).collect();
         assert!((point_spacing_mm(&thrice) - 260.0).abs() < 1.0, "{}", point_spacing_mm(&thrice));
     }
@@ -119,7 +119,7 @@ mod tests {
     fn the_cutoff_must_suit_wheel_and_points() {
         let contact = contact_width_mm(12.5, 0.02);
         assert!(check_cutoff(5.0, contact, 2.14).is_ok());
-        let Err(MapError::CutoffBelowSpacing { least_mm, .. }) = check_cutoff(3.0, contact, 2.14) else { panic!() };
+        let Err(MapError::CutoffBelowSpacing { min_mm: least_mm, .. }) = check_cutoff(3.0, contact, 2.14) else { panic!() };
         assert_eq!(least_mm, 4.28);
         assert!(matches!(check_cutoff(2.0, contact, 0.5), Err(MapError::CutoffBelowContact { .. })));
     }

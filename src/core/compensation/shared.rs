@@ -69,10 +69,10 @@ struct Comparison {
 pub struct Shared {
     /// State of the machine, as after passes of its own; [`LearningState::wanted_mm`] is the correction of its first
     /// pass.
-    pub known: LearningState,
+    pub state: LearningState,
     /// For each band taken over: its shortest wavelength, in millimetres, and the assumed rms share of the repeatable
     /// error that is a machine's own.
-    pub differ: Vec<[f64; 2]>,
+    pub own_shares: Vec<[f64; 2]>,
 }
 
 /// Observation of a band by one machine.
@@ -82,7 +82,7 @@ struct Told {
     /// Variance of the mean.
     variance_mm2: f64,
     /// Variance of the non-repeatable error of a pass.
-    scatter_mm2: f64,
+    noise_mm2: f64,
 }
 
 impl Alike {
@@ -183,7 +183,7 @@ impl LearningState {
             let of_band: Vec<&Told> = all.iter().filter_map(|of| of[k].as_ref()).collect();
             let Some(share) = alike.own_share(band.from_mm).filter(|share| *share <= MOST_OWN) else { continue };
             let Some((values_mm, q)) = predicted(&of_band, share, grid.len()) else { continue };
-            let scatter_mm2 = of_band.iter().map(|of| of.scatter_mm2).sum::<f64>() / of_band.len() as f64;
+            let scatter_mm2 = of_band.iter().map(|of| of.noise_mm2).sum::<f64>() / of_band.len() as f64;
             let counts = (CORRELATED * band.independent(&on_grid)).recip();
             band.scatter = [counts * scatter_mm2, counts];
             band.belief = Some((q / scatter_mm2).max(LEAST_BELIEF));
@@ -201,7 +201,7 @@ impl LearningState {
             known.wanted_mm = Some(mean.values_mm.iter().map(|r| -r / known.response[0]).collect());
             known.mean = Some(mean);
         }
-        Some(Shared { known, differ })
+        Some(Shared { state: known, own_shares: differ })
     }
 }
 
@@ -220,14 +220,14 @@ fn nothing_on(grid: Grid) -> ErrorOnGrid {
 fn told(known: &LearningState, grid: &Grid) -> Vec<Option<Told>> {
     let Some(mean) = &known.mean else { return known.bands.iter().map(|_| None).collect() };
     let on_grid = nothing_on(*grid);
-    let parts = known.split(&on_grid, mean.grid.resample(&mean.values_mm, grid));
+    let parts = known.split_bands(&on_grid, mean.grid.resample(&mean.values_mm, grid));
     let of_band = |(band, values_mm): (&Band, Vec<f64>)| {
-        let (belief, scatter_mm2) = band.belief.zip(band.scatter_mm2())?;
+        let (belief, scatter_mm2) = band.belief.zip(band.noise_mm2())?;
         let is_told = scatter_mm2 > 0.0 && band.borrowed <= MOST_BORROWED;
         // The machine's own part of the mean is what remains without the borrowed share, so its variance is larger.
         let variance_mm2 = belief * scatter_mm2 / (1.0 - band.borrowed).powi(2);
         let mean_mm2 = on_grid.mean_square(&values_mm);
-        is_told.then_some(Told { values_mm, mean_mm2, variance_mm2, scatter_mm2 })
+        is_told.then_some(Told { values_mm, mean_mm2, variance_mm2, noise_mm2: scatter_mm2 })
     };
     known.bands.iter().zip(parts).map(of_band).collect()
 }
@@ -260,16 +260,16 @@ fn predicted(machines: &[&Told], own_share: f64, nodes: usize) -> Option<(Vec<f6
 
 /// Returns the band of all wavelengths together, with the non-repeatable error of the others unless it has its own.
 fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
-    let of_others: Vec<f64> = others.iter().filter_map(|other| other.whole.scatter_mm2()).collect();
+    let of_others: Vec<f64> = others.iter().filter_map(|other| other.whole.noise_mm2()).collect();
     let others_mm2 = of_others.iter().sum::<f64>() / of_others.len() as f64;
-    let scatter = if own.scatter_mm2().is_some() || of_others.is_empty() {
+    let scatter = if own.noise_mm2().is_some() || of_others.is_empty() {
         own.scatter
     } else {
         let counts = CORRELATED.recip();
         [counts * others_mm2, counts]
     };
     let with = Band { scatter, ..*own };
-    let belief = with.scatter_mm2().filter(|n2| *n2 > 0.0).map(|n2| (variance_mm2 / n2).max(LEAST_BELIEF));
+    let belief = with.noise_mm2().filter(|n2| *n2 > 0.0).map(|n2| (variance_mm2 / n2).max(LEAST_BELIEF));
     Band { belief, borrowed: 1.0, ..with }
 }
 
@@ -341,16 +341,16 @@ mod tests {
         let (one, two) = (flat(5f64.sqrt()), flat(-(5f64.sqrt())));
         let begun =
             |others: &[&LearningState]| fresh(GainRule::Adaptive).begun_with(others, &stated(0.5), GRID).unwrap();
-        let Shared { known, differ } = begun(&[&one, &one]);
+        let Shared { state: known, own_shares: differ } = begun(&[&one, &one]);
         let values = &known.mean.as_ref().unwrap().values_mm;
         assert!(values.iter().all(|v| (v - 4.0 / 7.0 * 5f64.sqrt()).abs() < 1e-12), "{}", values[0]);
         assert!((known.bands[0].belief.unwrap() - 10.0 / 7.0).abs() < 1e-12, "{:?}", known.bands);
-        assert!((differ[0][1] - 0.5f64.sqrt()).abs() < 1e-12 && known.is_sound());
-        for (wanted, r) in known.wanted_mm().unwrap().iter().zip(values) {
+        assert!((differ[0][1] - 0.5f64.sqrt()).abs() < 1e-12 && known.is_valid());
+        for (wanted, r) in known.next_correction_mm().unwrap().iter().zip(values) {
             assert_eq!(*wanted, -r / known.response()[0]);
         }
         // Two machines that contradict each other.
-        assert!(power(&begun(&[&one, &two]).known.mean.unwrap().values_mm) < 1e-24);
+        assert!(power(&begun(&[&one, &two]).state.mean.unwrap().values_mm) < 1e-24);
     }
 
     #[test]
@@ -359,10 +359,10 @@ mod tests {
             let other = machine(rule, field(1), [0.5, 1e-9]);
             let begun = |alike: &Alike| fresh(rule).begun_with(&[&other], alike, GRID).unwrap();
             for unlike in [stated(1.0), stated(0.51), Alike::default()] {
-                let Shared { known, differ } = begun(&unlike);
+                let Shared { state: known, own_shares: differ } = begun(&unlike);
                 assert!(differ.is_empty() && known == fresh(rule));
             }
-            let Shared { known, differ } = begun(&stated(0.0));
+            let Shared { state: known, own_shares: differ } = begun(&stated(0.0));
             assert_eq!(differ.len(), known.bands.len());
             for (a, b) in known.mean.unwrap().values_mm.iter().zip(field(1)) {
                 assert!((a - b).abs() < 1e-6, "{a} {b}");
@@ -383,7 +383,7 @@ mod tests {
                 // A noise of 0.05 in all, divided between the bands as white noise is.
                 let machines = [100 + 2 * pair, 101 + 2 * pair].map(|seed| {
                     let mut known = machine(rule, of(seed), [1.0, 1.0]);
-                    let noise = known.split(&nothing_on(GRID), sum(&[(0.05, &field(seed + 1000))]));
+                    let noise = known.split_bands(&nothing_on(GRID), sum(&[(0.05, &field(seed + 1000))]));
                     for (band, noise) in known.bands.iter_mut().zip(noise) {
                         band.scatter = [power(&noise), 1.0];
                     }
@@ -405,7 +405,7 @@ mod tests {
             (0..4).map(|k| machine(rule, field(k), [0.3 + 0.2 * k as f64, 1e-2 * (k + 1) as f64])).collect();
         let of = |order: [usize; 4]| {
             let others: Vec<&LearningState> = order.iter().map(|k| &machines[*k]).collect();
-            let Shared { known, differ } = fresh(rule).begun_with(&others, &stated(0.5), GRID).unwrap();
+            let Shared { state: known, own_shares: differ } = fresh(rule).begun_with(&others, &stated(0.5), GRID).unwrap();
             (known.mean.unwrap().values_mm, known.bands, known.response, differ)
         };
         let (values, bands, response, differ) = of([0, 1, 2, 3]);
@@ -422,14 +422,14 @@ mod tests {
         // However certain the others are.
         let rule = GainRule::Adaptive;
         let other = machine(rule, vec![5.0; GRID.len()], [0.02, 1e-4]);
-        let mut known = fresh(rule).begun_with(&[&other], &stated(0.01), GRID).unwrap().known;
+        let mut known = fresh(rule).begun_with(&[&other], &stated(0.01), GRID).unwrap().state;
         let mut alone = fresh(rule);
-        let none = Correction::none(GRID, 0.0);
+        let none = Correction::zero(GRID, 0.0);
         for pass in 1..=8 {
             let values = field(40 + pass).iter().map(|noise| 4.98 + 0.01 * noise).collect();
-            let error = ErrorMap::known(GRID, values, vec![true; GRID.len()]);
-            let seen = Seen { correction: &none, error: &error, answer: None, smooth: None };
-            (known, alone) = (known.after(&seen), alone.after(&seen));
+            let error = ErrorMap::exact(GRID, values, vec![true; GRID.len()]);
+            let seen = Seen { correction: &none, error: &error, response: None, explained: None };
+            (known, alone) = (known.updated(&seen), alone.updated(&seen));
             let [of, without] = [&known, &alone].map(|of| of.bands[0].belief.unwrap());
             assert!(of <= without + 1e-12, "pass {pass}: {of} against {without}");
         }
@@ -447,7 +447,7 @@ mod tests {
         let mut alike = Alike::default();
         assert!(!alike.compare([&one, &told], true) && alike.comparisons() == 0);
         let shared = fresh(rule).begun_with(&[&told], &stated(0.1), GRID).unwrap();
-        assert!(shared.differ.is_empty());
+        assert!(shared.own_shares.is_empty());
     }
 
     #[test]
@@ -458,7 +458,7 @@ mod tests {
         let mut other = machine(rule, on(GRID), [0.1, 1e-6]);
         other.mean = Some(Mean { grid: finer, values_mm: on(finer) });
         let shared = fresh(rule).begun_with(&[&other], &stated(0.05), GRID).unwrap();
-        for (a, b) in shared.known.mean.unwrap().values_mm.iter().zip(on(GRID)) {
+        for (a, b) in shared.state.mean.unwrap().values_mm.iter().zip(on(GRID)) {
             assert!((a - b).abs() < 0.02 * b.abs() + 0.01, "{a} {b}");
         }
         let mut alike = Alike::default();
@@ -485,7 +485,7 @@ mod tests {
         let grid = Grid { columns: 1_500_000, rows: 1, first_mm: [0.0; 2], spacing_mm: [1e-9, 1.0] };
         long.mean = Some(Mean { grid, values_mm: vec![0.0; grid.len()] });
         for (state, why) in [(certain, "no uncertainty"), (huge, "1.000e200 mm"), (long, "1500000 x 1 nodes")] {
-            assert!(state.is_sound() && state.unfit_to_teach().unwrap().contains(why), "{:?}", state.unfit_to_teach());
+            assert!(state.is_valid() && state.unfit_to_teach().unwrap().contains(why), "{:?}", state.unfit_to_teach());
         }
     }
 
@@ -498,7 +498,7 @@ mod tests {
         let mut borrowed = own.clone();
         borrowed.bands.iter_mut().for_each(|band| band.borrowed = 0.9);
         let begun =
-            |others: &[&LearningState]| fresh(rule).begun_with(others, &stated(0.1), GRID).unwrap().known.response;
+            |others: &[&LearningState]| fresh(rule).begun_with(others, &stated(0.1), GRID).unwrap().state.response;
         assert_eq!(begun(&[&own, &borrowed, &borrowed]), begun(&[&own]));
     }
 

@@ -384,7 +384,7 @@ fn bending(axes: &[Axis; 2]) -> Vec<f64> {
 struct Local {
     first: usize,
     across: usize,
-    at: [f64; 2],
+    fraction: [f64; 2],
     shares: [f64; 16],
 }
 
@@ -393,7 +393,7 @@ impl Local {
         let ((i, u), (j, v)) = (axes[0].cell(place[0]), axes[1].cell(place[1]));
         let (x, y) = (basis(0, u), basis(0, v));
         let across = axes[0].count();
-        Self { first: j * across + i, across, at: [u, v], shares: std::array::from_fn(|k| x[k % 4] * y[k / 4]) }
+        Self { first: j * across + i, across, fraction: [u, v], shares: std::array::from_fn(|k| x[k % 4] * y[k / 4]) }
     }
 
     fn index(&self, k: usize) -> usize {
@@ -406,8 +406,8 @@ impl Local {
 
     fn slopes(&self, axes: &[Axis; 2], coefficients: &[f64]) -> [f64; 2] {
         [0, 1].map(|axis| {
-            let x = basis(usize::from(axis == 0), self.at[0]);
-            let y = basis(usize::from(axis == 1), self.at[1]);
+            let x = basis(usize::from(axis == 0), self.fraction[0]);
+            let y = basis(usize::from(axis == 1), self.fraction[1]);
             (0..16).map(|k| x[k % 4] * y[k / 4] * coefficients[self.index(k)]).sum::<f64>() / axes[axis].step
         })
     }

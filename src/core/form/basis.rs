@@ -38,7 +38,7 @@ pub enum Basis {
 impl Basis {
     /// Returns the polynomials that suit an aperture: Zernike for a disc, a ring and an ellipse, Legendre for a
     /// rectangle and a polygon.
-    pub fn of(aperture: &Aperture) -> Self {
+    pub fn for_aperture(aperture: &Aperture) -> Self {
         match aperture {
             Aperture::Circle { .. } | Aperture::Annulus { .. } | Aperture::Ellipse { .. } => Self::zernike(aperture),
             Aperture::Rectangle { .. } | Aperture::Polygon { .. } => Self::legendre(aperture.bounds()),
@@ -76,7 +76,7 @@ impl Basis {
     }
 
     /// Returns the name of a term, counted from 0: index and degree with azimuthal order, or the two degrees.
-    pub fn term(&self, k: usize) -> String {
+    pub fn term_name(&self, k: usize) -> String {
         match self {
             Self::Zernike { numbering, .. } => {
                 let index = first(*numbering) + k as u32;
@@ -91,7 +91,7 @@ impl Basis {
     }
 
     /// Returns the maximum number of terms.
-    pub(super) fn most(&self) -> usize {
+    pub(super) fn max_terms(&self) -> usize {
         match self {
             Self::Zernike { numbering: ZernikeNumbering::Fringe, .. } => 37,
             Self::Zernike { .. } => MOST_ZERNIKE,
@@ -100,20 +100,20 @@ impl Basis {
     }
 
     /// Returns the largest complete number of terms up to `most`: no term lacks its companions of the same order.
-    pub(super) fn complete(&self, most: usize) -> usize {
+    pub(super) fn complete_terms(&self, most: usize) -> usize {
         let counts =
             |fringe: bool| (0..).map(move |n: usize| if fringe { (n + 1) * (n + 1) } else { (n + 1) * (n + 2) / 2 });
         let fringe = matches!(self, Self::Zernike { numbering: ZernikeNumbering::Fringe, .. });
-        counts(fringe).take_while(|count| *count <= most.min(self.most())).last().unwrap_or(0)
+        counts(fringe).take_while(|count| *count <= most.min(self.max_terms())).last().unwrap_or(0)
     }
 
     /// Prepares the first terms for evaluation.
     ///
     /// # Errors
     /// A number of terms out of range, and a domain without an area.
-    pub(super) fn terms(&self, terms: usize) -> Result<Terms, FormError> {
-        if !(1..=self.most()).contains(&terms) {
-            return Err(FormError::Terms { terms, basis: self.name(), most: self.most() });
+    pub(super) fn prepare_terms(&self, terms: usize) -> Result<Terms, FormError> {
+        if !(1..=self.max_terms()).contains(&terms) {
+            return Err(FormError::Terms { terms, basis: self.name(), max_terms: self.max_terms() });
         }
         match self {
             Self::Zernike { radius_mm, .. } if !(*radius_mm > 0.0 && radius_mm.is_finite()) => Err(FormError::NoArea),
@@ -147,7 +147,7 @@ impl Terms {
 
     /// Writes the value of every term at a sample to `row`. `index` identifies the sample in errors.
     pub(super) fn values(&self, index: usize, sample: &Sample, row: &mut [f64]) -> Result<(), FormError> {
-        let [x, y] = sample.at_mm;
+        let [x, y] = sample.place_mm;
         match self {
             Self::Zernike { orders, centre_mm, radius_mm, .. } => {
                 let (x, y) = (x - centre_mm[0], y - centre_mm[1]);
@@ -253,16 +253,16 @@ mod tests {
     #[test]
     fn terms_are_named_and_ordered() {
         let rectangle = Basis::legendre([[-2.0, 0.0], [4.0, 2.0]]);
-        assert_eq!((rectangle.term(0), rectangle.term(4)), ("L0(x) L0(y)".into(), "L1(x) L1(y)".into()));
+        assert_eq!((rectangle.term_name(0), rectangle.term_name(4)), ("L0(x) L0(y)".into(), "L1(x) L1(y)".into()));
         assert_eq!((0..6).map(degrees).collect::<Vec<_>>(), [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]]);
-        assert_eq!([1, 2, 3, 9, 36, 200].map(|most| rectangle.complete(most)), [1, 1, 3, 6, 36, 105]);
+        assert_eq!([1, 2, 3, 9, 36, 200].map(|most| rectangle.complete_terms(most)), [1, 1, 3, 6, 36, 105]);
         let ring = Aperture::Annulus { centre_mm: [1.0, 2.0], inner_radius_mm: 3.0, outer_radius_mm: 9.0 };
-        let Basis::Zernike { centre_mm, radius_mm, .. } = Basis::of(&ring) else { panic!("discs have Zernike's") };
+        let Basis::Zernike { centre_mm, radius_mm, .. } = Basis::for_aperture(&ring) else { panic!("discs have Zernike's") };
         assert_eq!((centre_mm, radius_mm), ([1.0, 2.0], 9.0));
-        assert_eq!((Basis::of(&ring).term(8), Basis::of(&ring).complete(40)), ("Z9 (4, 0)".into(), 36));
+        assert_eq!((Basis::for_aperture(&ring).term_name(8), Basis::for_aperture(&ring).complete_terms(40)), ("Z9 (4, 0)".into(), 36));
         let square = Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 6.0, height_mm: 8.0 };
         assert!(matches!(Basis::zernike(&square), Basis::Zernike { radius_mm: 5.0, .. }));
-        assert!(matches!(rectangle.terms(0), Err(FormError::Terms { most: 105, .. })));
+        assert!(matches!(rectangle.prepare_terms(0), Err(FormError::Terms { max_terms: 105, .. })));
     }
 
     #[test]
@@ -270,10 +270,10 @@ mod tests {
         use crate::surface::analytic::{Zernike, ZernikeDefinition, ZernikeNormalisation};
         for numbering in [ZernikeNumbering::Fringe, ZernikeNumbering::Noll, ZernikeNumbering::Ansi] {
             let basis = Basis::Zernike { numbering, centre_mm: [1.0, -2.0], radius_mm: 20.0 };
-            let terms = basis.terms(basis.most()).unwrap();
+            let terms = basis.prepare_terms(basis.max_terms()).unwrap();
             let mut row = vec![f64::NAN; terms.len()];
             for at_mm in [[1.0, -2.0], [8.0, 3.0], [-12.0, 11.5], [21.0, -2.0], [1.0, -27.0]] {
-                terms.values(0, &Sample { at_mm, deviation_mm: 0.0 }, &mut row).unwrap();
+                terms.values(0, &Sample { place_mm: at_mm, deviation_mm: 0.0 }, &mut row).unwrap();
                 for (k, value) in row.iter().enumerate() {
                     let written = ZernikeDefinition {
                         numbering,
@@ -284,7 +284,7 @@ mod tests {
                     };
                     let surface = Zernike::try_from(&written).unwrap();
                     let (expected, _) = surface.sag_and_gradient(at_mm[0] - 1.0, at_mm[1] + 2.0).unwrap();
-                    assert!((value - expected).abs() <= 1e-11 * expected.abs().max(1.0), "{}: {value}", basis.term(k));
+                    assert!((value - expected).abs() <= 1e-11 * expected.abs().max(1.0), "{}: {value}", basis.term_name(k));
                 }
             }
         }

@@ -10,7 +10,7 @@ use crate::geometry::Sample;
 #[non_exhaustive]
 pub enum FormError {
     #[error("there are {points} points; at least {least} are required; measure more points or request fewer terms")]
-    TooFewPoints { points: usize, least: usize },
+    TooFewPoints { points: usize, min_points: usize },
     #[error("point {} has a place or a deviation that is not a finite number; remove it", index + 1)]
     NotFinite { index: usize },
     #[error("the points lie at one place or on a line, and the figure requires an area; measure across the part")]
@@ -21,7 +21,7 @@ pub enum FormError {
     )]
     Undetermined { term: String, points: usize },
     #[error("{terms} terms are requested, and {basis} has 1 to {most}; request fewer")]
-    Terms { terms: usize, basis: &'static str, most: usize },
+    Terms { terms: usize, basis: &'static str, max_terms: usize },
     #[error(
         "point {} lies {distance_mm} mm from the middle of polynomials with a radius of {radius_mm} mm; the limit is \
          1.5 times the radius; correct the aperture or remove the point", index + 1
@@ -41,7 +41,7 @@ pub enum FormError {
 /// Rejects samples that are too few or not finite.
 pub(super) fn check(samples: &[Sample], least: usize) -> Result<(), FormError> {
     if samples.len() < least {
-        return Err(FormError::TooFewPoints { points: samples.len(), least });
+        return Err(FormError::TooFewPoints { points: samples.len(), min_points: least });
     }
     match samples.iter().position(|sample| !sample.is_finite()) {
         Some(index) => Err(FormError::NotFinite { index }),

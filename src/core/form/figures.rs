@@ -81,7 +81,7 @@ pub struct Figures {
     /// Robust peak to valley.
     pub pvr: RobustPv,
     /// PV of all points without the outermost 0.2 %, by [`pv_of_most`].
-    pub pv998_mm: f64,
+    pub pv_998_mm: f64,
     /// Root mean square about zero.
     pub rms_mm: f64,
     /// Mean deviation.
@@ -112,7 +112,7 @@ pub fn figures(samples: &[Sample], options: &FormOptions) -> Result<Figures, For
     check(samples, 4)?;
     let aperture = match &options.aperture {
         Some(aperture) => aperture.clone(),
-        None => rectangle(bounds(samples.iter().map(|s| s.at_mm)))?,
+        None => rectangle(bounds(samples.iter().map(|s| s.place_mm)))?,
     };
     let mut removed = options.removed.clone();
     removed.sort();
@@ -120,12 +120,12 @@ pub fn figures(samples: &[Sample], options: &FormOptions) -> Result<Figures, For
     let samples = without(&removed, samples)?;
     let points = samples.len();
     let by_value = |a: &&Sample, b: &&Sample| a.deviation_mm.total_cmp(&b.deviation_mm);
-    let extreme = |s: &Sample| Extreme { value_mm: s.deviation_mm, at_mm: s.at_mm };
+    let extreme = |s: &Sample| Extreme { value_mm: s.deviation_mm, at_mm: s.place_mm };
     let (Some(highest), Some(lowest)) = (samples.iter().max_by(by_value), samples.iter().min_by(by_value)) else {
-        return Err(FormError::TooFewPoints { points, least: 4 });
+        return Err(FormError::TooFewPoints { points, min_points: 4 });
     };
     let mean = |f: fn(f64) -> f64| samples.iter().map(|s| f(s.deviation_mm)).sum::<f64>() / points as f64;
-    let basis = Basis::of(&aperture);
+    let basis = Basis::for_aperture(&aperture);
     let suited = fit_most(&basis, PVR_TERMS, &samples)?;
     let of_kind = |wanted: Basis| {
         if wanted == basis { Some(suited.clone()) } else { fit_most(&wanted, PVR_TERMS, &samples).ok() }
@@ -134,7 +134,7 @@ pub fn figures(samples: &[Sample], options: &FormOptions) -> Result<Figures, For
         points,
         pv_mm: highest.deviation_mm - lowest.deviation_mm,
         pvr: robust_pv(&suited, &samples)?,
-        pv998_mm: pv_of_most(samples.iter().map(|s| s.deviation_mm)).unwrap_or_default(),
+        pv_998_mm: pv_of_most(samples.iter().map(|s| s.deviation_mm)).unwrap_or_default(),
         rms_mm: mean(|d| d * d).sqrt(),
         mean_mm: mean(|d| d),
         highest: extreme(highest),
@@ -149,7 +149,7 @@ pub fn figures(samples: &[Sample], options: &FormOptions) -> Result<Figures, For
 
 fn rectangle([low, high]: [[f64; 2]; 2]) -> Result<Aperture, FormError> {
     let has_area = (0..2).all(|k| high[k] - low[k] > 0.0);
-    if has_area { Ok(Aperture::between([low, high])) } else { Err(FormError::NoArea) }
+    if has_area { Ok(Aperture::from_corners([low, high])) } else { Err(FormError::NoArea) }
 }
 
 fn robust_pv(fit: &Fit, samples: &[Sample]) -> Result<RobustPv, FormError> {
@@ -186,7 +186,7 @@ fn coverage(aperture: &Aperture, samples: &[Sample]) -> Coverage {
     let count: [usize; 2] = std::array::from_fn(|k| (size[k] / cell_mm).ceil().max(1.0) as usize);
     let mut held = vec![false; count[0] * count[1]];
     for sample in samples {
-        let place: [f64; 2] = std::array::from_fn(|k| (sample.at_mm[k] - low[k]) / cell_mm);
+        let place: [f64; 2] = std::array::from_fn(|k| (sample.place_mm[k] - low[k]) / cell_mm);
         if place.iter().all(|p| *p >= 0.0) {
             let [i, j]: [usize; 2] = std::array::from_fn(|k| (place[k] as usize).min(count[k] - 1));
             held[j * count[0] + i] = true;

@@ -45,11 +45,11 @@ pub struct Fit {
 /// Fewer points than terms; a term that the points do not determine; a point that is not finite or far outside.
 pub fn fit(basis: &Basis, terms: usize, samples: &[Sample]) -> Result<Fit, FormError> {
     check(samples, terms)?;
-    let rows = basis.terms(terms)?;
+    let rows = basis.prepare_terms(terms)?;
     let solved = solve(terms, samples, |index, sample, row| rows.values(index, sample, row))?;
     let Solved { coefficients, orthogonal, residual, undetermined } = solved;
     if let Some(k) = undetermined {
-        return Err(FormError::Undetermined { term: basis.term(k), points: samples.len() });
+        return Err(FormError::Undetermined { term: basis.term_name(k), points: samples.len() });
     }
     Ok(Fit {
         basis: basis.clone(),
@@ -66,10 +66,10 @@ pub fn fit(basis: &Basis, terms: usize, samples: &[Sample]) -> Result<Fit, FormE
 /// Points that do not determine even one term, or that are not finite or far outside.
 pub fn fit_most(basis: &Basis, most: usize, samples: &[Sample]) -> Result<Fit, FormError> {
     check(samples, POINTS_A_TERM)?;
-    let mut terms = basis.complete(most.min(samples.len() / POINTS_A_TERM));
+    let mut terms = basis.complete_terms(most.min(samples.len() / POINTS_A_TERM));
     loop {
         match fit(basis, terms, samples) {
-            Err(FormError::Undetermined { .. }) if terms > 1 => terms = basis.complete(terms - 1),
+            Err(FormError::Undetermined { .. }) if terms > 1 => terms = basis.complete_terms(terms - 1),
             fitted => return fitted,
         }
     }
@@ -81,7 +81,7 @@ impl Fit {
     /// # Errors
     /// A sample far outside of the polynomials' domain.
     pub fn values_mm(&self, samples: &[Sample]) -> Result<Vec<f64>, FormError> {
-        let terms: Terms = self.basis.terms(self.coefficients_mm.len())?;
+        let terms: Terms = self.basis.prepare_terms(self.coefficients_mm.len())?;
         let value = |row: &mut Vec<f64>, (index, sample): (usize, &Sample)| {
             terms.values(index, sample, row)?;
             Ok(row.iter().zip(&self.coefficients_mm).map(|(value, c)| value * c).sum())

@@ -58,16 +58,16 @@ pub fn iso_10110(samples: &[Sample], aperture: &Aperture, wavelength_nm: f64) ->
     }
     let [low, high] = aperture.bounds();
     let middle: [f64; 2] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
-    let radius = samples.iter().map(|s| (s.at_mm[0] - middle[0]).hypot(s.at_mm[1] - middle[1])).fold(0.0, f64::max);
+    let radius = samples.iter().map(|s| (s.place_mm[0] - middle[0]).hypot(s.place_mm[1] - middle[1])).fold(0.0, f64::max);
     let square = |s: &Sample| {
-        let [x, y]: [f64; 2] = std::array::from_fn(|k| (s.at_mm[k] - middle[k]) / radius);
+        let [x, y]: [f64; 2] = std::array::from_fn(|k| (s.place_mm[k] - middle[k]) / radius);
         x * x + y * y
     };
     let total = without(&[Removed::Piston, Removed::Tilt], samples)?;
     let irregularity = without(&[Removed::Piston, Removed::Tilt, Removed::Power], samples)?;
     // The coefficient of r^2. Its origin does not matter, because piston and tilt are fitted too.
     let power = solve(4, samples, |_, s, row| {
-        let [x, y]: [f64; 2] = std::array::from_fn(|k| (s.at_mm[k] - middle[k]) / radius);
+        let [x, y]: [f64; 2] = std::array::from_fn(|k| (s.place_mm[k] - middle[k]) / radius);
         row.copy_from_slice(&[1.0, x, y, x * x + y * y]);
         Ok(())
     })?

@@ -41,8 +41,8 @@ pub struct TakenOut {
 
 impl TakenOut {
     /// Returns the words for the motion and for the removed forms, separated by commas.
-    pub fn removed(&self, forms: &[Removed]) -> String {
-        let words = std::iter::once(self.motion.as_str()).chain(forms.iter().map(|form| form.word()));
+    pub fn describe(&self, forms: &[Removed]) -> String {
+        let words = std::iter::once(self.motion.as_str()).chain(forms.iter().map(|form| form.name()));
         words.collect::<Vec<_>>().join(", ")
     }
 }
@@ -55,7 +55,7 @@ pub const EVERY_POINT: &str = "none: every point used";
 /// Units: micrometres; coverage in percent.
 pub fn labelled(figures: &Figures, taken_out: &TakenOut) -> Vec<Labelled> {
     let Figures { pvr, highest, lowest, coverage, .. } = figures;
-    let removed = taken_out.removed(&figures.removed);
+    let removed = taken_out.describe(&figures.removed);
     let um = |name, mm: f64, made: &str| row(name, 1e3 * mm, "um", &removed, EVERY_POINT, made);
     let of_fit = format!(
         "robust: PV of {} {} terms fitted to all points, {:.4} um, and 3 times the rms of the rest, {:.4} um",
@@ -70,7 +70,7 @@ pub fn labelled(figures: &Figures, taken_out: &TakenOut) -> Vec<Labelled> {
         um("PVr", pvr.value_mm, &of_fit),
         um(
             "PV 99.8 % of the points",
-            figures.pv998_mm,
+            figures.pv_998_mm,
             "of all points but the outermost 0.1 % at either end: largest less least",
         ),
         um("RMS of the points", figures.rms_mm, "of all points, about zero"),

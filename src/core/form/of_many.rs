@@ -15,13 +15,13 @@ const NEW: f64 = 1e-7;
 /// Fits of ISO 10110-5 over a set of places.
 pub struct IsoFits {
     /// Piston, x and y tilt and r^2, orthogonal, each with one value per place.
-    base: Vec<Vec<f64>>,
+    quadric_terms: Vec<Vec<f64>>,
     /// Coefficient of r^2 / R^2 for a unit of the last of these terms, and the peak to valley of r^2 / R^2 over the
     /// places.
     power: f64,
     power_pv: f64,
     /// Terms that are symmetric about the centre.
-    even: Vec<Vec<f64>>,
+    symmetric_terms: Vec<Vec<f64>>,
 }
 
 /// Figures of ISO 10110-5 of a form. Units: millimetres.
@@ -48,7 +48,7 @@ impl IsoFits {
     /// `None` if the places are too few or do not determine a fit.
     ///
     /// Frame: model. Units: millimetres.
-    pub fn over(places: &[[f64; 2]], middle_mm: Option<[f64; 2]>) -> Option<Self> {
+    pub fn new(places: &[[f64; 2]], middle_mm: Option<[f64; 2]>) -> Option<Self> {
         if places.len() < FEWEST {
             return None;
         }
@@ -67,17 +67,17 @@ impl IsoFits {
         let even = DMatrix::from_fn(places.len(), SYMMETRIC + 1, |r, c| even_terms(square(r))[c]);
         let carried = (SYMMETRIC + 1).min(places.len() / 4).max(1);
         let (even, _) = (1..=carried).rev().find_map(|terms| orthogonal(&even.columns(0, terms).into_owned()))?;
-        Some(Self { base, power: 1.0 / scales[3], power_pv: most - least, even })
+        Some(Self { quadric_terms: base, power: 1.0 / scales[3], power_pv: most - least, symmetric_terms: even })
     }
 
     /// Computes the figures of a form, given as one value per place, in their order.
-    pub fn of(&self, form: &[f64]) -> IsoOfForm {
+    pub fn evaluate(&self, form: &[f64]) -> IsoOfForm {
         let n = form.len() as f64;
         let dot = |row: &[f64], with: &[f64]| row.iter().zip(with).map(|(a, b)| a * b).sum::<f64>();
         let mut rest = form.to_vec();
         let mut taken = [0.0; 4];
         let mut rms_total_mm = 0.0;
-        for (c, (taken, term)) in taken.iter_mut().zip(&self.base).enumerate() {
+        for (c, (taken, term)) in taken.iter_mut().zip(&self.quadric_terms).enumerate() {
             if c == 3 {
                 rms_total_mm = (dot(&rest, &rest) / n).sqrt();
             }
@@ -85,7 +85,7 @@ impl IsoFits {
             rest.iter_mut().zip(term).for_each(|(value, term)| *value -= *taken * term);
         }
         let mut even = vec![0.0; form.len()];
-        for term in &self.even {
+        for term in &self.symmetric_terms {
             let share = dot(term, &rest);
             even.iter_mut().zip(term).for_each(|(value, term)| *value += share * term);
         }
@@ -129,7 +129,7 @@ mod tests {
     fn of_one_form_it_is_what_the_figures_of_one_form_are() {
         let aperture = Aperture::Circle { centre_mm: [0.0; 2], radius_mm: 20.0 };
         for places in [disc(1.3), disc(4.0), disc(8.0)] {
-            let fits = IsoFits::over(&places, Some([0.0; 2])).unwrap();
+            let fits = IsoFits::new(&places, Some([0.0; 2])).unwrap();
             let form = |[x, y]: [f64; 2]| {
                 1e-3 * (0.4 + 0.02 * x - 0.01 * y
                     + 2e-3 * (x * x + y * y)
@@ -138,8 +138,8 @@ mod tests {
             };
             let values: Vec<f64> = places.iter().map(|&at| form(at)).collect();
             let samples: Vec<Sample> =
-                places.iter().map(|&at_mm| Sample { at_mm, deviation_mm: form(at_mm) }).collect();
-            let (one, many) = (iso_10110(&samples, &aperture, 632.8).unwrap(), fits.of(&values));
+                places.iter().map(|&at_mm| Sample { place_mm: at_mm, deviation_mm: form(at_mm) }).collect();
+            let (one, many) = (iso_10110(&samples, &aperture, 632.8).unwrap(), fits.evaluate(&values));
             for (one_nm, many_mm) in [
                 (one.power_nm, many.power_mm),
                 (one.power_rim_nm, many.power_rim_mm),
@@ -157,9 +157,9 @@ mod tests {
     #[test]
     fn a_motion_changes_nothing_and_a_sphere_has_power_alone() {
         let places = disc(2.0);
-        let fits = IsoFits::over(&places, None).unwrap();
+        let fits = IsoFits::new(&places, None).unwrap();
         let of =
-            |form: &dyn Fn(f64, f64) -> f64| fits.of(&places.iter().map(|[x, y]| form(*x, *y)).collect::<Vec<_>>());
+            |form: &dyn Fn(f64, f64) -> f64| fits.evaluate(&places.iter().map(|[x, y]| form(*x, *y)).collect::<Vec<_>>());
         let sphere = of(&|x, y| 5e-6 * (x * x + y * y) + 0.3 - 2e-3 * x + 1e-3 * y);
         // 5e-6 * 20^2 from the middle to the rim.
         assert!((sphere.power_mm - 2e-3).abs() < 1e-12 && (sphere.power_rim_mm - 2e-3).abs() < 1e-12, "{sphere:?}");
@@ -170,8 +170,8 @@ mod tests {
 
     #[test]
     fn too_few_places_and_places_on_a_line_have_no_figures() {
-        assert!(IsoFits::over(&disc(2.0)[..11], None).is_none());
+        assert!(IsoFits::new(&disc(2.0)[..11], None).is_none());
         let line: Vec<[f64; 2]> = (0..40).map(|k| [f64::from(k), 0.5 * f64::from(k)]).collect();
-        assert!(IsoFits::over(&line, None).is_none() && IsoFits::over(&[[3.0; 2]; 40], None).is_none());
+        assert!(IsoFits::new(&line, None).is_none() && IsoFits::new(&[[3.0; 2]; 40], None).is_none());
     }
 }

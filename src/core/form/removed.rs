@@ -28,7 +28,7 @@ pub enum Removed {
 
 impl Removed {
     /// Returns the name of the form.
-    pub fn word(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::Piston => "piston",
             Self::Tilt => "tilt",
@@ -45,7 +45,7 @@ impl Removed {
 /// # Errors
 /// Too few points, points at one place, and forms that the points do not determine.
 pub(super) fn without(removed: &[Removed], samples: &[Sample]) -> Result<Vec<Sample>, FormError> {
-    let [low, high] = bounds(samples.iter().map(|s| s.at_mm));
+    let [low, high] = bounds(samples.iter().map(|s| s.place_mm));
     let middle: [f64; 2] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
     let half = 0.5 * (high[0] - low[0]).max(high[1] - low[1]);
     if removed.is_empty() {
@@ -56,7 +56,7 @@ pub(super) fn without(removed: &[Removed], samples: &[Sample]) -> Result<Vec<Sam
     }
     // Lengths in half sizes of the part, so that every term is of order 1.
     let values = |sample: &Sample| {
-        let [x, y]: [f64; 2] = std::array::from_fn(|k| (sample.at_mm[k] - middle[k]) / half);
+        let [x, y]: [f64; 2] = std::array::from_fn(|k| (sample.place_mm[k] - middle[k]) / half);
         let q = x * x + y * y;
         removed.iter().flat_map(move |form| {
             let (first, second) = match form {
@@ -77,7 +77,7 @@ pub(super) fn without(removed: &[Removed], samples: &[Sample]) -> Result<Vec<Sam
         Ok(())
     })?;
     if let Some(k) = solved.undetermined {
-        let names = removed.iter().flat_map(|form| std::iter::repeat_n(form.word(), values_of(*form)));
+        let names = removed.iter().flat_map(|form| std::iter::repeat_n(form.name(), values_of(*form)));
         let term = names.collect::<Vec<_>>()[k].to_owned();
         return Err(FormError::Undetermined { term, points: samples.len() });
     }

@@ -33,7 +33,7 @@ pub struct SlopesAt {
     /// Number of nodes.
     pub nodes: usize,
     /// Start of each node in `weights`, and the end of the last.
-    begins: Vec<usize>,
+    node_starts: Vec<usize>,
     /// Index of a place, and its weights for the slope along x and along y.
     weights: Vec<(usize, [f64; 2])>,
 }
@@ -43,7 +43,7 @@ impl SlopesAt {
     /// they allow. Without a given length it uses the shortest possible. Returns `None` if the places allow no length.
     ///
     /// Frame: model. Units: millimetres.
-    pub fn over(places: &[[f64; 2]], integration_mm: Option<f64>) -> Option<Self> {
+    pub fn new(places: &[[f64; 2]], integration_mm: Option<f64>) -> Option<Self> {
         if places.len() < FEWEST {
             return None;
         }
@@ -60,7 +60,7 @@ impl SlopesAt {
         let mut order: Vec<usize> = (0..places.len()).collect();
         order.sort_by(|&a, &b| places[a][0].total_cmp(&places[b][0]).then(a.cmp(&b)));
         while radius_mm <= longest_mm {
-            let made = Self::within(places, &order, radius_mm);
+            let made = Self::with_radius(places, &order, radius_mm);
             let asked = places.len().min(MOST_NODES) as f64;
             if made.nodes >= FEWEST_NODES && made.nodes as f64 >= SHARE * asked {
                 return Some(made);
@@ -70,7 +70,7 @@ impl SlopesAt {
         None
     }
 
-    fn within(places: &[[f64; 2]], order: &[usize], radius_mm: f64) -> Self {
+    fn with_radius(places: &[[f64; 2]], order: &[usize], radius_mm: f64) -> Self {
         let most = places.len().min(MOST_NODES);
         let (mut begins, mut weights) = (vec![0], Vec::new());
         for of in (0..most).map(|k| k * places.len() / most) {
@@ -79,14 +79,14 @@ impl SlopesAt {
                 begins.push(weights.len());
             }
         }
-        Self { integration_mm: radius_mm * 2f64.sqrt(), nodes: begins.len() - 1, begins, weights }
+        Self { integration_mm: radius_mm * 2f64.sqrt(), nodes: begins.len() - 1, node_starts: begins, weights }
     }
 
     /// Returns the root mean square and the largest of the slopes of a form, in radians. The form has one value per
     /// place, in their order.
-    pub fn of(&self, form: &[f64]) -> [f64; 2] {
+    pub fn evaluate(&self, form: &[f64]) -> [f64; 2] {
         let (mut squares, mut most) = (0.0, 0.0_f64);
-        for ends in self.begins.windows(2) {
+        for ends in self.node_starts.windows(2) {
             let mut slope = [0.0; 2];
             for (place, weight) in &self.weights[ends[0]..ends[1]] {
                 slope[0] += weight[0] * form[*place];
@@ -140,7 +140,7 @@ mod tests {
     }
 
     fn of(at: &SlopesAt, places: &[[f64; 2]], form: impl Fn(f64, f64) -> f64) -> [f64; 2] {
-        at.of(&places.iter().map(|[x, y]| form(*x, *y)).collect::<Vec<_>>())
+        at.evaluate(&places.iter().map(|[x, y]| form(*x, *y)).collect::<Vec<_>>())
     }
 
     #[test]
@@ -148,7 +148,7 @@ mod tests {
         for (places, wanted) in
             [(grid(1.0), None), (grid(2.0), Some(9.0)), (scattered(300), None), (scattered(60), None)]
         {
-            let at = SlopesAt::over(&places, wanted).unwrap();
+            let at = SlopesAt::new(&places, wanted).unwrap();
             let [rms, most] = of(&at, &places, |x, y| 3e-6 * x - 4e-6 * y + 1.0);
             assert!((rms - 5e-6).abs() < 1e-14 && (most - 5e-6).abs() < 1e-14, "{rms} {most}");
             assert_eq!(of(&at, &places, |_, _| 0.0), [0.0; 2]);
@@ -161,7 +161,7 @@ mod tests {
         // sin(kx) over a length L has the slope k cos(kx) sinc(kL/2).
         let k = std::f64::consts::TAU / 20.0;
         for (places, wanted) in [(grid(1.0), 2.0), (grid(1.0), 5.0), (grid(1.0), 8.0), (scattered(2400), 6.0)] {
-            let at = SlopesAt::over(&places, Some(wanted)).unwrap();
+            let at = SlopesAt::new(&places, Some(wanted)).unwrap();
             let length = at.integration_mm;
             let expected = (0.5 * k * length).sin() / (0.5 * k * length) * k * 1e-6 / 2f64.sqrt();
             let [rms, most] = of(&at, &places, |x, _| 1e-6 * (k * x).sin());
@@ -175,11 +175,11 @@ mod tests {
         // A scan: 0.2 mm along, 4 mm across.
         let scan: Vec<[f64; 2]> =
             (0..11).flat_map(|j| (0..301).map(move |i| [0.2 * f64::from(i), 4.0 * f64::from(j)])).collect();
-        let at = SlopesAt::over(&scan, None).unwrap();
+        let at = SlopesAt::new(&scan, None).unwrap();
         assert!((4.0..16.0).contains(&at.integration_mm) && at.nodes > 300, "{} {}", at.integration_mm, at.nodes);
         assert!((of(&at, &scan, |x, y| 1e-6 * (x + y))[0] - 2f64.sqrt() * 1e-6).abs() < 1e-14);
-        assert!(SlopesAt::over(&scattered(19), None).is_none());
+        assert!(SlopesAt::new(&scattered(19), None).is_none());
         let line: Vec<[f64; 2]> = (0..40).map(|k| [f64::from(k), 0.5 * f64::from(k)]).collect();
-        assert!(SlopesAt::over(&line, None).is_none() && SlopesAt::over(&[[1.0; 2]; 40], None).is_none());
+        assert!(SlopesAt::new(&line, None).is_none() && SlopesAt::new(&[[1.0; 2]; 40], None).is_none());
     }
 }

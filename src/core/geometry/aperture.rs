@@ -108,7 +108,7 @@ impl ApertureError {
 
 impl Aperture {
     /// Returns the rectangle between two corners, the lower and the upper.
-    pub(crate) fn between([low, high]: [[f64; 2]; 2]) -> Self {
+    pub(crate) fn from_corners([low, high]: [[f64; 2]; 2]) -> Self {
         let centre_mm = [0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1])];
         Self::Rectangle { centre_mm, width_mm: high[0] - low[0], height_mm: high[1] - low[1] }
     }

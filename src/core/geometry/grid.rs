@@ -92,7 +92,7 @@ impl Grid {
 
     /// Returns true if the grid has nodes, not more than the maximum, at finite places; checks a grid that was read
     /// from a file.
-    pub fn is_sound(&self) -> bool {
+    pub fn is_valid(&self) -> bool {
         let nodes = self.columns as f64 * self.rows as f64;
         self.columns > 0
             && self.rows > 0
@@ -163,11 +163,11 @@ mod tests {
         }
         assert_eq!(grid.nearest([f64::NAN, 5.0]), None);
         assert!(
-            grid.is_sound() && !Grid { columns: 0, ..grid }.is_sound() && !Grid { columns: 1 << 60, ..grid }.is_sound()
+            grid.is_valid() && !Grid { columns: 0, ..grid }.is_valid() && !Grid { columns: 1 << 60, ..grid }.is_valid()
         );
         assert!(
-            !Grid { spacing_mm: [0.0, 1.0], ..grid }.is_sound()
-                && !Grid { first_mm: [f64::NAN, 1.0], ..grid }.is_sound()
+            !Grid { spacing_mm: [0.0, 1.0], ..grid }.is_valid()
+                && !Grid { first_mm: [f64::NAN, 1.0], ..grid }.is_valid()
         );
         let values = [0.0, 1.0, 2.0, 4.0, 5.0, 6.0];
         let finer = Grid { columns: 5, rows: 1, first_mm: [-1.0, 6.0], spacing_mm: [0.5, 1.0] };

@@ -19,15 +19,15 @@ pub struct GridOrder {
     /// Number of nodes along y.
     pub rows: usize,
     /// Index of the point at each node, row by row with x fastest; [`NO_POINT`] if there is none.
-    pub point_at: Vec<u32>,
+    pub point_indices: Vec<u32>,
     /// Number of nodes without a point.
     pub holes: usize,
 }
 
 impl GridOrder {
     /// Returns true if the points already are row by row, x fastest, without a hole.
-    pub(crate) fn is_in_order(&self) -> bool {
-        self.holes == 0 && self.point_at.iter().enumerate().all(|(node, &point)| node as u32 == point)
+    pub(crate) fn is_ordered(&self) -> bool {
+        self.holes == 0 && self.point_indices.iter().enumerate().all(|(node, &point)| node as u32 == point)
     }
 }
 
@@ -106,7 +106,7 @@ pub fn recognise_grid(points: &[Point]) -> Option<GridOrder> {
             return None;
         }
     }
-    Some(GridOrder { columns: x.count, rows: y.count, point_at, holes: nodes - points.len() })
+    Some(GridOrder { columns: x.count, rows: y.count, point_indices: point_at, holes: nodes - points.len() })
 }
 
 /// Equally spaced coordinates along one axis.
@@ -189,7 +189,7 @@ mod tests {
         let points = grid(101, 57, 0.1133, 0.124);
         let order = recognise_grid(&points).unwrap();
         assert_eq!((order.columns, order.rows, order.holes), (101, 57, 0));
-        assert!(order.is_in_order());
+        assert!(order.is_ordered());
         let found = grid_in_order(&points).unwrap();
         assert_eq!((found.columns, found.rows), (101, 57));
         assert_eq!(found.corners, [[points[0].x, points[0].y], [points[101 * 57 - 1].x, points[101 * 57 - 1].y]]);
@@ -197,8 +197,8 @@ mod tests {
         let mixed = shuffled(&points);
         assert_eq!(grid_in_order(&mixed), None);
         let order = recognise_grid(&mixed).unwrap();
-        assert!(!order.is_in_order());
-        for (node, &index) in order.point_at.iter().enumerate() {
+        assert!(!order.is_ordered());
+        for (node, &index) in order.point_indices.iter().enumerate() {
             assert_eq!(mixed[index as usize], points[node]);
         }
     }

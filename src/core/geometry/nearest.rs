@@ -10,13 +10,13 @@ pub(crate) struct Nearest(KDTree<f64, Entry>);
 
 impl Nearest {
     /// Builds the tree of some points. A point that is not finite gets an arbitrary position.
-    pub(crate) fn of(points: impl Iterator<Item = Point>) -> Self {
+    pub(crate) fn new(points: impl Iterator<Item = Point>) -> Self {
         // With 16 points in a leaf the tree is built faster than with 8, and a query takes the same time.
         Self(KDTree::new_with_bucket_size(&points.map(Entry::from).collect::<Vec<_>>(), 16))
     }
 
     /// Returns the indices of the points nearest to a place and their squared distances, the nearest first.
-    pub(crate) fn to(&self, p: &Point, count: u32) -> impl Iterator<Item = (usize, f64)> {
+    pub(crate) fn nearest(&self, p: &Point, count: u32) -> impl Iterator<Item = (usize, f64)> {
         let exact = Parameters { epsilon: 0.0, max_radius: f64::INFINITY, allow_self_match: true, sort_results: true };
         // For some tens of neighbours a list is faster than the crate's default, a heap.
         let found = self.0.knn_advanced(count, &Entry::from(*p), CandidateContainer::Linear, &exact, None);
@@ -31,8 +31,8 @@ struct Entry([NotNan<f64>; 3]);
 impl From<Point> for Entry {
     fn from(p: Point) -> Self {
         /// Limit of the coordinates: squares of larger ones would overflow.
-        const LARGEST: f64 = 1e100;
-        Self(<[f64; 3]>::from(p).map(|c| NotNan::new(c.clamp(-LARGEST, LARGEST)).unwrap_or_default()))
+        const MAX_COORDINATE: f64 = 1e100;
+        Self(<[f64; 3]>::from(p).map(|c| NotNan::new(c.clamp(-MAX_COORDINATE, MAX_COORDINATE)).unwrap_or_default()))
     }
 }
 
@@ -59,10 +59,10 @@ mod tests {
         // Some points twice, and many at one place.
         points.extend_from_within(..40);
         points.extend([at(5000); 50]);
-        let tree = Nearest::of(points.iter().copied());
+        let tree = Nearest::new(points.iter().copied());
         for place in (2990..3100).map(at).chain([Point::new(9.0, -9.0, 9.0)]) {
             let mut exact: Vec<f64> = points.iter().map(|p| (p - place).norm_squared()).collect();
-            let found: Vec<(usize, f64)> = tree.to(&place, 25).collect();
+            let found: Vec<(usize, f64)> = tree.nearest(&place, 25).collect();
             assert!(found.iter().all(|&(k, square)| (exact[k] - square).abs() < 1e-12));
             exact.sort_by(f64::total_cmp);
             assert_eq!(found.len(), 25);
@@ -72,10 +72,10 @@ mod tests {
 
     #[test]
     fn few_points_and_strange_ones_are_no_trouble() {
-        assert_eq!(Nearest::of([].into_iter()).to(&Point::origin(), 4).count(), 0);
-        let two = Nearest::of([Point::origin(), Point::new(3.0, 0.0, 0.0)].into_iter());
-        assert_eq!(two.to(&Point::new(2.0, 0.0, 0.0), 4).collect::<Vec<_>>(), [(1, 1.0), (0, 4.0)]);
+        assert_eq!(Nearest::new([].into_iter()).nearest(&Point::origin(), 4).count(), 0);
+        let two = Nearest::new([Point::origin(), Point::new(3.0, 0.0, 0.0)].into_iter());
+        assert_eq!(two.nearest(&Point::new(2.0, 0.0, 0.0), 4).collect::<Vec<_>>(), [(1, 1.0), (0, 4.0)]);
         let strange = [f64::NAN, f64::INFINITY, f64::MIN, 1.0].map(|c| Point::new(c, f64::MAX, 0.0));
-        assert_eq!(Nearest::of(strange.into_iter().cycle().take(100)).to(&strange[0], 1).count(), 1);
+        assert_eq!(Nearest::new(strange.into_iter().cycle().take(100)).nearest(&strange[0], 1).count(), 1);
     }
 }

@@ -96,13 +96,13 @@ impl Pose {
 
     /// Moves a point.
     #[inline]
-    pub fn point(&self, p: &Point) -> Point {
+    pub fn transform_point(&self, p: &Point) -> Point {
         Point::from(self.rotation * p.coords + self.translation_mm)
     }
 
     /// Rotates a direction.
     #[inline]
-    pub fn direction(&self, v: &Vector) -> Vector {
+    pub fn transform_direction(&self, v: &Vector) -> Vector {
         self.rotation * v
     }
 
@@ -212,7 +212,7 @@ mod tests {
     fn a_quarter_turn_about_z_by_hand() {
         // The screw of pitch zero about the vertical line through (1, 0): v = -omega x q.
         let pose = Pose::exp(&Twist::new(0.0, -PI / 2.0, 0.0, 0.0, 0.0, PI / 2.0));
-        let moved = pose.point(&Point::new(2.0, 0.0, 5.0));
+        let moved = pose.transform_point(&Point::new(2.0, 0.0, 5.0));
         assert!((moved - Point::new(1.0, 1.0, 5.0)).norm() < 1e-15, "{moved}");
     }
 

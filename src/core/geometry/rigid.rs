@@ -32,7 +32,7 @@ pub struct RigidFit {
 
 impl RigidFit {
     /// Returns the index of the pair with the largest residual, and the length of that residual in millimetres.
-    pub fn worst(&self) -> (usize, f64) {
+    pub fn max_residual(&self) -> (usize, f64) {
         let lengths = self.residuals_mm.iter().map(Vector3::norm).enumerate();
         lengths.fold((0, 0.0), |worst, next| if next.1 > worst.1 { next } else { worst })
     }
@@ -83,7 +83,7 @@ pub fn fit_rigid(from: &[Point], to: &[Point]) -> Result<RigidFit, RigidError> {
     let sign = (u * v_t).determinant().signum();
     let rotation = u * Matrix3::from_diagonal(&Vector::new(1.0, 1.0, sign)) * v_t;
     let pose = Pose { rotation, translation_mm: b - rotation * a }.orthonormalised();
-    let residuals_mm: Vec<Vector> = from.iter().zip(to).map(|(p, q)| q - pose.point(p)).collect();
+    let residuals_mm: Vec<Vector> = from.iter().zip(to).map(|(p, q)| q - pose.transform_point(p)).collect();
     let rms_mm = rms(&residuals_mm);
     if sign < 0.0 {
         let mirror = u * v_t;
@@ -160,10 +160,10 @@ mod tests {
             for angle in [0.0, 1e-9, 0.01, 1.0, 2.0, std::f64::consts::PI] {
                 let omega = Vector::new(0.36, -0.48, 0.8) * angle;
                 let truth = Pose::exp(&Twist::new(300.0, -20.0, 1e4, omega.x, omega.y, omega.z));
-                let to: Vec<Point> = from.iter().map(|p| truth.point(p)).collect();
+                let to: Vec<Point> = from.iter().map(|p| truth.transform_point(p)).collect();
                 let fit = fit_rigid(&from[..count], &to[..count]).unwrap();
                 assert!((fit.pose.rotation - truth.rotation).amax() < 1e-14, "{count} points, {angle} rad");
-                assert!(fit.rms_mm < 1e-10 && (fit.pose.point(&from[0]) - to[0]).norm() < 1e-10);
+                assert!(fit.rms_mm < 1e-10 && (fit.pose.transform_point(&from[0]) - to[0]).norm() < 1e-10);
             }
         }
     }
@@ -174,14 +174,14 @@ mod tests {
         let mut to = from.clone();
         to[3].z += 4.0;
         let fit = fit_rigid(&from, &to).unwrap();
-        let (worst, off_mm) = fit.worst();
+        let (worst, off_mm) = fit.max_residual();
         assert!(worst == 3 && off_mm > 0.5 && off_mm < 4.0, "{worst}: {off_mm}");
         // The best fit is a minimum: a small rotation or shift about it increases the rms.
         for k in 0..6 {
             let mut twist = Twist::zeros();
             twist[k] = if k < 3 { 1e-3 } else { 1e-6 };
             let near = Pose::exp(&twist) * fit.pose;
-            let moved: Vec<Vector> = from.iter().zip(&to).map(|(p, q)| q - near.point(p)).collect();
+            let moved: Vec<Vector> = from.iter().zip(&to).map(|(p, q)| q - near.transform_point(p)).collect();
             assert!(rms(&moved) > fit.rms_mm, "direction {k}");
         }
     }

@@ -4,7 +4,7 @@
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sample {
     /// x and y of the contact point in the model frame, in millimetres.
-    pub at_mm: [f64; 2],
+    pub place_mm: [f64; 2],
     /// Deviation in millimetres; positive where there is too much material.
     pub deviation_mm: f64,
 }
@@ -12,6 +12,6 @@ pub struct Sample {
 impl Sample {
     /// Returns true if all numbers are finite.
     pub fn is_finite(&self) -> bool {
-        (self.at_mm[0] + self.at_mm[1] + self.deviation_mm).is_finite()
+        (self.place_mm[0] + self.place_mm[1] + self.deviation_mm).is_finite()
     }
 }

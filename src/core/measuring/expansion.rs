@@ -20,12 +20,12 @@ pub struct Expansion {
 
 impl Expansion {
     /// Returns the measured value of a length of 1 at a temperature in degrees Celsius.
-    pub fn measured(&self, temperature_c: f64) -> f64 {
+    pub fn length_factor(&self, temperature_c: f64) -> f64 {
         1.0 + (self.part_per_k - self.scales_per_k) * (temperature_c - REFERENCE_C)
     }
 
     /// Returns the standard uncertainty of [`Expansion::measured`].
-    pub fn sigma(&self, temperature_c: f64) -> f64 {
+    pub fn length_factor_sigma(&self, temperature_c: f64) -> f64 {
         let by_temperature = (self.part_per_k - self.scales_per_k) * self.temperature_sigma_k;
         by_temperature.hypot(self.part_sigma_per_k * (temperature_c - REFERENCE_C))
     }
@@ -38,7 +38,7 @@ impl Expansion {
     pub fn at_reference(&self, points: &[Point], temperature_c: f64) -> Vec<Point> {
         let n = points.len().max(1) as f64;
         let middle = Point::from(points.iter().map(|p| p.coords).sum::<crate::geometry::Vector>() / n);
-        let measured = self.measured(temperature_c);
+        let measured = self.length_factor(temperature_c);
         points.iter().map(|p| middle + (p - middle) / measured).collect()
     }
 }
@@ -53,9 +53,9 @@ mod tests {
     #[test]
     fn by_hand() {
         // 3.5e-6 per kelvin more than the scales, over ten kelvins: 3.5 um on 100 mm.
-        assert!((STEEL.measured(30.0) - 1.000_035).abs() < 1e-12);
-        assert!((STEEL.sigma(30.0) - (1.75e-6_f64).hypot(1e-5)).abs() < 1e-18);
-        assert!(STEEL.measured(20.0) == 1.0 && (STEEL.sigma(20.0) - 1.75e-6).abs() < 1e-18);
+        assert!((STEEL.length_factor(30.0) - 1.000_035).abs() < 1e-12);
+        assert!((STEEL.length_factor_sigma(30.0) - (1.75e-6_f64).hypot(1e-5)).abs() < 1e-18);
+        assert!(STEEL.length_factor(20.0) == 1.0 && (STEEL.length_factor_sigma(20.0) - 1.75e-6).abs() < 1e-18);
         let warm = [Point::new(-50.0 * 1.000_035, 3.0, 0.0), Point::new(50.0 * 1.000_035, 3.0, 0.0)];
         let [a, b] = STEEL.at_reference(&warm, 30.0)[..] else { panic!() };
         assert!((a - Point::new(-50.0, 3.0, 0.0)).norm() < 1e-12 && (b - Point::new(50.0, 3.0, 0.0)).norm() < 1e-12);

@@ -51,7 +51,7 @@ pub enum PatternError {
         "none of the {asked} places of the measuring pattern lies on the part at least {margin_mm} mm inside its \
          edge; reduce edge_margin_mm or the spacing"
     )]
-    NoneOnPart { asked: usize, margin_mm: f64 },
+    NoneOnPart { requested: usize, margin_mm: f64 },
 }
 
 /// Returns targets on the part, `margin_mm` inside its edge, in the order of measurement.
@@ -67,13 +67,13 @@ pub fn targets(nominal: &Nominal, side: Side, layout: &Layout, margin_mm: f64) -
     let (mut found, mut walk) = (Vec::with_capacity(places.len()), Walk::new(surface, bounds));
     for place in &places {
         let target = match place {
-            Wanted::Over(xy) => walk.over(*xy),
-            Wanted::Near(point) => walk.near(point),
+            Wanted::AtXy(xy) => walk.target_at(*xy),
+            Wanted::NearestTo(point) => walk.target_nearest_to(point),
         };
         found.extend(target.filter(|target| walk.is_inside(target, margin_mm)));
     }
     if found.is_empty() {
-        return Err(PatternError::NoneOnPart { asked: places.len(), margin_mm });
+        return Err(PatternError::NoneOnPart { requested: places.len(), margin_mm });
     }
     Ok(found)
 }
@@ -95,8 +95,8 @@ pub fn sphere_targets(centre: Point, radius_mm: f64, count: usize) -> Vec<Target
 }
 
 enum Wanted {
-    Over([f64; 2]),
-    Near(Point),
+    AtXy([f64; 2]),
+    NearestTo(Point),
 }
 
 fn bounds(nominal: &Nominal) -> [[f64; 2]; 2] {
@@ -129,7 +129,7 @@ fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result
                 let (i, j) = (k % columns, k / columns);
                 // Every second row runs backwards, so that the probe need not travel back.
                 let i = if j % 2 == 0 { i } else { columns - 1 - i };
-                Wanted::Over([middle[0] + at(i, columns, width), middle[1] + at(j, rows, depth)])
+                Wanted::AtXy([middle[0] + at(i, columns, width), middle[1] + at(j, rows, depth)])
             })
             .collect())
     };
@@ -152,7 +152,7 @@ fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result
             let area = (width * depth).max(1e-9);
             spiral((area / f64::from((*count).max(1))).sqrt(), middle, [width, depth])
         }
-        Layout::Points(points) => Ok(points.iter().map(|p| Wanted::Near(*p)).collect()),
+        Layout::Points(points) => Ok(points.iter().map(|p| Wanted::NearestTo(*p)).collect()),
     }
 }
 
@@ -172,7 +172,7 @@ fn spiral(spacing: f64, middle: [f64; 2], [width, depth]: [f64; 2]) -> Result<Ve
         let (sin, cos) = angle.sin_cos();
         let (x, y) = (r * cos, r * sin);
         if x.abs() <= 0.5 * width && y.abs() <= 0.5 * depth {
-            found.push(Wanted::Over([middle[0] + x, middle[1] + y]));
+            found.push(Wanted::AtXy([middle[0] + x, middle[1] + y]));
         }
         angle += spacing / r.max(spacing / TAU).hypot(spacing / TAU);
     }
@@ -181,7 +181,7 @@ fn spiral(spacing: f64, middle: [f64; 2], [width, depth]: [f64; 2]) -> Result<Ve
 /// Walk over the surface from target to target.
 struct Walk<'a> {
     surface: OffsetSurface<'a>,
-    place: Place,
+    facet: Place,
     /// Height of the last target, at which the search for the next begins.
     z: f64,
     /// Diagonal of the bounds in x and y: limit of one step in height.
@@ -191,16 +191,16 @@ struct Walk<'a> {
 impl<'a> Walk<'a> {
     fn new(surface: OffsetSurface<'a>, [low, high]: [[f64; 2]; 2]) -> Self {
         let z = surface.nominal().points().next().map_or(0.0, |p| p.z);
-        Self { surface, place: Place::UNKNOWN, z, size_mm: (high[0] - low[0]).hypot(high[1] - low[1]) }
+        Self { surface, facet: Place::UNKNOWN, z, size_mm: (high[0] - low[0]).hypot(high[1] - low[1]) }
     }
 
     /// Finds the point of the surface over x and y by Newton's method on the height: each step intersects the vertical
     /// line with the tangent plane at the foot.
-    fn over(&mut self, [x, y]: [f64; 2]) -> Option<Target> {
+    fn target_at(&mut self, [x, y]: [f64; 2]) -> Option<Target> {
         let mut p = Point::new(x, y, self.z);
         for _ in 0..MOST_TURNS {
-            let foot = self.surface.foot(&p, self.place);
-            self.place = foot.place;
+            let foot = self.surface.project(&p, self.facet);
+            self.facet = foot.facet;
             let lean = foot.normal.z;
             if lean.abs() < 1e-3 || !foot.distance_mm.is_finite() {
                 return None;
@@ -209,19 +209,19 @@ impl<'a> Walk<'a> {
             p.z -= step.clamp(-self.size_mm, self.size_mm);
             if step.abs() < 1e-9 * (1.0 + self.size_mm) {
                 self.z = p.z;
-                return (foot.beyond_mm <= ON_PART_MM).then_some(Target { point: p, normal: foot.normal });
+                return (foot.beyond_edge_mm <= ON_PART_MM).then_some(Target { point: p, normal: foot.normal });
             }
         }
         None
     }
 
-    fn near(&mut self, p: &Point) -> Option<Target> {
-        let foot = self.surface.foot(p, self.place);
-        self.place = foot.place;
+    fn target_nearest_to(&mut self, p: &Point) -> Option<Target> {
+        let foot = self.surface.project(p, self.facet);
+        self.facet = foot.facet;
         let target = Target { point: p - foot.distance_mm * foot.normal, normal: foot.normal };
         // A point far away belongs to another part, or to another unit.
         let near = foot.distance_mm.abs() <= 0.05 * self.size_mm;
-        (foot.beyond_mm <= ON_PART_MM && near).then_some(target)
+        (foot.beyond_edge_mm <= ON_PART_MM && near).then_some(target)
     }
 
     /// Returns true if the surface continues for the margin in every direction.
@@ -235,7 +235,7 @@ impl<'a> Walk<'a> {
         outline.is_none_or(|o| o.contains(target.point.x, target.point.y))
             && (margin_mm == 0.0
                 || around.map(|(s, c)| target.point + margin_mm * (c * u + s * v)).all(|p| {
-                    self.surface.foot(&p, self.place).beyond_mm <= ON_PART_MM
+                    self.surface.project(&p, self.facet).beyond_edge_mm <= ON_PART_MM
                         && outline.is_none_or(|o| o.contains(p.x, p.y))
                 }))
     }

@@ -26,7 +26,7 @@ const WIDER: f64 = 0.15;
 
 /// Cosines of the lowest wavenumbers over a rectangle, preceded by polynomials over the part.
 pub(super) struct Basis {
-    pub(super) lay: Anisotropy,
+    pub(super) anisotropy: Anisotropy,
     corner_mm: [f64; 2],
     lengths_mm: [f64; 2],
     /// Centre and half lengths of the rectangle around the part, on which the polynomials are defined.
@@ -71,7 +71,7 @@ impl Basis {
         let halves_mm = spans_mm.map(|span_mm| (0.5 * span_mm).max(0.01 * wider_mm));
         let degrees = (2..=degree).flat_map(|whole| (0..=whole).map(move |b| [whole - b, b])).collect();
         Self {
-            lay,
+            anisotropy: lay,
             corner_mm,
             lengths_mm,
             middle_mm,
@@ -109,7 +109,7 @@ impl Basis {
         let last2 = self.squared_wavenumbers.last().copied().unwrap_or(0.0);
         let area_mm2 = self.lengths_mm[0] * self.lengths_mm[1];
         let longest_mm = 2.0 * self.halves_mm[0].max(self.halves_mm[1]);
-        let is_long = smoothness != Smoothness::Never && range_mm >= longest_mm;
+        let is_long = smoothness != Smoothness::Exponential && range_mm >= longest_mm;
         let of_polynomial = if is_long { (area_mm2 / self.degrees.len().max(1) as f64).sqrt() } else { 0.0 };
         let polynomials = self.degrees.iter().map(|_| of_polynomial);
         (
@@ -120,7 +120,7 @@ impl Basis {
 
     /// Evaluates every basis function at the places: one row for each place, one column for each polynomial and cosine.
     pub(super) fn at(&self, places: &[[f64; 2]]) -> Mat<f64> {
-        let at_mm = [0, 1].map(|axis| places.iter().map(|&place| self.lay.rotated(place)[axis]).collect::<Vec<f64>>());
+        let at_mm = [0, 1].map(|axis| places.iter().map(|&place| self.anisotropy.rotated(place)[axis]).collect::<Vec<f64>>());
         let polynomials = [0, 1].map(|axis| self.polynomials(axis, &at_mm[axis]));
         let cosines = [0, 1].map(|axis| self.cosines(axis, &at_mm[axis]));
         let of_polynomials = self.degrees.iter().map(|order| (&polynomials, order));
@@ -244,9 +244,9 @@ mod tests {
 
     #[test]
     fn within_the_part_they_make_the_covariance_of_the_field() {
-        for (smoothness, near) in [(Smoothness::Never, 0.05), (Smoothness::Once, 0.02), (Smoothness::Endless, 0.02)] {
+        for (smoothness, near) in [(Smoothness::Exponential, 0.05), (Smoothness::Matern2, 0.02), (Smoothness::SquaredExponential, 0.02)] {
             for lay in [Anisotropy::NONE, Anisotropy::at(0.7, 3.0)] {
-                let field = Field { smoothness, lay, ..Field::new(1.0, 12.0) };
+                let field = Field { smoothness, anisotropy: lay, ..Field::new(1.0, 12.0) };
                 let waves = Basis::over(&PART, lay, 3000, 4);
                 for (a, b) in [([0.0, 0.0], [3.0, 1.0]), ([10.0, -5.0], [14.0, 2.0]), ([20.0, 10.0], [20.0, 2.0])] {
                     let [made, exact] = [covariance(&waves, &field, [a, b]), field.covariance_mm2(a, b)];
@@ -262,9 +262,9 @@ mod tests {
     #[test]
     fn what_shorter_waves_would_have_is_told() {
         let waves = Basis::over(&PART, Anisotropy::NONE, 200, 0);
-        let left = [20.0, 5.0, 1.0].map(|range_mm| waves.standard_deviations(Smoothness::Never, range_mm).1);
+        let left = [20.0, 5.0, 1.0].map(|range_mm| waves.standard_deviations(Smoothness::Exponential, range_mm).1);
         assert!(left[0] < 0.2 && left[1] > 0.3 && left[2] > 0.8 && left[2] < 1.0, "{left:?}");
-        assert!(waves.standard_deviations(Smoothness::Endless, 30.0).1 < 0.02);
+        assert!(waves.standard_deviations(Smoothness::SquaredExponential, 30.0).1 < 0.02);
     }
 
     #[test]
@@ -289,10 +289,10 @@ mod tests {
         let corner = waves.at(&[[30.0, -20.0]])[(0, two_by_two)];
         assert!((corner - 5.0 / (78.0_f64 * 58.0).sqrt()).abs() < 1e-12, "{corner}");
         for (smoothness, range_mm, has) in [
-            (Smoothness::Endless, 61.0, true),
-            (Smoothness::Once, 61.0, true),
-            (Smoothness::Endless, 59.0, false),
-            (Smoothness::Never, 200.0, false),
+            (Smoothness::SquaredExponential, 61.0, true),
+            (Smoothness::Matern2, 61.0, true),
+            (Smoothness::SquaredExponential, 59.0, false),
+            (Smoothness::Exponential, 200.0, false),
         ] {
             let (strengths, _) = waves.standard_deviations(smoothness, range_mm);
             assert!(strengths[..count].iter().all(|strength| (*strength > 0.0) == has), "{smoothness:?} {range_mm}");

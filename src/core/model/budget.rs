@@ -30,13 +30,13 @@ pub struct BudgetEntry {
 /// Components of a variance.
 struct Parts {
     /// Noise of the points.
-    scatter: f64,
+    noise: f64,
     /// Field between the points.
     form: f64,
     /// Unknown motions of the part.
     pose: f64,
     /// Each random effect.
-    stated: Vec<f64>,
+    random_effects: Vec<f64>,
 }
 
 /// Decomposes the standard uncertainties of root mean square and PV 99.8 %. Returns one entry per source; empty if the
@@ -54,14 +54,14 @@ pub(super) fn decompose(
     let of = |figure: usize| {
         let mut parts = parts(observed, fields, posterior, (&drawn.places, &slopes[figure]))?;
         if ground_in.is_some() {
-            parts.stated.clone_from(&by_ground_in[figure]);
+            parts.random_effects.clone_from(&by_ground_in[figure]);
         }
-        let whole = parts.scatter + parts.form + parts.pose + parts.stated.iter().sum::<f64>();
+        let whole = parts.noise + parts.form + parts.pose + parts.random_effects.iter().sum::<f64>();
         let share = |source: UncertaintySource| match source {
-            UncertaintySource::Scatter => parts.scatter,
+            UncertaintySource::Scatter => parts.noise,
             UncertaintySource::Form => parts.form,
             UncertaintySource::Pose => parts.pose,
-            _ => parts.stated.iter().zip(sources).filter(|(_, of)| **of == source).map(|(part, _)| part).sum(),
+            _ => parts.random_effects.iter().zip(sources).filter(|(_, of)| **of == source).map(|(part, _)| part).sum(),
         };
         let of_whole = UncertaintySource::ALL.map(|source| uncertainties_mm[figure] * (share(source) / whole).sqrt());
         of_whole.iter().all(|part| part.is_finite()).then_some(of_whole)
@@ -133,7 +133,7 @@ fn parts(
     let of_stated = |e: usize| (0..whole).map(|k| effect(k, e) * weights[(k, 0)]).sum::<f64>().powi(2);
     let stated: Vec<f64> = (0..stated).map(of_stated).collect();
     let form = (pose_known - scatter - stated.iter().sum::<f64>()).max(0.0);
-    Some(Parts { scatter, form, pose: (explained - explained_free).max(0.0), stated })
+    Some(Parts { noise: scatter, form, pose: (explained - explained_free).max(0.0), random_effects: stated })
 }
 
 /// Computes the derivatives of root mean square and PV 99.8 % with respect to the form at each place, as means over the

@@ -39,7 +39,7 @@ pub struct DensePosterior {
     /// K^-1 H.
     effects: Mat<f64>,
     /// The estimated effects b, and their covariance.
-    found: DVector<f64>,
+    estimates: DVector<f64>,
     covariance: DMatrix<f64>,
     likelihood: f64,
 }
@@ -90,7 +90,7 @@ impl DensePosterior {
             places: places.clone(),
             weights,
             effects: solved.subcols(0, p).to_owned(),
-            found,
+            estimates: found,
             covariance: gram.inverse(),
             likelihood: -0.5 * (log_det + log_gram + squares + (n - vague) as f64 * std::f64::consts::TAU.ln()),
             factor,
@@ -112,12 +112,12 @@ impl DensePosterior {
     /// fixed effects are the motions of the part, they give the pose of its nominal frame, and the covariance includes
     /// the uncertainty due to the unknown field.
     pub fn estimated_effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
-        (&self.found, &self.covariance)
+        (&self.estimates, &self.covariance)
     }
 
     /// Predicts the field at places, without the effects.
     pub fn predict(&self, places: &[[f64; 2]]) -> Vec<Prediction> {
-        let p = self.found.len();
+        let p = self.estimates.len();
         let across = self.hyperparameters.field.pairs().across(&self.places, places);
         let solved = self.factor.solve(&across);
         let sigma2 = self.hyperparameters.field.sigma_mm * self.hyperparameters.field.sigma_mm;
@@ -136,7 +136,7 @@ impl DensePosterior {
     /// Predicts the field at places like [`Self::predict`]; returns the means in mm, and the covariance of every pair
     /// of places in mm^2.
     pub(super) fn predict_together(&self, places: &[[f64; 2]]) -> (Vec<f64>, Mat<f64>) {
-        let p = self.found.len();
+        let p = self.estimates.len();
         let pairs = self.hyperparameters.field.pairs();
         let across = pairs.across(&self.places, places);
         let solved = self.factor.solve(&across);
@@ -183,18 +183,18 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 /// # Errors
 /// Returns [`ModelError::EffectsAlike`] if the matrix, scaled to a unit diagonal, is singular within 1e-12.
 pub(super) fn checked_cholesky(gram: DMatrix<f64>) -> Result<nalgebra::Cholesky<f64, nalgebra::Dyn>, ModelError> {
-    const LEAST: f64 = 1e-12;
+    const MIN_PIVOT: f64 = 1e-12;
     if gram.nrows() == 0 {
-        return gram.cholesky().ok_or(ModelError::EffectsAlike);
+        return gram.cholesky().ok_or(ModelError::CollinearEffects);
     }
     // Effects have different units, so the test scales them: only their correlation counts.
     let scales = DVector::from_iterator(gram.nrows(), gram.diagonal().iter().map(|v| v.sqrt()));
     let alike = DMatrix::from_fn(gram.nrows(), gram.ncols(), |a, b| gram[(a, b)] / (scales[a] * scales[b]));
     let least = alike.symmetric_eigenvalues().iter().copied().fold(f64::INFINITY, f64::min);
-    if least.is_nan() || least <= LEAST {
-        return Err(ModelError::EffectsAlike);
+    if least.is_nan() || least <= MIN_PIVOT {
+        return Err(ModelError::CollinearEffects);
     }
-    gram.cholesky().ok_or(ModelError::EffectsAlike)
+    gram.cholesky().ok_or(ModelError::CollinearEffects)
 }
 
 #[cfg(test)]

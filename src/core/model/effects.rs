@@ -40,7 +40,7 @@ impl EffectEstimates {
         let some = observed.subset(&chosen);
         let fields = FieldHypotheses::over(&some, NoiseKind::PLAIN)?;
         // A smooth field is overconfident if the form is rough; rougher fields are conservative.
-        let rough = |smoothness| smoothness == Smoothness::Once;
+        let rough = |smoothness| smoothness == Smoothness::Matern2;
         let mut likely = Posterior::of(&fields, &some, Some(priors), None).weighted_hyperparameters(rough);
         likely.retain(|(_, weight)| *weight > FEW);
         let whole: f64 = likely.iter().map(|(_, weight)| weight).sum();

@@ -10,40 +10,40 @@ pub enum ModelError {
     #[error("{points} places, {deviations} deviations and {rows} rows of effects do not match")]
     Shape { points: usize, deviations: usize, rows: usize },
     #[error("the model requires at least {least} points; {points} are given")]
-    TooFewPoints { points: usize, least: usize },
+    TooFewPoints { points: usize, min_points: usize },
     #[error("point {} has a number that is not finite", point + 1)]
     NotFinite { point: usize },
     #[error("the {what} is {value} mm; it must be finite and above 0")]
-    Hyper { what: &'static str, value: f64 },
+    Hyperparameter { what: &'static str, value: f64 },
     #[error(
         "the lay of the field has the direction {along:?} and the stretch {stretch}; the direction must be a unit \
          vector, and the stretch at least 1"
     )]
-    Lay { along: [f64; 2], stretch: f64 },
+    Anisotropy { along: [f64; 2], stretch: f64 },
     #[error(
         "the standard uncertainty of the {what} is {value} (mm, rad or a share); it must be at least 0 and plausible \
          for a machine or a fixture: correct the stated value"
     )]
-    Stated { what: &'static str, value: f64 },
+    StatedUncertainty { what: &'static str, value: f64 },
     #[error(
         "the prior of the {what} has the median {median} and the factor {factor}; the median must be finite and \
          above 0, the factor finite and above 1"
     )]
-    Expected { what: &'static str, median: f64, factor: f64 },
+    Prior { what: &'static str, median: f64, factor: f64 },
     #[error("the drift is {value}; it must be at least 0 and below 1")]
-    Drift { value: f64 },
+    NoiseAutocorrelation { value: f64 },
     #[error(
         "the covariance of the points is not positive definite: their noise is too small compared with the field, or \
          places coincide"
     )]
     NotDefinite,
     #[error("these points do not separate the effects; remove the effects that the surface does not show")]
-    EffectsAlike,
+    CollinearEffects,
     #[error(
         "the points are of {sessions} session; at least {least} are required for the variance between sessions: \
          measure once more, or from another station"
     )]
-    TooFewSessions { sessions: usize, least: usize },
+    TooFewSessions { sessions: usize, min_sessions: usize },
     #[error("{points} points and {sessions} numbers of their sessions do not match")]
     Sessions { points: usize, sessions: usize },
 }

@@ -16,18 +16,18 @@ pub struct Field {
     /// Smoothness of the field.
     pub smoothness: Smoothness,
     /// Direction along which the field is wider.
-    pub lay: Anisotropy,
+    pub anisotropy: Anisotropy,
 }
 
 /// Smoothness of a field: the nu of its Matern covariance, or how many times it can be differentiated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Smoothness {
     /// nu = 1/2, exp(-2 r / range): the roughest, nowhere differentiable.
-    Never,
+    Exponential,
     /// nu = 2: differentiable once.
-    Once,
+    Matern2,
     /// nu = infinity, exp(-2 (r / range)^2): differentiable any number of times.
-    Endless,
+    SquaredExponential,
 }
 
 /// Direction along which a field is wider than across, as the tracks of a wheel make it.
@@ -43,18 +43,18 @@ impl Smoothness {
     /// Returns nu; `None` if it is infinite.
     pub(super) fn nu(self) -> Option<f64> {
         match self {
-            Self::Never => Some(0.5),
-            Self::Once => Some(2.0),
-            Self::Endless => None,
+            Self::Exponential => Some(0.5),
+            Self::Matern2 => Some(2.0),
+            Self::SquaredExponential => None,
         }
     }
 
     /// Returns the name.
     pub fn name(self) -> &'static str {
         match self {
-            Self::Never => "never",
-            Self::Once => "once",
-            Self::Endless => "endless",
+            Self::Exponential => "never",
+            Self::Matern2 => "once",
+            Self::SquaredExponential => "endless",
         }
     }
 }
@@ -85,7 +85,7 @@ impl Anisotropy {
 impl Field {
     /// Creates an isotropic field that can be differentiated once.
     pub const fn new(sigma_mm: f64, range_mm: f64) -> Self {
-        Self { sigma_mm, range_mm, smoothness: Smoothness::Once, lay: Anisotropy::NONE }
+        Self { sigma_mm, range_mm, smoothness: Smoothness::Matern2, anisotropy: Anisotropy::NONE }
     }
 
     /// Returns the covariance of the field at two places.
@@ -101,11 +101,11 @@ impl Field {
 
     /// Maps a place into the plane in which the field is isotropic; the map preserves areas.
     fn straightened(&self, at: [f64; 2]) -> [f64; 2] {
-        if self.lay.stretch == 1.0 {
+        if self.anisotropy.stretch == 1.0 {
             return at;
         }
-        let root = self.lay.stretch.sqrt();
-        let [along, across] = self.lay.rotated(at);
+        let root = self.anisotropy.stretch.sqrt();
+        let [along, across] = self.anisotropy.rotated(at);
         [along / root, across * root]
     }
 
@@ -116,12 +116,12 @@ impl Field {
     pub(super) fn check(&self) -> Result<(), ModelError> {
         for (what, value) in [("field", self.sigma_mm), ("range", self.range_mm)] {
             if !(value.is_finite() && value > 0.0) {
-                return Err(ModelError::Hyper { what, value });
+                return Err(ModelError::Hyperparameter { what, value });
             }
         }
-        let Anisotropy { along: [c, s], stretch } = self.lay;
+        let Anisotropy { along: [c, s], stretch } = self.anisotropy;
         let is_lay = stretch.is_finite() && stretch >= 1.0 && (c.hypot(s) - 1.0).abs() < 1e-9;
-        if is_lay { Ok(()) } else { Err(ModelError::Lay { along: [c, s], stretch }) }
+        if is_lay { Ok(()) } else { Err(ModelError::Anisotropy { along: [c, s], stretch }) }
     }
 }
 
@@ -162,7 +162,7 @@ mod tests {
 
     #[test]
     fn along_its_lay_a_field_is_wider_and_its_range_is_the_mean_of_both() {
-        let field = Field { lay: Anisotropy::at(0.5, 4.0), ..Field::new(2.0, 30.0) };
+        let field = Field { anisotropy: Anisotropy::at(0.5, 4.0), ..Field::new(2.0, 30.0) };
         let at = |r: f64, angle: f64| field.covariance_mm2([1.0, 1.0], [1.0 + r * angle.cos(), 1.0 + r * angle.sin()]);
         let alike = Field::new(2.0, 30.0).covariance_mm2([0.0; 2], [20.0, 0.0]);
         // The range along is 4 times that across: twice the mean along, half of it across.
@@ -184,8 +184,8 @@ mod tests {
         for lay in
             [Anisotropy::at(0.0, 0.5), Anisotropy::at(f64::NAN, 2.0), Anisotropy { along: [1.0, 1.0], stretch: 2.0 }]
         {
-            assert!(of(Field { lay, ..Field::new(1.0, 1.0) }).contains("lay"));
+            assert!(of(Field { anisotropy, ..Field::new(1.0, 1.0) }).contains("lay"));
         }
-        assert!(of(Field { lay: Anisotropy::at(3.0, 5.0), ..Field::new(1.0, 1.0) }).is_empty());
+        assert!(of(Field { anisotropy: Anisotropy::at(3.0, 5.0), ..Field::new(1.0, 1.0) }).is_empty());
     }
 }

@@ -68,7 +68,7 @@ impl SlopeFigures {
     /// Computes the figures of smooth forms, a column each: the first matrix is for the figures, the second one raises
     /// the upper ends of the maximum.
     pub(super) fn of(slopes: &SlopesAt, forms: &[DMatrix<f64>; 2], (is_seen, inputs): (bool, &ModelInputs)) -> Self {
-        let found = forms.each_ref().map(|forms| each(forms, |form| slopes.of(form)));
+        let found = forms.each_ref().map(|forms| each(forms, |form| slopes.evaluate(form)));
         let [rms, largest] = [0, 1].map(|k| {
             let values = |of: usize| found[of].iter().map(|of| of[k]).collect();
             let of = Interval::of(values(0), (Vec::new(), (k == 1).then(|| values(1)).into_iter()), is_seen, inputs);
@@ -82,7 +82,7 @@ impl IsoFigures {
     /// Computes the figures of forms, a column each: the first matrix is for the figures, the second one raises the
     /// upper ends of extremes.
     pub(super) fn of(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool, inputs: &ModelInputs) -> Self {
-        let found = forms.each_ref().map(|forms| each(forms, |form| fits.of(form)));
+        let found = forms.each_ref().map(|forms| each(forms, |form| fits.evaluate(form)));
         let values = |k: usize, of: fn(&IsoOfForm) -> f64| found[k].iter().map(of).collect::<Vec<f64>>();
         let interval = |of: fn(&IsoOfForm) -> f64, has_low: bool| {
             Interval::of(values(0, of), (Vec::new(), std::iter::empty()), has_low, inputs)

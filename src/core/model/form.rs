@@ -42,7 +42,7 @@ pub struct Form {
     /// Slopes of the smooth form; None if there are too few points for them.
     pub slope: Option<SlopeFigures>,
     /// RMS of the standard uncertainty of the smooth form over all places, in mm.
-    pub known_mm: f64,
+    pub rms_smooth_sigma_mm: f64,
     /// Sources of the standard uncertainties of the figures; empty if these cannot be decomposed.
     pub budget: Vec<BudgetEntry>,
     /// Hyperparameters from the points alone, without the given prior. They are used to learn the prior of later parts.
@@ -50,19 +50,19 @@ pub struct Form {
     pub hyperparameters_without_prior: Option<Hyperparameters>,
     /// True if the points show a form. If false, only upper bounds of the figures are given, and their intervals begin
     /// at 0.
-    pub is_seen: bool,
+    pub is_detected: bool,
     /// Degrees of freedom that the fit leaves to the points from which the field is estimated.
     pub degrees_of_freedom: f64,
     /// True if the degrees of freedom are too few to separate the form from the noise, and the noise of the probe is
     /// unknown. The upper bounds then assume that the deviations are entirely form.
-    pub is_of_few: bool,
+    pub is_underdetermined: bool,
 }
 
 /// Form at a measured point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FormPoint {
     /// Position in the model frame, in mm.
-    pub at_mm: [f64; 2],
+    pub place_mm: [f64; 2],
     /// Form at the point and its standard uncertainty.
     pub form: Prediction,
     /// Standard uncertainty of the smooth part of the form, which a correction can use.
@@ -78,7 +78,7 @@ pub struct FormFigures {
     pub pv: Interval,
     /// PV 99.8 %: peak to valley over the aperture, including the places between. The outermost 0.1 % at either end are
     /// left out, but never a touched place.
-    pub pv_most_points: Interval,
+    pub pv_998: Interval,
 }
 
 /// Median and 95 % credible interval of a figure.
@@ -155,13 +155,13 @@ impl Form {
         };
         let drawn = of(posterior.samples(HypothesisSet::All, SAMPLES, 1), true);
         let slope = seen.slope(inputs, &posterior, &drawn);
-        let drawn = whole(drawn, &seen.apart, inputs);
-        let form = if seen.is_chance { &[][..] } else { &seen.agreed };
+        let drawn = whole(drawn, &seen.unexplained, inputs);
+        let form = if seen.is_chance { &[][..] } else { &seen.confirmed };
         let least =
             whole(of(posterior.samples(HypothesisSet::Smooth, FEWER, 2), false), form, &least_form(&posterior, inputs))
                 .told_by();
         let most = match posterior.is_rough() > MAY_BE {
-            true => whole(of(posterior.samples(HypothesisSet::Rough, FEWER, 3), false), &seen.apart, inputs).told_by(),
+            true => whole(of(posterior.samples(HypothesisSet::Rough, FEWER, 3), false), &seen.unexplained, inputs).told_by(),
             false => Vec::new(),
         };
         let ground_in = at(&drawn.chosen);
@@ -197,15 +197,15 @@ impl Form {
         let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
         let effects = seen.motions.rows(places.iter().copied());
         // If there are many more places than touches, the places are close enough to each other.
-        let is_between = places.len() < 2 * seen.kept.len();
+        let is_between = places.len() < 2 * seen.inliers.len();
         let at = places.iter().map(plane).collect();
         let drawn = seen.drawn(posterior.samples(HypothesisSet::All, SAMPLES, 1), at, effects, is_between);
         let drawn = SampledForms { untouched: (0..places.len()).collect(), ..drawn };
         let drawn = drawn.rough_where_touched(&seen.observed.places).known_as(&seen.observed);
-        let ground_in = seen.ground_in.is_some().then(|| seen.stated.columns(places.iter().copied()));
+        let ground_in = seen.ground_in.is_some().then(|| seen.machine_effects.columns(places.iter().copied()));
         let drawn = drawn.without(ground_in.as_ref());
         let slope = if is_whole { seen.slope(inputs, &posterior, &drawn) } else { None };
-        let drawn = seen.with_those(&seen.apart, drawn.with_what_is_narrow(inputs), inputs).after_best_fit();
+        let drawn = seen.with_those(&seen.unexplained, drawn.with_what_is_narrow(inputs), inputs).after_best_fit();
         Ok(Self { slope, ..seen.form(inputs, &posterior, (&drawn, [&[], &[]]), ground_in, is_whole) })
     }
 }
@@ -216,16 +216,16 @@ struct FittedModel {
     /// Observations at all used points.
     all: Observed,
     /// Indices of the points that no field explains, ascending. They count as form nevertheless.
-    apart: Vec<usize>,
+    unexplained: Vec<usize>,
     /// Those of them that neighbouring touches confirm.
-    agreed: Vec<usize>,
+    confirmed: Vec<usize>,
     /// True if there are so many isolated points that two of them can be neighbours by chance.
     is_chance: bool,
     /// Indices of the other points, and the observations there.
-    kept: Vec<usize>,
+    inliers: Vec<usize>,
     observed: Observed,
     /// Effects of the machine, its probe, the temperature and the datum on all points together.
-    stated: MachineEffects,
+    machine_effects: MachineEffects,
     /// Columns of these effects that are ground into the part, at all used points; None before the first correction.
     ground_in: Option<DMatrix<f64>>,
     fields: FieldHypotheses,
@@ -237,7 +237,7 @@ impl FittedModel {
         /// Number of rounds. Each round estimates the hyperparameters again. Without the tallest points of a defect,
         /// its flanks stand out.
         const ROUNDS: usize = 3;
-        if let Some(priors) = &inputs.priors {
+        if let Some(priors) = &inputs.prior {
             priors.check()?;
         }
         /// Number of touches around one.
@@ -245,26 +245,26 @@ impl FittedModel {
         let mut seen = Self::with_all_in_the_fit(registration, inputs, at_points)?;
         for _ in 0..ROUNDS {
             let more = seen.unexplained(inputs);
-            let apart = seen.apart.len() + more.len();
+            let apart = seen.unexplained.len() + more.len();
             if more.is_empty() || apart as f64 > MOST_APART * seen.all.places.len() as f64 {
                 break;
             }
-            let mut apart = [&seen.apart[..], &more[..]].concat();
+            let mut apart = [&seen.unexplained[..], &more[..]].concat();
             apart.sort_unstable();
             let kept: Vec<usize> = (0..seen.all.places.len()).filter(|k| apart.binary_search(k).is_err()).collect();
             let observed = seen.all.subset(&kept);
             // The remaining points can be too few for the model. Then these points stay in it.
             let Ok(fields) = FieldHypotheses::over(&observed, seen.fields.kind) else { break };
-            seen = Self { apart, kept, observed, fields, ..seen };
+            seen = Self { unexplained: apart, inliers: kept, observed, fields, ..seen };
         }
         let left_out = registration.deviations.iter().filter(|d| d.status == PointStatus::Outlier).count();
-        let alone = (left_out + seen.apart.len() - seen.agreed.len()) as f64;
+        let alone = (left_out + seen.unexplained.len() - seen.confirmed.len()) as f64;
         let by_chance = 0.5 * AROUND * alone * alone / seen.all.places.len() as f64;
         Ok(Self { is_chance: by_chance > MAY_BE, ..seen })
     }
 
     fn posterior(&self, inputs: &ModelInputs) -> Posterior<'_> {
-        Posterior::of(&self.fields, &self.observed, inputs.priors.as_ref(), probe(inputs))
+        Posterior::of(&self.fields, &self.observed, inputs.prior.as_ref(), probe(inputs))
     }
 
     /// Evaluates the samples at the places, in the frame of the registration. Each sample contains the motion that fits
@@ -279,10 +279,10 @@ impl FittedModel {
         let Observed { fixed_effects: rows, random_effects: stated, deviations_mm, .. } = &self.observed;
         let weights = rows * inverse_of_products(rows);
         let found = weights.tr_mul(&DVector::from_column_slice(deviations_mm));
-        let beside = weights.tr_mul(stated) * &draws.stated;
+        let beside = weights.tr_mul(stated) * &draws.random_effects;
         let sums = self.fields.sums(&weights);
         let sums = Mat::from_fn(sums.nrows(), sums.ncols(), |r, c| sums[(r, c)]);
-        let moved = draws.waves.each_ref().map(|waves| {
+        let moved = draws.coefficients.each_ref().map(|waves| {
             let of_form = &sums * waves;
             DMatrix::from_fn(rows.ncols(), waves.ncols(), |m, c| found[m] - beside[(m, c)] - of_form[(m, c)])
         });
@@ -292,9 +292,9 @@ impl FittedModel {
     /// Returns the points whose residual from the field is too large for noise, as indices of all used points.
     fn unexplained(&self, inputs: &ModelInputs) -> Vec<usize> {
         /// Minimum number of points: with fewer, the usual residual is unknown.
-        const FEWEST: usize = 40;
+        const MIN_POINTS: usize = 40;
         let Observed { places, deviations_mm, fixed_effects: effects, random_effects: stated, .. } = &self.observed;
-        if places.len() < FEWEST {
+        if places.len() < MIN_POINTS {
             return Vec::new();
         }
         let posterior = self.posterior(inputs);
@@ -313,7 +313,7 @@ impl FittedModel {
 
     /// Converts indices of the points in the model to indices of all used points.
     fn of_all(&self, chosen: &[usize]) -> Vec<usize> {
-        chosen.iter().map(|&k| self.kept[k]).collect()
+        chosen.iter().map(|&k| self.inliers[k]).collect()
     }
 
     /// Adds points that no field explains to the samples, each with its measured deviation minus the noise of a touch.
@@ -331,7 +331,7 @@ impl FittedModel {
         let mut apart = apart.to_vec();
         if at_points {
             apart.sort_by(|a, b| self.all.deviations_mm[*b].abs().total_cmp(&self.all.deviations_mm[*a].abs()));
-            apart.truncate((count * rows).div_ceil(self.kept.len().max(1)));
+            apart.truncate((count * rows).div_ceil(self.inliers.len().max(1)));
             apart.sort_unstable();
         }
         let found = self.touched_at(&apart, &drawn, inputs);
@@ -340,12 +340,12 @@ impl FittedModel {
 
     /// Returns samples of the form at the points, from their deviations: one column for each given sample.
     fn touched_at(&self, points: &[usize], drawn: &SampledForms, inputs: &ModelInputs) -> SampledForms {
-        let stated = self.all.random_effects.select_rows(points) * &drawn.stated;
+        let stated = self.all.random_effects.select_rows(points) * &drawn.random_effects;
         let of_probe = |mm: f64| probe(inputs).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
-        let mut forms = [0, 1].map(|_| DMatrix::zeros(points.len(), drawn.scatter_mm.len()));
-        for c in 0..drawn.scatter_mm.len() {
+        let mut forms = [0, 1].map(|_| DMatrix::zeros(points.len(), drawn.noise_mm.len()));
+        for c in 0..drawn.noise_mm.len() {
             let mut normals = Normals::new(6, c as u64);
-            let scatter_mm = of_probe(drawn.scatter_mm[c]);
+            let scatter_mm = of_probe(drawn.noise_mm[c]);
             // The tallest touch of a defect probably has positive noise. Therefore the second samples, which bound the
             // extremes, use one noise for all touches.
             let alike_mm = scatter_mm * normals.next();
@@ -356,17 +356,17 @@ impl FittedModel {
             }
         }
         let found = SampledForms {
-            all: drawn.all.is_some().then(|| forms[0].clone()),
+            all_form: drawn.all_form.is_some().then(|| forms[0].clone()),
             forms,
             places: points.iter().map(|&k| self.all.places[k]).collect(),
             effects: self.all.fixed_effects.select_rows(points),
             chosen: points.to_vec(),
             untouched: Vec::new(),
-            smooth_sigma_mm: vec![mean(&drawn.scatter_mm); points.len()],
-            scatter_mm: drawn.scatter_mm.clone(),
-            narrow_mm: [Vec::new(), Vec::new()],
-            stated: drawn.stated.clone(),
-            between: None,
+            smooth_sigma_mm: vec![mean(&drawn.noise_mm); points.len()],
+            noise_mm: drawn.noise_mm.clone(),
+            truncated_mm: [Vec::new(), Vec::new()],
+            random_effects: drawn.random_effects.clone(),
+            intermediate: None,
         };
         found.without(self.ground_in.as_ref().map(|columns| columns.select_rows(points)).as_ref())
     }
@@ -378,10 +378,10 @@ impl FittedModel {
         inputs: &ModelInputs,
         at_points: bool,
     ) -> Result<Self, ModelError> {
-        let all = registration.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Used);
+        let all = registration.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Inlier);
         let (path, used): (Vec<f64>, Vec<&Deviation>) = all.map(|(k, d)| (k as f64, d)).unzip();
         if used.is_empty() {
-            return Err(ModelError::TooFewPoints { points: 0, least: 7 });
+            return Err(ModelError::TooFewPoints { points: 0, min_points: 7 });
         }
         let motions = Motions::of(registration, used.iter().map(|d| d.point));
         let stated = motions.stated(registration, inputs)?;
@@ -398,12 +398,12 @@ impl FittedModel {
         Ok(Self {
             motions,
             all,
-            agreed: apart.clone(),
+            confirmed: apart.clone(),
             is_chance: false,
-            apart,
-            kept,
+            unexplained: apart,
+            inliers: kept,
             observed,
-            stated,
+            machine_effects: stated,
             ground_in,
             fields,
         })
@@ -411,7 +411,7 @@ impl FittedModel {
 
     /// Computes the slopes of the samples, before form without a slope is added to them.
     fn slope(&self, inputs: &ModelInputs, posterior: &Posterior, drawn: &SampledForms) -> Option<SlopeFigures> {
-        let slopes = SlopesAt::over(&drawn.places, inputs.area.integration_mm)?;
+        let slopes = SlopesAt::new(&drawn.places, inputs.area.integration_mm)?;
         let smooth = [0, 1].map(|k| best_fitted(drawn.forms[k].clone(), &drawn.effects));
         Some(SlopeFigures::of(&slopes, &smooth, (is_seen(posterior), inputs)))
     }
@@ -426,18 +426,18 @@ impl FittedModel {
         ground_in: Option<DMatrix<f64>>,
         is_whole: bool,
     ) -> Form {
-        let ground_into_kept = self.ground_in.as_ref().map(|columns| columns.select_rows(&self.kept));
+        let ground_into_kept = self.ground_in.as_ref().map(|columns| columns.select_rows(&self.inliers));
         let alike = ground_into_kept.as_ref().unwrap_or(&self.observed.random_effects);
         let covariance = of_the_fit(&self.observed, (&self.fields, posterior), alike);
         // Points apart from the field are detected, whatever the others show.
-        let is_seen = is_seen(posterior) || !self.apart.is_empty();
+        let is_seen = is_seen(posterior) || !self.unexplained.is_empty();
         let figures = drawn.figures(is_seen, ends, inputs);
         let budget = if is_whole { self.budget(inputs, posterior, drawn, ground_in, &figures) } else { Vec::new() };
-        let iso = IsoFits::over(&drawn.places, inputs.area.middle_mm).filter(|_| is_whole);
+        let iso = IsoFits::new(&drawn.places, inputs.area.middle_mm).filter(|_| is_whole);
         let hyperparameters = posterior.mean_hyperparameters();
-        let alone = match inputs.priors {
+        let alone = match inputs.prior {
             None => hyperparameters,
-            Some(_) => self.posterior(&ModelInputs { priors: None, ..*inputs }).mean_hyperparameters(),
+            Some(_) => self.posterior(&ModelInputs { prior: None, ..*inputs }).mean_hyperparameters(),
         };
         Form {
             hyperparameters,
@@ -448,10 +448,10 @@ impl FittedModel {
             budget,
             iso: iso.map(|fits| IsoFigures::of(&fits, &drawn.forms, is_seen, inputs)),
             slope: None,
-            known_mm: drawn.known_mm(),
-            is_seen,
+            rms_smooth_sigma_mm: drawn.known_mm(),
+            is_detected: is_seen,
             degrees_of_freedom: posterior.degrees_of_freedom(),
-            is_of_few: is_of_few(posterior, inputs),
+            is_underdetermined: is_of_few(posterior, inputs),
         }
     }
 
@@ -464,11 +464,11 @@ impl FittedModel {
         figures: &FormFigures,
     ) -> Vec<BudgetEntry> {
         let ground_in = ground_in.map(|columns| best_fitted(columns, &drawn.effects));
-        let uncertainties_mm = [figures.rms, figures.pv_most_points].map(|of| of.standard_mm());
+        let uncertainties_mm = [figures.rms, figures.pv_998].map(|of| of.standard_mm());
         let model = (&self.fields, posterior);
-        let points = (&self.observed, &self.stated.sources()[..]);
+        let points = (&self.observed, &self.machine_effects.sources()[..]);
         let mut budget = budget::decompose(points, model, (drawn, ground_in.as_ref()), uncertainties_mm);
-        budget.retain(|share| share.source != UncertaintySource::Datum || inputs.datum.is_some());
+        budget.retain(|share| share.source != UncertaintySource::Datum || inputs.locked_sigmas.is_some());
         budget
     }
 }
@@ -485,9 +485,9 @@ fn is_seen(posterior: &Posterior) -> bool {
 /// that value is not necessarily form.
 fn least_form(posterior: &Posterior, inputs: &ModelInputs) -> ModelInputs {
     /// Maximum excess of the noise over that of the probe, in standard uncertainties, that is still consistent with it.
-    const MAY_SCATTER: f64 = 2.0;
+    const MAX_EXCESS_SIGMAS: f64 = 2.0;
     match probe(inputs) {
-        Some([probe_mm, u]) if posterior.mean_hyperparameters().noise_sigma_mm < probe_mm * (MAY_SCATTER * u).exp() => {
+        Some([probe_mm, u]) if posterior.mean_hyperparameters().noise_sigma_mm < probe_mm * (MAX_EXCESS_SIGMAS * u).exp() => {
             ModelInputs { probe_noise_mm: [0.0; 2], ..*inputs }
         }
         _ => *inputs,
@@ -535,7 +535,7 @@ fn thinned(of: usize) -> impl Iterator<Item = usize> {
 #[derive(Clone, Copy, Debug)]
 pub struct ModelInputs {
     /// Prior of range and noise ratio. If None, a prior from the Fisher information of the variance ratio is used.
-    pub priors: Option<Prior>,
+    pub prior: Option<Prior>,
     /// Uncertainty of the machine that is common to all points, from its cell file.
     pub machine: MachineUncertainty,
     /// Standard uncertainty of the calibrated radius of the probe, in mm. It moves every point along its normal by the
@@ -546,7 +546,7 @@ pub struct ModelInputs {
     /// Standard uncertainties of the pose in the directions that the registration locked: along x, y and z of the model
     /// in mm, and of the turns about them through the centroid of the points in rad. 0 in directions that are known
     /// exactly or that the registration found. None if the registration locked no direction.
-    pub datum: Option<[f64; 6]>,
+    pub locked_sigmas: Option<[f64; 6]>,
     /// True if the part was corrected by a measurement of the same machine in the same clamping. Then all effects of
     /// uncertain size (machine, probe, temperature, datum) are ground into the part, and the points no longer show
     /// them.
@@ -556,9 +556,9 @@ pub struct ModelInputs {
     /// counts as the probe's.
     pub probe_noise_mm: [f64; 2],
     /// Probability that a figure is beyond each of the bounds [`Interval::least_mm`] and [`Interval::most_mm`].
-    pub look_risk: f64,
+    pub decision_risk: f64,
     /// Probability of being within the limit that a figure needs for acceptance.
-    pub probability: f64,
+    pub acceptance_probability: f64,
     /// Options of the figures over an area.
     pub area: AreaOptions,
 }
@@ -566,15 +566,15 @@ pub struct ModelInputs {
 impl Default for ModelInputs {
     fn default() -> Self {
         Self {
-            priors: None,
+            prior: None,
             machine: MachineUncertainty::default(),
             radius_sigma_mm: 0.0,
             scale_sigma: 0.0,
-            datum: None,
+            locked_sigmas: None,
             is_corrected: false,
             probe_noise_mm: [0.0; 2],
-            look_risk: 0.005,
-            probability: 0.975,
+            decision_risk: 0.005,
+            acceptance_probability: 0.975,
             area: AreaOptions::default(),
         }
     }
@@ -610,7 +610,7 @@ pub(super) struct SampledForms {
     /// Samples by the posterior, and by fields of the second variance. The second bounds the extremes.
     pub(super) forms: [DMatrix<f64>; 2],
     /// Samples that take the deviations entirely as form, apart from the noise; only if there are few points.
-    all: Option<DMatrix<f64>>,
+    all_form: Option<DMatrix<f64>>,
     pub(super) places: Vec<[f64; 2]>,
     /// Motions that a best fit removes, at the places.
     pub(super) effects: DMatrix<f64>,
@@ -621,17 +621,17 @@ pub(super) struct SampledForms {
     /// Standard uncertainty of the smooth form at each place.
     smooth_sigma_mm: Vec<f64>,
     /// Noise of each sample, and for each variance the standard deviation of waves shorter than those of the basis.
-    scatter_mm: Vec<f64>,
-    narrow_mm: [Vec<f64>; 2],
+    noise_mm: Vec<f64>,
+    truncated_mm: [Vec<f64>; 2],
     /// Random effects of each sample, in standard uncertainties.
-    stated: DMatrix<f64>,
+    random_effects: DMatrix<f64>,
     /// The same samples between the places.
-    between: Option<IntermediateForms>,
+    intermediate: Option<IntermediateForms>,
 }
 
 /// Samples of the form between the places.
 struct IntermediateForms {
-    between: IntermediateNodes,
+    nodes: IntermediateNodes,
     forms: [DMatrix<f64>; 2],
     effects: DMatrix<f64>,
 }
@@ -645,7 +645,7 @@ impl SampledForms {
         moved: &[DMatrix<f64>; 2],
         is_between: bool,
     ) -> Self {
-        let PosteriorSamples { waves, scatter_mm, narrow_mm, stated } = draws;
+        let PosteriorSamples { coefficients: waves, noise_mm: scatter_mm, truncated_mm: narrow_mm, random_effects: stated } = draws;
         let count = scatter_mm.len();
         let at = fields.basis.at(&places);
         let firsts: Vec<usize> = (0..count).step_by(A_TIME).collect();
@@ -669,7 +669,7 @@ impl SampledForms {
                 let all = (0..count).into_par_iter().flat_map_iter(one).collect();
                 DMatrix::from_vec(between.nodes.len(), count, all)
             });
-            IntermediateForms { effects: between.rows(&effects), forms: on, between }
+            IntermediateForms { effects: between.rows(&effects), forms: on, nodes: between }
         });
         let mut between = between;
         for (k, moved) in moved.iter().enumerate() {
@@ -680,16 +680,16 @@ impl SampledForms {
         }
         Self {
             forms,
-            all: None,
+            all_form: None,
             places,
             effects,
             chosen: Vec::new(),
             untouched: Vec::new(),
             smooth_sigma_mm: Vec::new(),
-            scatter_mm,
-            narrow_mm,
-            stated,
-            between,
+            noise_mm: scatter_mm,
+            truncated_mm: narrow_mm,
+            random_effects: stated,
+            intermediate: between,
         }
     }
 
@@ -698,8 +698,8 @@ impl SampledForms {
     fn rough_where_touched(mut self, touched: &[[f64; 2]]) -> Self {
         let at = |&[x, y]: &[f64; 2]| Point::new(x, y, 0.0);
         let near2 = (0.5 * spacing_mm(&self.places)).powi(2);
-        let tree = Nearest::of(touched.iter().map(at));
-        let is_touched = |k: &usize| tree.to(&at(&self.places[*k]), 1).any(|(_, square)| square < near2);
+        let tree = Nearest::new(touched.iter().map(at));
+        let is_touched = |k: &usize| tree.nearest(&at(&self.places[*k]), 1).any(|(_, square)| square < near2);
         for k in (0..self.places.len()).filter(|k| !is_touched(k)) {
             let row = self.forms[0].row(k).into_owned();
             self.forms[1].set_row(k, &row);
@@ -730,7 +730,7 @@ impl SampledForms {
         let fitted = |column: DMatrix<f64>| &column - &base * base.tr_mul(&column);
         let found = &seen.deviations_mm;
         if is_of_few(posterior, inputs) {
-            let mut all = DMatrix::zeros(found.len(), self.scatter_mm.len());
+            let mut all = DMatrix::zeros(found.len(), self.noise_mm.len());
             let free = posterior.degrees_of_freedom().max(1.0);
             for (c, mut form) in all.column_iter_mut().enumerate() {
                 let mut normals = Normals::new(7, c as u64);
@@ -738,12 +738,12 @@ impl SampledForms {
                 // variance.
                 let chi2: f64 = (0..free as usize).map(|_| normals.next().powi(2)).sum();
                 let larger = (found.len() as f64 / chi2.max(f64::MIN_POSITIVE)).sqrt().max(1.0);
-                let scatter_mm = self.scatter_mm[c];
+                let scatter_mm = self.noise_mm[c];
                 form.iter_mut().zip(found).for_each(|(value, of)| *value = larger * of + scatter_mm * normals.next());
             }
-            self.all = Some(all);
+            self.all_form = Some(all);
         }
-        let Self { forms, scatter_mm, narrow_mm, .. } = &mut self;
+        let Self { forms, noise_mm: scatter_mm, truncated_mm: narrow_mm, .. } = &mut self;
         for (forms, narrow_mm) in forms.iter_mut().zip(narrow_mm) {
             let rows = forms.nrows();
             let of = |(c, form): (usize, &mut [f64])| {
@@ -768,14 +768,14 @@ impl SampledForms {
     /// Adds form that is too narrow to be resolved to places that were not touched: the excess of the noise over that
     /// of the probe, and short waves.
     fn with_what_is_narrow(mut self, inputs: &ModelInputs) -> Self {
-        add_narrow(&mut self.forms, (&self.scatter_mm, &self.narrow_mm), inputs, 4);
+        add_narrow(&mut self.forms, (&self.noise_mm, &self.truncated_mm), inputs, 4);
         self.narrow_between(inputs);
         self
     }
 
     fn narrow_between(&mut self, inputs: &ModelInputs) {
-        if let Some(between) = &mut self.between {
-            add_narrow(&mut between.forms, (&self.scatter_mm, &self.narrow_mm), inputs, 8);
+        if let Some(between) = &mut self.intermediate {
+            add_narrow(&mut between.forms, (&self.noise_mm, &self.truncated_mm), inputs, 8);
         }
     }
 
@@ -794,7 +794,7 @@ impl SampledForms {
             }
         };
         self.forms.iter_mut().for_each(|forms| take(forms, columns));
-        if let Some(IntermediateForms { between, forms, .. }) = &mut self.between {
+        if let Some(IntermediateForms { nodes: between, forms, .. }) = &mut self.intermediate {
             let columns = between.rows(columns);
             forms.iter_mut().for_each(|forms| take(forms, &columns));
         }
@@ -816,7 +816,7 @@ impl SampledForms {
         let sigma_mm = [&self.smooth_sigma_mm[..], &other.smooth_sigma_mm].concat();
         Self {
             forms: [0, 1].map(|k| joined(&self.forms[k], &other.forms[k])),
-            all: self.all.as_ref().map(|all| joined(all, &other.forms[0])),
+            all_form: self.all_form.as_ref().map(|all| joined(all, &other.forms[0])),
             effects: joined(&self.effects, &other.effects),
             places: order.iter().map(|&row| places[row]).collect(),
             chosen: order.iter().map(|&row| chosen[row]).collect(),
@@ -855,10 +855,10 @@ impl SampledForms {
             taken
         };
         let taken = self.forms.each_mut().map(fit);
-        self.all.iter_mut().for_each(|all| {
+        self.all_form.iter_mut().for_each(|all| {
             fit(all);
         });
-        if let Some(IntermediateForms { forms, effects, .. }) = &mut self.between {
+        if let Some(IntermediateForms { forms, effects, .. }) = &mut self.intermediate {
             for (forms, taken) in forms.iter_mut().zip(&taken) {
                 // The points determine every motion that the registration was free to make, so the factor is
                 // invertible.
@@ -877,7 +877,7 @@ impl SampledForms {
             let mean_mm = row.sum() / count;
             let sigma_mm = (row.iter().map(|v| (v - mean_mm).powi(2)).sum::<f64>() / (count - 1.0)).sqrt();
             let smooth_sigma_mm = self.smooth_sigma_mm[k];
-            FormPoint { at_mm: *at_mm, form: Prediction { mean_mm, sigma_mm }, smooth_sigma_mm }
+            FormPoint { place_mm: *at_mm, form: Prediction { mean_mm, sigma_mm }, smooth_sigma_mm }
         };
         self.places.iter().enumerate().map(of).collect()
     }
@@ -897,8 +897,8 @@ impl SampledForms {
     /// Returns the figures with their intervals. If no form is detectable, only upper bounds are given.
     fn figures(&self, is_seen: bool, [least, most]: [&[[f64; 3]]; 2], inputs: &ModelInputs) -> FormFigures {
         let [plain, rough] =
-            [0, 1].map(|k| self.figures_of(&self.forms[k], self.between.as_ref().map(|of| &of.forms[0])));
-        let all = self.all.as_ref().map(|all| self.figures_of(all, None));
+            [0, 1].map(|k| self.figures_of(&self.forms[k], self.intermediate.as_ref().map(|of| &of.forms[0])));
+        let all = self.all_form.as_ref().map(|all| self.figures_of(all, None));
         let low_factor = if (1..FEW_POINTS).contains(&self.chosen.len()) { FEW_LOW_FACTOR } else { 1.0 };
         let interval = |k: usize| {
             let of = |figures: &[[f64; 3]]| figures.iter().map(|of| of[k]).collect::<Vec<f64>>();
@@ -906,7 +906,7 @@ impl SampledForms {
             let higher = [Some(others), all.as_deref()].into_iter().flatten().filter(|of| !of.is_empty()).map(of);
             Interval::with_low_factor(of(&plain), (of(least), higher), (is_seen, low_factor), inputs)
         };
-        FormFigures { rms: interval(0), pv: interval(1), pv_most_points: interval(2) }
+        FormFigures { rms: interval(0), pv: interval(1), pv_998: interval(2) }
     }
 
     /// Returns the root mean square, the peak to valley and that of the aperture for each sample.
@@ -1016,7 +1016,7 @@ impl Interval {
                 of
             })
             .collect();
-        let ModelInputs { look_risk, probability, .. } = *inputs;
+        let ModelInputs { decision_risk: look_risk, acceptance_probability: probability, .. } = *inputs;
         let nth = |of: &[f64], share: f64| of[((of.len() - 1) as f64 * share).round() as usize];
         let at = |share: f64| {
             let own = nth(&values, share);
@@ -1053,7 +1053,7 @@ impl Motions {
         let centre = Point::from(points.clone().fold(Vector::zeros(), |sum, p| sum + p.coords) / n);
         let size_mm = (points.map(|p| (p - centre).norm_squared()).sum::<f64>() / n).sqrt().max(f64::MIN_POSITIVE);
         let about = about(centre, size_mm);
-        let covariance = about * registration.verdict.covariance * about.transpose();
+        let covariance = about * registration.quality.covariance * about.transpose();
         let SymmetricEigen { eigenvalues, eigenvectors } = covariance.symmetric_eigen();
         let seen = |k: &usize| eigenvalues[*k] > HELD * eigenvalues.max();
         let columns: Vec<Vector6<f64>> = (0..6).filter(seen).map(|k| eigenvectors.column(k).into_owned()).collect();
@@ -1079,9 +1079,9 @@ impl Motions {
         inputs: &ModelInputs,
     ) -> Result<MachineEffects, ModelError> {
         let of_others = [inputs.radius_sigma_mm, inputs.scale_sigma];
-        let datum = inputs.datum.unwrap_or_default();
+        let datum = inputs.locked_sigmas.unwrap_or_default();
         if let Some((what, value)) = unsound(&inputs.machine, of_others, &datum) {
-            return Err(ModelError::Stated { what, value });
+            return Err(ModelError::StatedUncertainty { what, value });
         }
         let model_from_machine = registration.cmm_from_model.rotation.transpose();
         Ok(MachineEffects::new(inputs.machine, of_others, datum, self.centre, model_from_machine))

@@ -33,7 +33,7 @@ use super::basis::Basis;
 use super::{Anisotropy, ModelError, Observed, Smoothness, orthonormal_base, spacing_mm};
 
 /// Smoothnesses of the hypotheses, from rough to smooth.
-pub(super) const KINDS: [Smoothness; 3] = [Smoothness::Never, Smoothness::Once, Smoothness::Endless];
+pub(super) const KINDS: [Smoothness; 3] = [Smoothness::Exponential, Smoothness::Matern2, Smoothness::SquaredExponential];
 /// Number of ranges for each smoothness.
 const RANGES: usize = 9;
 /// Shortest range, in spacings of the points.
@@ -70,12 +70,12 @@ const BLOCKS_AT_ONCE: usize = 32;
 /// Correlation of the noise from one point to the next, and anisotropy of the field.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct NoiseKind {
-    pub(super) lay: Anisotropy,
+    pub(super) anisotropy: Anisotropy,
     pub(super) autocorrelation: f64,
 }
 
 impl NoiseKind {
-    pub(super) const PLAIN: Self = Self { lay: Anisotropy::NONE, autocorrelation: 0.0 };
+    pub(super) const PLAIN: Self = Self { anisotropy: Anisotropy::NONE, autocorrelation: 0.0 };
 }
 
 /// Hypotheses of the field over the points of a measurement.
@@ -94,7 +94,7 @@ pub(super) struct FieldHypotheses {
     pub(super) log_whitened: f64,
     reduced: Reduced,
     /// Products Q'W phi: the part of the basis functions that the best fit removes.
-    taken: Mat<f64>,
+    removed_by_fit: Mat<f64>,
     pub(super) hypotheses: Vec<FieldHypothesis>,
 }
 
@@ -138,13 +138,13 @@ impl FieldHypotheses {
     pub(super) fn over(observed: &Observed, kind: NoiseKind) -> Result<Self, ModelError> {
         let mut fields = Self::bare(observed, kind)?;
         // Rough fields hardly differ from one range to the next, and cost most: every second range is enough.
-        let is_laid = |k: usize, smoothness: Smoothness| smoothness != Smoothness::Never || k.is_multiple_of(2);
+        let is_laid = |k: usize, smoothness: Smoothness| smoothness != Smoothness::Exponential || k.is_multiple_of(2);
         let all = fields.ranges_mm().enumerate().flat_map(|(k, range_mm)| KINDS.map(|of| (k, of, range_mm)));
         let all: Vec<_> = all.filter(|&(k, smoothness, _)| is_laid(k, smoothness)).collect();
         let node = |&(_, smoothness, range_mm): &(usize, Smoothness, f64)| fields.node(smoothness, range_mm);
         fields.hypotheses = all.par_iter().filter_map(node).collect();
         // Each rough node represents two ranges, so its prior doubles.
-        let rough = fields.hypotheses.iter_mut().filter(|node| node.smoothness == Smoothness::Never);
+        let rough = fields.hypotheses.iter_mut().filter(|node| node.smoothness == Smoothness::Exponential);
         rough.for_each(|node| node.prior.iter_mut().for_each(|of| *of += LN_2));
         Ok(fields)
     }
@@ -164,7 +164,7 @@ impl FieldHypotheses {
         let places = observed.places.clone();
         let n = places.len();
         let count = ((WAVES_A_POINT * n as f64) as usize).clamp(FEWEST_WAVES, MOST_WAVES[usize::from(n > MOST_WHOLE)]);
-        let waves = Basis::over(&places, kind.lay, count, if n > MOST_WHOLE { DEGREE } else { 0 });
+        let waves = Basis::over(&places, kind.anisotropy, count, if n > MOST_WHOLE { DEGREE } else { 0 });
         let whitening = whitening(&observed.path, n, kind.autocorrelation);
         let effects = whitened(&whitening, &observed.fixed_effects);
         let factor = super::dense::checked_cholesky(effects.tr_mul(&effects))?;
@@ -182,10 +182,10 @@ impl FieldHypotheses {
             degrees_of_freedom: free,
             log_whitened,
             reduced,
-            taken: Mat::new(),
+            removed_by_fit: Mat::new(),
             hypotheses: Vec::new(),
         };
-        (fields.reduced, fields.taken) = if n <= MOST_WHOLE { fields.whole() } else { fields.reduced_by_products() };
+        (fields.reduced, fields.removed_by_fit) = if n <= MOST_WHOLE { fields.whole() } else { fields.reduced_by_products() };
         Ok(fields)
     }
 
@@ -355,9 +355,9 @@ impl FieldHypotheses {
     /// Returns the rows C D, which convert a node's coefficients to coordinates, followed by the rows Q'W phi D, which
     /// the best fit removes.
     pub(super) fn with_effects(&self, node: &FieldHypothesis) -> Mat<f64> {
-        let (r, p) = (self.reduced.rows.nrows(), self.taken.nrows());
+        let (r, p) = (self.reduced.rows.nrows(), self.removed_by_fit.nrows());
         Mat::from_fn(r + p, node.standard_deviations.len(), |k, wave| {
-            let of = if k < r { self.reduced.rows[(k, wave)] } else { self.taken[(k - r, wave)] };
+            let of = if k < r { self.reduced.rows[(k, wave)] } else { self.removed_by_fit[(k - r, wave)] };
             of * node.standard_deviations[wave]
         })
     }

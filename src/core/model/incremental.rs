@@ -33,7 +33,7 @@ pub struct IncrementalPosterior {
     /// Number of fixed and random effects.
     columns: usize,
     /// Observed points, and the rows of L.
-    told: Vec<Place>,
+    observed_places: Vec<Place>,
     lower: Vec<Vec<f64>>,
     /// L^-1 times the deviations.
     whitened: Vec<f64>,
@@ -102,7 +102,7 @@ impl IncrementalPosterior {
             hyperparameters,
             pairs: hyperparameters.field.pairs(),
             columns: fixed_effects.ncols() + random_effects.ncols(),
-            told: Vec::new(),
+            observed_places: Vec::new(),
             lower: Vec::new(),
             whitened: Vec::new(),
             blocks: Vec::new(),
@@ -125,7 +125,7 @@ impl IncrementalPosterior {
     /// cases.
     pub fn update(&mut self, observed: &Observed) -> Result<(), ModelError> {
         let places = self.places_of(observed)?;
-        let known = self.told.len();
+        let known = self.observed_places.len();
         for (place, deviation_mm) in places.into_iter().zip(&observed.deviations_mm) {
             self.border(place, Some(*deviation_mm))?;
         }
@@ -140,7 +140,7 @@ impl IncrementalPosterior {
     /// # Errors
     /// Returns [`ModelError::NotDefinite`] if the new diagonal element of the factor is not finite and above 0.
     pub fn update_with_expected(&mut self, place: usize) -> Result<(), ModelError> {
-        let known = self.told.len();
+        let known = self.observed_places.len();
         self.border(self.blocks[place / BLOCK].places[place % BLOCK].clone(), None)?;
         self.carry(known);
         Ok(())
@@ -189,8 +189,8 @@ impl IncrementalPosterior {
     /// Returns L^-1 times the covariances of a place with all observed points, and mean and standard deviation of the
     /// deviation that a touch there will find.
     fn predicted(&self, place: &Place) -> (Vec<f64>, f64, f64) {
-        let mut l: Vec<f64> = Vec::with_capacity(self.told.len() + 1);
-        for (told, lower) in self.told.iter().zip(&self.lower) {
+        let mut l: Vec<f64> = Vec::with_capacity(self.observed_places.len() + 1);
+        for (told, lower) in self.observed_places.iter().zip(&self.lower) {
             let before: f64 = lower.iter().zip(&l).map(|(a, b)| a * b).sum();
             l.push((self.covariance_mm2(place, told) - before) / lower[l.len()]);
         }
@@ -210,7 +210,7 @@ impl IncrementalPosterior {
         self.whitened.push(deviation_mm.map_or(0.0, |deviation_mm| (deviation_mm - mean_mm) / d));
         l.push(d);
         self.lower.push(l);
-        self.told.push(place);
+        self.observed_places.push(place);
         Ok(())
     }
 
@@ -218,8 +218,8 @@ impl IncrementalPosterior {
     fn carry(&mut self, from: usize) {
         let mut blocks = std::mem::take(&mut self.blocks);
         blocks.par_iter_mut().for_each(|block| {
-            for k in from..self.told.len() {
-                let told = &self.told[k];
+            for k in from..self.observed_places.len() {
+                let told = &self.observed_places[k];
                 let mut row: Vec<f64> = block.places.iter().map(|place| self.covariance_mm2(told, place)).collect();
                 for (l, across) in self.lower[k].iter().zip(&block.across) {
                     row.iter_mut().zip(across).for_each(|(value, across)| *value -= l * across);

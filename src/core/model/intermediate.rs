@@ -31,7 +31,7 @@ pub(super) struct IntermediateNodes {
 impl IntermediateNodes {
     /// Lays a grid along the axes of some waves; returns `None` if it would have no node.
     pub(super) fn of(places: &[[f64; 2]], waves: &Basis) -> Option<Self> {
-        let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.lay.rotated(place)).collect();
+        let places: Vec<[f64; 2]> = places.iter().map(|&place| waves.anisotropy.rotated(place)).collect();
         let distance_mm = spacing_mm(&places);
         let [low, high] = bounds(places.iter().copied());
         let spans_mm = [0, 1].map(|axis| high[axis] - low[axis]);
@@ -44,7 +44,7 @@ impl IntermediateNodes {
         let corner_mm =
             [0, 1].map(|axis: usize| 0.5 * (low[axis] + high[axis] - spacing_mm * (counts[axis] - 1) as f64));
         let grid = BasisGrid { corner_mm, spacing_mm, counts };
-        let tree = Nearest::of(places.iter().map(|&[x, y]| Point::new(x, y, 0.0)));
+        let tree = Nearest::new(places.iter().map(|&[x, y]| Point::new(x, y, 0.0)));
         let beside = |node: usize| Some((node, beside(grid.place(node), &places, &tree, FARTHEST * distance_mm)?));
         let (nodes, corners): (Vec<usize>, Vec<_>) = (0..counts[0] * counts[1]).filter_map(beside).unzip();
         if nodes.is_empty() {
@@ -78,8 +78,8 @@ impl IntermediateNodes {
 /// Returns the three nearest touched places and their weights; `None` if touched places within `near_mm` do not
 /// surround the place.
 fn beside(at: [f64; 2], places: &[[f64; 2]], tree: &Nearest, near_mm: f64) -> Option<([usize; 3], [f64; 3])> {
-    const ASKED: u32 = 12;
-    let near: Vec<(usize, f64)> = tree.to(&Point::new(at[0], at[1], 0.0), ASKED).collect();
+    const CANDIDATES: u32 = 12;
+    let near: Vec<(usize, f64)> = tree.nearest(&Point::new(at[0], at[1], 0.0), CANDIDATES).collect();
     let mut angles: Vec<f64> = Vec::new();
     for (k, square) in &near {
         // The place is itself a touched one.

@@ -69,7 +69,7 @@ pub(super) struct MachineEffects {
     machine: MachineUncertainty,
     radius_mm: f64,
     temperature: f64,
-    datum: [f64; 6],
+    locked_sigmas: [f64; 6],
     centre: Point,
     model_from_machine: Matrix3<f64>,
 }
@@ -87,7 +87,7 @@ impl MachineEffects {
         model_from_machine: Matrix3<f64>,
     ) -> Self {
         let radius_mm = radius_mm.hypot(machine.reference_sphere_mm);
-        Self { machine, radius_mm, temperature, datum, centre, model_from_machine }
+        Self { machine, radius_mm, temperature, locked_sigmas: datum, centre, model_from_machine }
     }
 
     /// Returns the source of each column.
@@ -115,8 +115,8 @@ impl MachineEffects {
         let angles = angles.map(|(axes, angle)| (UncertaintySource::Squareness, Effect::Stretch(axes), angle));
         let probe = (0..5).map(|k| (UncertaintySource::Probe, Effect::Direction(k), probe_mm));
         let axis = |k: usize| self.model_from_machine.row(k).transpose();
-        let shifts = (0..3).map(|k| (UncertaintySource::Datum, Effect::Shift(axis(k)), self.datum[k]));
-        let turns = (0..3).map(|k| (UncertaintySource::Datum, Effect::Turn(axis(k)), self.datum[3 + k]));
+        let shifts = (0..3).map(|k| (UncertaintySource::Datum, Effect::Shift(axis(k)), self.locked_sigmas[k]));
+        let turns = (0..3).map(|k| (UncertaintySource::Datum, Effect::Turn(axis(k)), self.locked_sigmas[3 + k]));
         let machine = scales.chain(angles).chain(probe);
         let all = [radius, temperature].into_iter().chain(machine).chain(shifts).chain(turns);
         all.filter(|(.., size)| *size > 0.0).collect()

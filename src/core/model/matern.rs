@@ -31,7 +31,7 @@ pub(super) struct Curve {
 impl Curve {
     pub(super) fn of(smoothness: Smoothness) -> Self {
         static ONCE: Table = Table::new();
-        Self { table: (smoothness == Smoothness::Once).then(|| read(&ONCE)), is_rough: smoothness == Smoothness::Never }
+        Self { table: (smoothness == Smoothness::Matern2).then(|| read(&ONCE)), is_rough: smoothness == Smoothness::Exponential }
     }
 
     /// Returns the correlation at a distance; the argument is the square of the distance divided by the range.
@@ -101,9 +101,9 @@ mod tests {
     #[test]
     fn it_is_that_of_the_tables() {
         for (x, k2) in K {
-            let (found, expected) = (correlation(Smoothness::Once, x / 4.0), 0.5 * x * x * k2);
+            let (found, expected) = (correlation(Smoothness::Matern2, x / 4.0), 0.5 * x * x * k2);
             assert!((found / expected - 1.0).abs() < 1e-10, "{x}: {found} {expected}");
-            let rough = correlation(Smoothness::Never, x / 2.0);
+            let rough = correlation(Smoothness::Exponential, x / 2.0);
             assert!((rough / (-x).exp() - 1.0).abs() < 1e-14, "{x}: {rough}");
         }
         for smoothness in ALL {
@@ -113,13 +113,13 @@ mod tests {
         }
     }
 
-    const ALL: [Smoothness; 3] = [Smoothness::Never, Smoothness::Once, Smoothness::Endless];
+    const ALL: [Smoothness; 3] = [Smoothness::Exponential, Smoothness::Matern2, Smoothness::SquaredExponential];
 
     #[test]
     fn between_the_steps_it_is_as_exact() {
         for k in 0..4000 {
             let x = 1e-4 + 0.011_37 * f64::from(k);
-            let found = correlation(Smoothness::Once, x / 4.0);
+            let found = correlation(Smoothness::Matern2, x / 4.0);
             assert!((found - exact(x)[0]).abs() < 1e-10, "{x}");
         }
     }

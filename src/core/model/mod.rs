@@ -134,7 +134,7 @@ impl Observed {
             return Err(ModelError::Shape { points, deviations: deviations_mm.len(), rows: effects.nrows() });
         }
         if points <= columns {
-            return Err(ModelError::TooFewPoints { points, least: columns + 1 });
+            return Err(ModelError::TooFewPoints { points, min_points: columns + 1 });
         }
         let finite = |k: usize| {
             let effects = effects.row(k).into_iter().chain(&stated.row(k)).all(|value| value.is_finite());
@@ -176,12 +176,12 @@ impl Hyperparameters {
     /// Returns the correlation of the noise of two points that are this many steps of the path apart.
     fn noise_correlation(&self, steps: f64) -> f64 {
         // A correlation below exp(-36) is below the rounding error of a double, and counts as zero.
-        const FAR: f64 = 36.0;
+        const MAX_STEPS: f64 = 36.0;
         if self.noise_autocorrelation == 0.0 {
             return if steps == 0.0 { 1.0 } else { 0.0 };
         }
         let power = steps.abs() * self.noise_autocorrelation.ln();
-        if power < -FAR { 0.0 } else { power.exp() }
+        if power < -MAX_STEPS { 0.0 } else { power.exp() }
     }
 
     /// Checks that every hyperparameter is within its range.
@@ -192,10 +192,10 @@ impl Hyperparameters {
         let Self { field, noise_sigma_mm: scatter_mm, noise_autocorrelation: drift } = *self;
         field.check()?;
         if !(scatter_mm.is_finite() && scatter_mm > 0.0) {
-            return Err(ModelError::Hyper { what: "noise", value: scatter_mm });
+            return Err(ModelError::Hyperparameter { what: "noise", value: scatter_mm });
         }
         if !(0.0..1.0).contains(&drift) {
-            return Err(ModelError::Drift { value: drift });
+            return Err(ModelError::NoiseAutocorrelation { value: drift });
         }
         Ok(())
     }

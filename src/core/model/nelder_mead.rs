@@ -11,10 +11,10 @@ pub(super) fn maximize(
     near: f64,
     height: impl Fn([f64; 2]) -> f64,
 ) -> ([f64; 2], f64) {
-    const TURNS: usize = 120;
+    const MAX_ITERATIONS: usize = 120;
     let seen = |place: [f64; 2]| (place, height(place));
     let mut corners = [seen(start), seen([start[0] + steps[0], start[1]]), seen([start[0], start[1] + steps[1]])];
-    for _ in 0..TURNS {
+    for _ in 0..MAX_ITERATIONS {
         corners.sort_by(|a, b| b.1.total_cmp(&a.1));
         let [best, middle, worst] = corners;
         let spread =

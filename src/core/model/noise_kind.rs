@@ -47,7 +47,7 @@ pub(super) fn candidates(observed: &Observed) -> (NoiseKind, Option<NoiseKind>) 
     let blocks = CompositeLikelihood::of(observed);
     let plain = blocks.maximum(NoiseKind::PLAIN, None);
     let with_lay = |kind: NoiseKind, top: Top| NoiseKind {
-        lay: blocks.most_likely_anisotropy(kind, top).unwrap_or(Anisotropy::NONE),
+        anisotropy: blocks.most_likely_anisotropy(kind, top).unwrap_or(Anisotropy::NONE),
         ..kind
     };
     let drifting = if observed.path.is_empty() { None } else { blocks.most_likely_autocorrelation(plain) };
@@ -92,7 +92,7 @@ impl CompositeLikelihood {
         if range < (LEAST_RANGE * self.distance_mm).ln() {
             return f64::NEG_INFINITY;
         }
-        let field = Field { lay: kind.lay, ..Field::new(1.0, range.exp()) };
+        let field = Field { anisotropy: kind.anisotropy, ..Field::new(1.0, range.exp()) };
         let unit = Hyperparameters { field, noise_sigma_mm: ratio.exp(), noise_autocorrelation: kind.autocorrelation };
         let fit = |block: &Observed| {
             // A block that does not determine its plane, for example points on a line, is left out.
@@ -154,7 +154,7 @@ impl CompositeLikelihood {
         // A lay is the same after half a turn, and an isotropic field has no direction. So twice the angle and the
         // logarithm of the stretch are polar coordinates of the search plane.
         let of = |[a, b]: [f64; 2]| Anisotropy::at(0.5 * b.atan2(a), a.hypot(b).exp().min(MOST_STRETCHED));
-        let height = |place: [f64; 2]| self.log_likelihood(NoiseKind { lay: of(place), ..kind }, without.0);
+        let height = |place: [f64; 2]| self.log_likelihood(NoiseKind { anisotropy: of(place), ..kind }, without.0);
         let starts =
             [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]].map(|along: [f64; 2]| along.map(|v| v * FIRST_STRETCH));
         let start = starts.map(|start| (start, height(start))).into_iter().fold(([0.0; 2], without.1), higher);

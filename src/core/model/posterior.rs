@@ -53,7 +53,7 @@ pub(super) struct Posterior<'f> {
     observed: &'f Observed,
     probe: NoisePrior,
     /// Projections U' of the deviations and of the random effects, for each node.
-    seen: Vec<Projected>,
+    projected: Vec<Projected>,
     /// Logarithm of the posterior density: one vector for each node, one value for each variance ratio.
     densities: Vec<Vec<f64>>,
     /// Logarithm of the likelihood ratio of the best field and no field.
@@ -82,7 +82,7 @@ pub(super) enum HypothesisSet {
 
 impl HypothesisSet {
     fn has(self, smoothness: Smoothness) -> bool {
-        let is_rough = smoothness == Smoothness::Never;
+        let is_rough = smoothness == Smoothness::Exponential;
         match self {
             Self::All => true,
             Self::Smooth => !is_rough,
@@ -103,13 +103,13 @@ impl HypothesisSet {
 /// Samples of the field.
 pub(super) struct PosteriorSamples {
     /// Coefficients of the basis functions, one column for each sample, for each of the two variances.
-    pub(super) waves: [Mat<f64>; 2],
+    pub(super) coefficients: [Mat<f64>; 2],
     /// Standard deviation of the noise of each sample.
-    pub(super) scatter_mm: Vec<f64>,
+    pub(super) noise_mm: Vec<f64>,
     /// Standard deviation of the waves shorter than those of the basis, for each of the two variances.
-    pub(super) narrow_mm: [Vec<f64>; 2],
+    pub(super) truncated_mm: [Vec<f64>; 2],
     /// Random effects in standard uncertainties, one column for each sample.
-    pub(super) stated: DMatrix<f64>,
+    pub(super) random_effects: DMatrix<f64>,
 }
 
 impl<'f> Posterior<'f> {
@@ -134,7 +134,7 @@ impl<'f> Posterior<'f> {
         };
         let seen: Vec<Projected> = fields.hypotheses.iter().map(see).collect();
         let posterior =
-            Self { fields, observed, probe, seen, densities: Vec::new(), evidence: 0.0, squares: products[(0, 0)] };
+            Self { fields, observed, probe, projected: seen, densities: Vec::new(), evidence: 0.0, squares: products[(0, 0)] };
         let of = |(k, node): (usize, &FieldHypothesis)| {
             let likelihoods: Vec<f64> =
                 variance_ratios().map(|tau| posterior.noise_likelihood(k, tau).log_marginal()).collect();
@@ -169,7 +169,7 @@ impl<'f> Posterior<'f> {
     /// Returns the likelihood of the noise for a node and a variance ratio.
     fn noise_likelihood(&self, node: usize, tau: f64) -> NoiseLikelihood {
         let (FieldHypothesis { eigenvalues: values, truncated_variance: narrow, scale, .. }, Projected { v, rest }) =
-            (&self.fields.hypotheses[node], &self.seen[node]);
+            (&self.fields.hypotheses[node], &self.projected[node]);
         let stated = rest.nrows() - 1;
         let alike = 1.0 + scale * narrow * tau;
         let mut products = rest / alike;
@@ -233,9 +233,9 @@ impl<'f> Posterior<'f> {
         // If every deviation is zero, the noise is zero too: a positive minimum keeps the hyperparameters valid.
         let scatter_mm = self.noise_likelihood(node, tau).mode_mm().max(f64::MIN_POSITIVE.sqrt());
         let sigma_mm = scatter_mm * (tau * scale).sqrt();
-        let NoiseKind { lay, autocorrelation: drift } = self.fields.kind;
+        let NoiseKind { anisotropy: lay, autocorrelation: drift } = self.fields.kind;
         Hyperparameters {
-            field: Field { sigma_mm, range_mm: *range_mm, smoothness: *smoothness, lay },
+            field: Field { sigma_mm, range_mm: *range_mm, smoothness: *smoothness, anisotropy: lay },
             noise_sigma_mm: scatter_mm,
             noise_autocorrelation: drift,
         }
@@ -272,7 +272,7 @@ impl<'f> Posterior<'f> {
     ///
     /// Rough fields are not included, because their variance cannot be separated from the noise.
     pub(super) fn mean_hyperparameters(&self) -> Hyperparameters {
-        let likely = self.weighted_hyperparameters(|smoothness| smoothness != Smoothness::Never);
+        let likely = self.weighted_hyperparameters(|smoothness| smoothness != Smoothness::Exponential);
         let Some((first, _)) = likely.first().copied() else {
             let scatter_mm = self.rms_mm().max(f64::MIN_POSITIVE.sqrt());
             return Hyperparameters {
@@ -316,21 +316,21 @@ impl<'f> Posterior<'f> {
         let made: Vec<PosteriorSamples> =
             nodes.par_iter().map(|of| self.samples_of(of[0].0, of, (which, seed))).collect();
         let mut draws = PosteriorSamples {
-            waves: [0, 1].map(|_| Mat::zeros(self.fields.basis.len(), chosen.len())),
-            scatter_mm: Vec::new(),
-            narrow_mm: [Vec::new(), Vec::new()],
-            stated: DMatrix::zeros(self.observed.random_effects.ncols(), chosen.len()),
+            coefficients: [0, 1].map(|_| Mat::zeros(self.fields.basis.len(), chosen.len())),
+            noise_mm: Vec::new(),
+            truncated_mm: [Vec::new(), Vec::new()],
+            random_effects: DMatrix::zeros(self.observed.random_effects.ncols(), chosen.len()),
         };
         for of in made {
-            let first = draws.scatter_mm.len();
-            draws.stated.columns_mut(first, of.stated.ncols()).copy_from(&of.stated);
-            for (into, from) in draws.waves.iter_mut().zip(&of.waves) {
+            let first = draws.noise_mm.len();
+            draws.random_effects.columns_mut(first, of.random_effects.ncols()).copy_from(&of.random_effects);
+            for (into, from) in draws.coefficients.iter_mut().zip(&of.coefficients) {
                 for c in 0..from.ncols() {
                     into.col_as_slice_mut(first + c)[..from.nrows()].copy_from_slice(from.col_as_slice(c));
                 }
             }
-            draws.scatter_mm.extend(of.scatter_mm);
-            draws.narrow_mm.iter_mut().zip(of.narrow_mm).for_each(|(into, from)| into.extend(from));
+            draws.noise_mm.extend(of.noise_mm);
+            draws.truncated_mm.iter_mut().zip(of.truncated_mm).for_each(|(into, from)| into.extend(from));
         }
         draws
     }
@@ -342,7 +342,7 @@ impl<'f> Posterior<'f> {
         chosen: &[(usize, f64, usize)],
         (which, seed): (HypothesisSet, u64),
     ) -> PosteriorSamples {
-        let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.seen[number]);
+        let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.projected[number]);
         let (waves, seen, count) = (node.standard_deviations.len(), node.eigenvalues.len(), chosen.len());
         let mut streams: Vec<Normals> = chosen.iter().map(|(.., k)| Normals::new(seed, *k as u64)).collect();
         let told: Vec<(f64, DVector<f64>)> = chosen
@@ -384,10 +384,10 @@ impl<'f> Posterior<'f> {
             .variances(node.smoothness)
             .map(|under| (0..count).map(|c| (strength2(c, under) * node.truncated_variance).sqrt()).collect());
         PosteriorSamples {
-            waves: which.variances(node.smoothness).map(of),
-            stated: DMatrix::from_fn(self.observed.random_effects.ncols(), count, |e, c| told[c].1[e]),
-            scatter_mm: told.into_iter().map(|(scatter_mm, _)| scatter_mm).collect(),
-            narrow_mm,
+            coefficients: which.variances(node.smoothness).map(of),
+            random_effects: DMatrix::from_fn(self.observed.random_effects.ncols(), count, |e, c| told[c].1[e]),
+            noise_mm: told.into_iter().map(|(scatter_mm, _)| scatter_mm).collect(),
+            truncated_mm: narrow_mm,
         }
     }
 
@@ -398,7 +398,7 @@ impl<'f> Posterior<'f> {
         let Some((number, tau)) = self.most_probable() else {
             return (waves, DVector::zeros(self.observed.random_effects.ncols()));
         };
-        let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.seen[number]);
+        let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.projected[number]);
         let scale = self.noise_likelihood(number, tau);
         let scatter_mm = scale.mode_mm();
         let stated = scale.stated_mean(scatter_mm);
@@ -452,10 +452,10 @@ impl<'f> Posterior<'f> {
 ///
 /// u are the eigenvalues of E'K0^-1 E. b are the components of E'K0^-1 d along the eigenvectors.
 struct NoiseLikelihood {
-    free: f64,
+    degrees_of_freedom: f64,
     logs: f64,
     squares: f64,
-    by_stated: Vec<[f64; 2]>,
+    random_effect_terms: Vec<[f64; 2]>,
     axes: DMatrix<f64>,
     probe: NoisePrior,
 }
@@ -471,15 +471,15 @@ impl NoiseLikelihood {
             let beside = eigenvectors.tr_mul(&products.view((1, 0), (stated, 1)));
             (eigenvalues.iter().zip(&beside).map(|(u, b)| [u.max(0.0), *b]).collect(), eigenvectors)
         };
-        Self { free, logs, squares: products[(0, 0)].max(f64::MIN_POSITIVE), by_stated, axes, probe }
+        Self { degrees_of_freedom: free, logs, squares: products[(0, 0)].max(f64::MIN_POSITIVE), random_effect_terms: by_stated, axes, probe }
     }
 
     /// Returns the logarithm of the density over ln s.
     fn density(&self, log_mm: f64) -> f64 {
         let s2 = (2.0 * log_mm).exp();
-        let mut value = 2.0 * self.free * log_mm + self.logs;
+        let mut value = 2.0 * self.degrees_of_freedom * log_mm + self.logs;
         let mut squares = self.squares;
-        for [u, b] in &self.by_stated {
+        for [u, b] in &self.random_effect_terms {
             value += (u / s2).ln_1p();
             squares -= b * b / (s2 + u);
         }
@@ -494,10 +494,10 @@ impl NoiseLikelihood {
     fn steps(&self) -> (f64, f64, Vec<f64>) {
         const COARSE: usize = 24;
         const FINE: usize = 41;
-        let told: f64 = self.by_stated.iter().map(|[u, b]| b * b / u.max(f64::MIN_POSITIVE)).sum();
-        let wide = (16.0 / (2.0 * self.free).sqrt()).max(0.05);
+        let told: f64 = self.random_effect_terms.iter().map(|[u, b]| b * b / u.max(f64::MIN_POSITIVE)).sum();
+        let wide = (16.0 / (2.0 * self.degrees_of_freedom).sqrt()).max(0.05);
         let least = (self.squares - told).max(1e-12 * self.squares);
-        let [mut low, mut high] = [0.5 * (least / self.free).ln() - wide, 0.5 * (self.squares / self.free).ln() + wide];
+        let [mut low, mut high] = [0.5 * (least / self.degrees_of_freedom).ln() - wide, 0.5 * (self.squares / self.degrees_of_freedom).ln() + wide];
         if let Some([probe_mm, u]) = self.probe {
             high = high.max(probe_mm.ln() + 4.0 * u);
         }
@@ -525,14 +525,14 @@ impl NoiseLikelihood {
     }
 
     fn is_plain(&self) -> bool {
-        self.by_stated.is_empty() && self.probe.is_none()
+        self.random_effect_terms.is_empty() && self.probe.is_none()
     }
 
     /// Returns the logarithm of the likelihood with s integrated out, without the constants that are the same for every
     /// field.
     fn log_marginal(&self) -> f64 {
         if self.is_plain() {
-            return -0.5 * (self.logs + self.free * self.squares.ln());
+            return -0.5 * (self.logs + self.degrees_of_freedom * self.squares.ln());
         }
         let (_, step, densities) = self.steps();
         let top = densities.iter().copied().fold(f64::NEG_INFINITY, f64::max);
@@ -542,7 +542,7 @@ impl NoiseLikelihood {
     /// Returns the most probable s, in mm.
     fn mode_mm(&self) -> f64 {
         if self.is_plain() {
-            return (self.squares / self.free).sqrt();
+            return (self.squares / self.degrees_of_freedom).sqrt();
         }
         let (first, step, densities) = self.steps();
         let best = (0..densities.len()).fold(0, |best, k| if densities[k] > densities[best] { k } else { best });
@@ -554,11 +554,11 @@ impl NoiseLikelihood {
             // Chi-squared: for few degrees of freedom a sum of squared normal numbers, which is exact; otherwise the
             // cube-root approximation (Wilson and Hilferty 1931).
             const MANY: f64 = 60.0;
-            let chi2 = if self.free <= MANY {
-                (0..self.free as usize).map(|_| normals.next().powi(2)).sum::<f64>()
+            let chi2 = if self.degrees_of_freedom <= MANY {
+                (0..self.degrees_of_freedom as usize).map(|_| normals.next().powi(2)).sum::<f64>()
             } else {
-                let ninth = 2.0 / (9.0 * self.free);
-                self.free * (1.0 - ninth + ninth.sqrt() * normals.next()).powi(3)
+                let ninth = 2.0 / (9.0 * self.degrees_of_freedom);
+                self.degrees_of_freedom * (1.0 - ninth + ninth.sqrt() * normals.next()).powi(3)
             };
             return (self.squares / chi2.max(f64::MIN_POSITIVE)).sqrt();
         }
@@ -575,14 +575,14 @@ impl NoiseLikelihood {
 
     /// Returns the most probable random effects, each in units of its standard uncertainty.
     fn stated_mean(&self, scatter_mm: f64) -> DVector<f64> {
-        let along = self.by_stated.iter().map(|[u, b]| b / (scatter_mm * scatter_mm + u));
-        &self.axes * DVector::from_iterator(self.by_stated.len(), along)
+        let along = self.random_effect_terms.iter().map(|[u, b]| b / (scatter_mm * scatter_mm + u));
+        &self.axes * DVector::from_iterator(self.random_effect_terms.len(), along)
     }
 
     fn stated(&self, scatter_mm: f64, normals: &mut Normals) -> DVector<f64> {
         let scatter2 = scatter_mm * scatter_mm;
-        let spread = self.by_stated.iter().map(|[u, _]| (1.0 + u / scatter2).sqrt().recip() * normals.next());
-        let spread = &self.axes * DVector::from_iterator(self.by_stated.len(), spread);
+        let spread = self.random_effect_terms.iter().map(|[u, _]| (1.0 + u / scatter2).sqrt().recip() * normals.next());
+        let spread = &self.axes * DVector::from_iterator(self.random_effect_terms.len(), spread);
         self.stated_mean(scatter_mm) + spread
     }
 }
@@ -714,7 +714,7 @@ mod tests {
             let n = observed.places.len();
             let fields = FieldHypotheses::over(&observed, NoiseKind::PLAIN).unwrap();
             let posterior = Posterior::of(&fields, &observed, None, None);
-            let is_one = |node: &FieldHypothesis| node.smoothness == Smoothness::Once && node.range_mm > 30.0;
+            let is_one = |node: &FieldHypothesis| node.smoothness == Smoothness::Matern2 && node.range_mm > 30.0;
             let number = fields.hypotheses.iter().position(is_one).unwrap();
             let node = &fields.hypotheses[number];
             let waves = fields.basis.at(&observed.places);

@@ -30,7 +30,7 @@ impl Prior {
     pub(super) fn check(&self) -> Result<(), ModelError> {
         for (what, [median, factor]) in [("range", self.range_mm), ("ratio of noise to field", self.noise_ratio)] {
             if !(median.is_finite() && median > 0.0 && factor.is_finite() && factor > 1.0) {
-                return Err(ModelError::Expected { what, median, factor });
+                return Err(ModelError::Prior { what, median, factor });
             }
         }
         Ok(())

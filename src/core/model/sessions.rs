@@ -26,7 +26,7 @@ use crate::registration::{Deviation, PointStatus, Registration};
 #[derive(Clone, Debug)]
 pub struct Sessions {
     observed: Observed,
-    of: Vec<u32>,
+    session_numbers: Vec<u32>,
 }
 
 /// Hyperparameters of the field common to all sessions, and of the field of each session.
@@ -85,7 +85,7 @@ impl Sessions {
         if of.len() != observed.places.len() {
             return Err(ModelError::Sessions { points: observed.places.len(), sessions: of.len() });
         }
-        Ok(Self { observed, of })
+        Ok(Self { observed, session_numbers: of })
     }
 
     /// Joins the used points of registrations, each with the number of the session of every measured point. The motions
@@ -101,10 +101,10 @@ impl Sessions {
             if deviations.len() != sessions.len() {
                 return Err(ModelError::Sessions { points: deviations.len(), sessions: sessions.len() });
             }
-            let used = deviations.iter().zip(*sessions).filter(|(d, _)| d.status == PointStatus::Used);
+            let used = deviations.iter().zip(*sessions).filter(|(d, _)| d.status == PointStatus::Inlier);
             let (used, numbers): (Vec<&Deviation>, Vec<u32>) = used.unzip();
             if used.is_empty() {
-                return Err(ModelError::TooFewPoints { points: 0, least: 7 });
+                return Err(ModelError::TooFewPoints { points: 0, min_points: 7 });
             }
             parts.push(Motions::of(registration, used.iter().map(|d| d.point)).observed(&used));
             of.extend(numbers);
@@ -124,11 +124,11 @@ impl Sessions {
     /// Returns an error if there are fewer than two sessions; otherwise those of [`DensePosterior::fit`].
     pub fn between_session_variance(&self, priors: &Prior) -> Result<BetweenSessionVariance, ModelError> {
         priors.check()?;
-        let mut numbers = self.of.clone();
+        let mut numbers = self.session_numbers.clone();
         numbers.sort_unstable();
         numbers.dedup();
         if numbers.len() < FEWEST_SESSIONS {
-            return Err(ModelError::TooFewSessions { sessions: numbers.len(), least: FEWEST_SESSIONS });
+            return Err(ModelError::TooFewSessions { sessions: numbers.len(), min_sessions: FEWEST_SESSIONS });
         }
         let few = self.thinned(MOST_SEARCHED);
         let (found, top) = few.searched(priors);
@@ -193,7 +193,7 @@ impl Sessions {
         let own = Field::new(share, own_mm);
         let model = self.fit(unit, own)?;
         let squares = model.whitened_squares(&self.observed);
-        let free = (self.of.len() - self.observed.fixed_effects.ncols()) as f64;
+        let free = (self.session_numbers.len() - self.observed.fixed_effects.ncols()) as f64;
         // If all deviations are 0, so is the scale; the limit keeps it above 0.
         let scale = (squares / free).sqrt().max(f64::MIN_POSITIVE.sqrt());
         let log_of = |value: f64, [median, factor]: [f64; 2]| -0.5 * ((value / median).ln() / factor.ln()).powi(2);
@@ -212,7 +212,7 @@ impl Sessions {
     fn fit(&self, hyperparameters: Hyperparameters, own: Field) -> Result<DensePosterior, ModelError> {
         let places = &self.observed.places;
         let own = own.pairs();
-        DensePosterior::with(&self.observed, hyperparameters, |a, b| match self.of[a] == self.of[b] {
+        DensePosterior::with(&self.observed, hyperparameters, |a, b| match self.session_numbers[a] == self.session_numbers[b] {
             true => own.covariance_mm2(places[a], places[b]),
             false => 0.0,
         })
@@ -220,9 +220,9 @@ impl Sessions {
 
     /// Returns at most `most` of the points, evenly spaced in the order of measurement.
     fn thinned(&self, most: usize) -> Self {
-        let n = self.of.len();
+        let n = self.session_numbers.len();
         let chosen: Vec<usize> = (0..n.min(most)).map(|k| k * n / n.min(most)).collect();
-        Self { observed: self.observed.subset(&chosen), of: chosen.iter().map(|&k| self.of[k]).collect() }
+        Self { observed: self.observed.subset(&chosen), session_numbers: chosen.iter().map(|&k| self.session_numbers[k]).collect() }
     }
 }
 
@@ -254,7 +254,7 @@ impl BetweenSessionVariance {
         let Observed { places, fixed_effects: effects, .. } = &unseen.observed;
         let (means_mm, common) = model.predict_together(places);
         let pairs = self.session_field.pairs();
-        let own = Mat::from_fn(places.len(), places.len(), |r, c| match unseen.of[r] == unseen.of[c] {
+        let own = Mat::from_fn(places.len(), places.len(), |r, c| match unseen.session_numbers[r] == unseen.session_numbers[c] {
             true => pairs.covariance_mm2(places[r], places[c]),
             false => 0.0,
         });

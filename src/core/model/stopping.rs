@@ -23,12 +23,12 @@ pub struct StoppingCriteria {
     /// Largest accepted peak to valley, in mm; infinite if it is not limited.
     pub pv_mm: f64,
     /// Largest accepted PV 99.8 % (without the outermost 0.1 % at either end), in mm; infinite if it is not limited.
-    pub pv_most_points_mm: f64,
+    pub pv_998_mm: f64,
     /// Largest accepted root mean square, in mm; infinite if it is not limited.
     pub rms_mm: f64,
     /// Standard uncertainty of the smooth form (RMS over all targets) that is enough for a correction, in mm. A smaller
     /// one brings no gain, because the pass itself adds a larger error.
-    pub correction_mm: f64,
+    pub correction_sigma_mm: f64,
     /// True if another pass is allowed and is expected to improve the part.
     pub may_grind: bool,
 }
@@ -60,29 +60,29 @@ pub struct StoppingDecision {
 pub enum Reason {
     /// Every figure is within its limit, with the probability that one decision among many requires
     /// ([`ModelInputs::look_risk`]).
-    Within,
+    WithinLimits,
     /// The part has to be corrected, and the form is known well enough for the correction.
-    Known,
+    FormKnown,
     /// The part has to be corrected, and further touches would cost more than the error that another pass corrects.
-    Enough,
+    CorrectionPreferred,
     /// All targets were tried.
-    All,
+    AllTargetsTried,
     /// There are fewer touches than [`MIN_TOUCHES`]: too few for a decision.
-    Few,
+    TooFewTouches,
     /// The innovations of the last batch are larger than expected.
-    Surprised,
+    LargeInnovations,
     /// A touch is an outlier, and too few of its neighbours were tried.
-    Around,
+    UnconfirmedOutlier,
     /// The part has a narrow feature: only the whole pattern shows its size.
-    Feature,
+    NarrowFeature,
     /// The interval of a figure contains its limit.
     Undecided,
     /// The form is not known well enough for a correction.
-    Unknown,
+    FormUnknown,
     /// A figure is certainly beyond its limit, and no further pass is available to correct it.
-    Beyond,
+    BeyondLimit,
     /// [`MAX_BATCHES`] batches were touched: all remaining targets follow at once.
-    Late,
+    MaxBatchesReached,
 }
 
 /// Number of touches of the first batch: enough to check that it is the right part, and where it lies.
@@ -142,25 +142,25 @@ pub fn decide(
     let left = so_far.tried.iter().filter(|tried| tried.is_none()).count();
     let around = growing.around(so_far);
     let why = match () {
-        () if left == 0 => Reason::All,
-        () if count < MIN_TOUCHES => Reason::Few,
-        () if growing.feature(so_far) => Reason::Feature,
-        () if growing.is_surprised() => Reason::Surprised,
-        () if !around.is_empty() => Reason::Around,
+        () if left == 0 => Reason::AllTargetsTried,
+        () if count < MIN_TOUCHES => Reason::TooFewTouches,
+        () if growing.feature(so_far) => Reason::NarrowFeature,
+        () if growing.is_surprised() => Reason::LargeInnovations,
+        () if !around.is_empty() => Reason::UnconfirmedOutlier,
         () => settled(&form, purpose, (count, so_far.targets.len())),
     };
-    let is_over = matches!(why, Reason::Within | Reason::Known | Reason::Enough | Reason::Beyond | Reason::All);
+    let is_over = matches!(why, Reason::WithinLimits | Reason::FormKnown | Reason::CorrectionPreferred | Reason::BeyondLimit | Reason::AllTargetsTried);
     let batches = so_far.tried.iter().flatten().max().map_or(0, |last| last + 1);
-    let why = if batches >= MAX_BATCHES && !is_over { Reason::Late } else { why };
+    let why = if batches >= MAX_BATCHES && !is_over { Reason::MaxBatchesReached } else { why };
     let next = match why {
         _ if is_over => Vec::new(),
-        Reason::Feature | Reason::Late => (0..so_far.tried.len()).filter(|&k| so_far.tried[k].is_none()).collect(),
+        Reason::NarrowFeature | Reason::MaxBatchesReached => (0..so_far.tried.len()).filter(|&k| so_far.tried[k].is_none()).collect(),
         _ => {
             let wanted = if count < MIN_TOUCHES { MIN_TOUCHES - count } else { (count / 2).clamp(BATCH[0], BATCH[1]) };
             growing.next(so_far, &around, wanted.max(around.len()).min(left), seed)?
         }
     };
-    let is_all = matches!(why, Reason::Feature | Reason::Late);
+    let is_all = matches!(why, Reason::NarrowFeature | Reason::MaxBatchesReached);
     let next = if is_all { next } else { short_tour(so_far.targets, next) };
     // Slopes, ISO figures and budget are computed for the last decision only.
     let form = if next.is_empty() { Form::estimate_at(registration, inputs, so_far.targets)? } else { form };
@@ -171,13 +171,13 @@ pub fn decide(
 fn settled(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, usize)) -> Reason {
     let figures = [
         (form.figures.pv, purpose.pv_mm),
-        (form.figures.pv_most_points, purpose.pv_most_points_mm),
+        (form.figures.pv_998, purpose.pv_998_mm),
         (form.figures.rms, purpose.rms_mm),
     ];
     if figures.iter().all(|(figure, limit)| figure.most_mm <= *limit) {
-        return Reason::Within;
+        return Reason::WithinLimits;
     }
-    let is_known = form.known_mm <= purpose.correction_mm;
+    let is_known = form.rms_smooth_sigma_mm <= purpose.correction_sigma_mm;
     let is_beyond = figures.iter().any(|(figure, limit)| figure.least_mm > *limit);
     let (share, least) = GIVEN_UP;
     let gives_up = count >= least.max((share * pattern as f64) as usize);
@@ -185,19 +185,19 @@ fn settled(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, us
     // part that it can accept gets more touches, not another pass.
     let is_accepted = figures.iter().all(|(figure, limit)| figure.accepted_mm <= *limit);
     match () {
-        () if is_beyond && !purpose.may_grind => Reason::Beyond,
-        () if is_known && (is_beyond || gives_up && purpose.may_grind && !is_accepted) => Reason::Known,
-        () if gives_up && purpose.may_grind && !is_accepted => Reason::Enough,
-        () if is_beyond => Reason::Unknown,
+        () if is_beyond && !purpose.may_grind => Reason::BeyondLimit,
+        () if is_known && (is_beyond || gives_up && purpose.may_grind && !is_accepted) => Reason::FormKnown,
+        () if gives_up && purpose.may_grind && !is_accepted => Reason::CorrectionPreferred,
+        () if is_beyond => Reason::FormUnknown,
         () => Reason::Undecided,
     }
 }
 
 /// Posterior of the touches so far, with the innovations of the last batch.
 struct ExpectedTouches {
-    growing: IncrementalPosterior,
+    posterior: IncrementalPosterior,
     /// Target and standardized innovation of each touch of the last batch.
-    last: Vec<(usize, f64)>,
+    last_innovations: Vec<(usize, f64)>,
     outliers: Vec<usize>,
 }
 
@@ -212,7 +212,7 @@ impl ExpectedTouches {
     ) -> Result<Self, ModelError> {
         let PartialMeasurement { targets, tried, touched } = so_far;
         let all: Vec<_> = registration.deviations.iter().zip(touched.iter().copied()).collect();
-        let used = || all.iter().filter(|(d, _)| d.status == PointStatus::Used && d.in_fit);
+        let used = || all.iter().filter(|(d, _)| d.status == PointStatus::Inlier && d.in_fit);
         let motions = Motions::of(registration, used().map(|(d, _)| d.point));
         let stated = motions.stated(registration, inputs)?;
         let last = tried.iter().flatten().max().copied().unwrap_or(0);
@@ -236,12 +236,12 @@ impl ExpectedTouches {
         growing.update(&found)?;
         let is_far = |d: &Deviation| d.status != PointStatus::OffPart && !d.in_fit;
         let outliers = all.iter().filter(|(d, _)| is_far(d)).map(|(_, target)| *target).collect();
-        Ok(Self { growing, last: of_targets.into_iter().zip(off).collect(), outliers })
+        Ok(Self { posterior: growing, last_innovations: of_targets.into_iter().zip(off).collect(), outliers })
     }
 
     /// Returns true if the innovations of the last batch without its outliers are larger than expected by chance.
     fn is_surprised(&self) -> bool {
-        let squares: Vec<f64> = self.last.iter().filter(|(_, z)| z.abs() < STANDS_OUT).map(|(_, z)| z * z).collect();
+        let squares: Vec<f64> = self.last_innovations.iter().filter(|(_, z)| z.abs() < STANDS_OUT).map(|(_, z)| z * z).collect();
         let n = squares.len() as f64;
         // Quantile of chi-squared divided by its degrees of freedom (Wilson and Hilferty 1931).
         let ninth = 2.0 / (9.0 * n);
@@ -249,7 +249,7 @@ impl ExpectedTouches {
     }
 
     fn standing_out(&self) -> impl Iterator<Item = usize> + '_ {
-        let off = self.last.iter().filter(|(_, z)| z.abs() >= STANDS_OUT).map(|(target, _)| *target);
+        let off = self.last_innovations.iter().filter(|(_, z)| z.abs() >= STANDS_OUT).map(|(target, _)| *target);
         off.chain(self.outliers.iter().copied())
     }
 
@@ -294,11 +294,11 @@ impl ExpectedTouches {
             chosen.push(anywhere);
         }
         for &place in &chosen {
-            self.growing.update_with_expected(place)?;
+            self.posterior.update_with_expected(place)?;
         }
         while chosen.len() < wanted {
             let Some(best) = self.least_known(&open) else { break };
-            self.growing.update_with_expected(best)?;
+            self.posterior.update_with_expected(best)?;
             open[best] = false;
             chosen.push(best);
         }
@@ -308,7 +308,7 @@ impl ExpectedTouches {
     /// Returns the open target with the largest weighted variance. The weight is 2 where the maximum or the minimum of
     /// the form can lie, otherwise 1.
     fn least_known(&self, open: &[bool]) -> Option<usize> {
-        let known: Vec<Prediction> = self.growing.predictions().collect();
+        let known: Vec<Prediction> = self.posterior.predictions().collect();
         let surely =
             |sign: f64| known.iter().map(|p| sign * p.mean_mm - 2.0 * p.sigma_mm).fold(f64::NEG_INFINITY, f64::max);
         let [highest, lowest] = [surely(1.0), surely(-1.0)];
@@ -349,8 +349,8 @@ pub fn short_tour(targets: &[(Point, Vector)], chosen: Vec<usize>) -> Vec<usize>
     } {
         way.push(open.swap_remove(nearest));
     }
-    const TURNS: usize = 8;
-    for _ in 0..TURNS {
+    const MAX_PASSES: usize = 8;
+    for _ in 0..MAX_PASSES {
         let mut is_shorter = false;
         for i in 0..way.len().saturating_sub(2) {
             for j in i + 2..way.len() {

@@ -31,39 +31,39 @@ const LEAST_SHARE_OF_ALL: f64 = 0.25;
 /// Marks the outliers that are not isolated as used, and adds them to the number of points used, the objective, RMS and
 /// PV.
 pub(super) fn count_what_agrees(deviations: &mut [Deviation], verdict: &mut Verdict, outlier_sigmas: f64) {
-    if Counts::of(deviations).outliers == 0 {
+    if Counts::count(deviations).outliers == 0 {
         return;
     }
     let left_out: Vec<usize> =
         (0..deviations.len()).filter(|&k| deviations[k].status == PointStatus::Outlier).collect();
-    let around = Around::of(deviations, outlier_sigmas);
-    let form: Vec<usize> = left_out.into_par_iter().filter(|&k| !around.is_alone(k)).collect();
+    let around = Around::new(deviations, outlier_sigmas);
+    let form: Vec<usize> = left_out.into_par_iter().filter(|&k| !around.is_isolated(k)).collect();
     if form.is_empty() {
         return;
     }
     for k in form {
         let height_mm = deviations[k].deviation_mm;
-        deviations[k].status = PointStatus::Used;
-        verdict.used += 1;
+        deviations[k].status = PointStatus::Inlier;
+        verdict.inliers += 1;
         verdict.objective_mm2 += height_mm * height_mm;
     }
-    let used = deviations.iter().filter(|d| d.status == PointStatus::Used).map(|d| d.deviation_mm);
+    let used = deviations.iter().filter(|d| d.status == PointStatus::Inlier).map(|d| d.deviation_mm);
     let (low_mm, high_mm) =
         used.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), d| (f64::min(low, d), f64::max(high, d)));
     verdict.pv_mm = high_mm - low_mm;
-    verdict.rms_mm = (verdict.objective_mm2 / verdict.used as f64).sqrt();
+    verdict.rms_mm = (verdict.objective_mm2 / verdict.inliers as f64).sqrt();
 }
 
 /// Returns how many points on the part were left out of the fit although most of their neighbours were fitted.
 pub(super) fn contradicted(deviations: &[Deviation]) -> usize {
-    let around = Around::of(deviations, 0.0);
-    let is_left = |k: &usize| !deviations[around.of[*k]].in_fit;
+    let around = Around::new(deviations, 0.0);
+    let is_left = |k: &usize| !deviations[around.indices[*k]].in_fit;
     let among_others = |&k: &usize| {
-        let near = around.tree.to(&around.feet[k], NEAREST).filter(|(n, _)| *n != k).take(ASKED);
+        let near = around.tree.nearest(&around.projections[k], NEAREST).filter(|(n, _)| *n != k).take(ASKED);
         let (near, left) = near.fold((0, 0), |(near, left), (n, _)| (near + 1, left + usize::from(is_left(&n))));
         2 * left < near
     };
-    (0..around.of.len()).into_par_iter().filter(is_left).filter(among_others).count()
+    (0..around.indices.len()).into_par_iter().filter(is_left).filter(among_others).count()
 }
 
 /// Points on the part, indexed by their projections onto the surface. The height of a point does not change the
@@ -72,15 +72,15 @@ struct Around {
     tree: Nearest,
     heights_mm: Vec<f64>,
     /// Indices of these points among all points, ascending.
-    of: Vec<usize>,
-    feet: Vec<Point>,
+    indices: Vec<usize>,
+    projections: Vec<Point>,
     /// Median of the heights, and half of the limit for an outlier.
-    surface_mm: f64,
-    least_mm: f64,
+    median_height_mm: f64,
+    half_limit_mm: f64,
 }
 
 impl Around {
-    fn of(deviations: &[Deviation], outlier_sigmas: f64) -> Self {
+    fn new(deviations: &[Deviation], outlier_sigmas: f64) -> Self {
         let on_part = |k: &usize| deviations[*k].status != PointStatus::OffPart;
         let of: Vec<usize> = (0..deviations.len()).filter(on_part).collect();
         let heights_mm: Vec<f64> = of.iter().map(|&k| deviations[k].deviation_mm).collect();
@@ -88,15 +88,15 @@ impl Around {
             of.iter().map(|&k| deviations[k].point - deviations[k].normal * deviations[k].deviation_mm).collect();
         let (surface_mm, sigma_mm) = robust_sigma(heights_mm.iter().copied());
         let least_mm = 0.5 * outlier_sigmas * sigma_mm.max(LEAST_SIGMA_MM);
-        Self { tree: Nearest::of(feet.iter().copied()), heights_mm, of, feet, surface_mm, least_mm }
+        Self { tree: Nearest::new(feet.iter().copied()), heights_mm, indices: of, projections: feet, median_height_mm: surface_mm, half_limit_mm: least_mm }
     }
 
     /// Returns true if no neighbour deviates as this point does, relative to the level around the point.
-    fn is_alone(&self, k: usize) -> bool {
-        let Ok(own) = self.of.binary_search(&k) else { return true };
+    fn is_isolated(&self, k: usize) -> bool {
+        let Ok(own) = self.indices.binary_search(&k) else { return true };
         let near: Vec<(usize, f64)> = self
             .tree
-            .to(&self.feet[own], NEAREST)
+            .nearest(&self.projections[own], NEAREST)
             .filter(|(n, _)| *n != own)
             .map(|(n, square)| (n, square.sqrt()))
             .collect();
@@ -111,12 +111,12 @@ impl Around {
         // surface.
         let is_same = |n: usize, from_mm: f64, share: f64| {
             let [own_mm, other_mm] = [own, n].map(|k| self.heights_mm[k] - from_mm);
-            own_mm.signum() * other_mm > self.least_mm.max(share * own_mm.abs())
+            own_mm.signum() * other_mm > self.half_limit_mm.max(share * own_mm.abs())
         };
         let agrees = |(n, apart): &(usize, f64)| {
             *apart <= BESIDE * apart_mm
-                && (is_same(*n, level_mm, LEAST_SHARE) || is_same(*n, self.surface_mm, LEAST_SHARE_OF_ALL))
+                && (is_same(*n, level_mm, LEAST_SHARE) || is_same(*n, self.median_height_mm, LEAST_SHARE_OF_ALL))
         };
-        (self.heights_mm[own] - level_mm).abs() > self.least_mm && !others.iter().any(agrees)
+        (self.heights_mm[own] - level_mm).abs() > self.half_limit_mm && !others.iter().any(agrees)
     }
 }

@@ -28,19 +28,19 @@ pub(super) const ON_PART_STEPS: f32 = 1e-3;
 /// State of a measured point that passes from one iteration to the next.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Correspondence {
-    pub(crate) place: Place,
+    pub(crate) facet: Place,
     pub(crate) distance_mm: f64,
     /// Distance of the projection beyond the edge, in steps of the sampling.
     pub(crate) beyond_steps: f32,
     /// True if the point takes part in the fit.
-    pub(crate) used: bool,
+    pub(crate) in_fit: bool,
 }
 
 impl Correspondence {
     /// Returns the status of the point.
     pub(crate) fn status(&self) -> PointStatus {
-        match self.used {
-            true => PointStatus::Used,
+        match self.in_fit {
+            true => PointStatus::Inlier,
             false if self.is_off_part() => PointStatus::OffPart,
             false => PointStatus::Outlier,
         }
@@ -51,7 +51,7 @@ impl Correspondence {
         self.beyond_steps > ON_PART_STEPS
     }
 
-    pub(crate) const NEW: Self = Self { place: Place::UNKNOWN, distance_mm: 0.0, beyond_steps: 0.0, used: true };
+    pub(crate) const NEW: Self = Self { facet: Place::UNKNOWN, distance_mm: 0.0, beyond_steps: 0.0, in_fit: true };
 }
 
 /// Projects all points under a pose and returns the sums of the linear problem at the projections.
@@ -69,7 +69,7 @@ pub(crate) fn correspond(
 ) -> Sums {
     let pass = Pass { surface, residual, model_from_cmm: cmm_from_model.inverse(), scaling };
     let arch = pulp::Arch::new();
-    let task = |(points, correspondences)| arch.dispatch(Chunk { pass: &pass, points, correspondences });
+    let task = |(points, correspondences)| arch.dispatch(Chunk { projection_pass: &pass, points, correspondences });
     if measured.len() <= 2 * CHUNK {
         return task((measured, correspondences));
     }
@@ -79,7 +79,7 @@ pub(crate) fn correspond(
 
 /// Work of one task, in a form that is compiled once for each set of vector instructions.
 struct Chunk<'a> {
-    pass: &'a Pass<'a>,
+    projection_pass: &'a Pass<'a>,
     points: &'a [Point],
     correspondences: &'a mut [Correspondence],
 }
@@ -90,7 +90,7 @@ impl pulp::NullaryFnOnce for Chunk<'_> {
     // Inlined into the caller that uses the vector instructions: a called function would be compiled without them.
     #[inline(always)]
     fn call(self) -> Sums {
-        self.pass.chunk(self.points, self.correspondences)
+        self.projection_pass.sum_chunk(self.points, self.correspondences)
     }
 }
 
@@ -106,39 +106,39 @@ impl Pass<'_> {
     /// Returns the sums of one chunk of points. Processes four points together if they stay on their facets or move to
     /// new facets together, and single points otherwise.
     #[inline(always)]
-    fn chunk(&self, points: &[Point], correspondences: &mut [Correspondence]) -> Sums {
+    fn sum_chunk(&self, points: &[Point], correspondences: &mut [Correspondence]) -> Sums {
         let mut sums = Sums::zero();
         let mut fours = FourSums::zero();
         let mut last = Place::UNKNOWN;
         let mut recent = [[Place::UNKNOWN; LANES]; 2];
-        let in_fours = self.surface.has_four_feet() && self.surface.nominal().outline().is_none();
+        let in_fours = self.surface.supports_project_x4() && self.surface.nominal().outline().is_none();
         let (four_points, rest_points) = points.as_chunks::<LANES>();
         let (four_correspondences, rest_correspondences) = correspondences.as_chunks_mut::<LANES>();
         for (points, correspondences) in four_points.iter().zip(four_correspondences) {
             // No closure around code that needs the vector instructions: a closure would be compiled without them.
             let start = if in_fours { self.start(correspondences, &recent) } else { None };
             let taken = match start {
-                Some(places) => self.four(points, correspondences, places, &mut fours),
+                Some(places) => self.project_x4(points, correspondences, places, &mut fours),
                 None => false,
             };
             if !taken {
                 for (point, correspondence) in points.iter().zip(&mut *correspondences) {
-                    self.one(point, correspondence, &mut last, &mut sums);
+                    self.project_one(point, correspondence, &mut last, &mut sums);
                 }
             }
             recent = [
                 recent[1],
                 [
-                    correspondences[0].place,
-                    correspondences[1].place,
-                    correspondences[2].place,
-                    correspondences[3].place,
+                    correspondences[0].facet,
+                    correspondences[1].facet,
+                    correspondences[2].facet,
+                    correspondences[3].facet,
                 ],
             ];
-            last = correspondences[LANES - 1].place;
+            last = correspondences[LANES - 1].facet;
         }
         for (point, correspondence) in rest_points.iter().zip(rest_correspondences) {
-            self.one(point, correspondence, &mut last, &mut sums);
+            self.project_one(point, correspondence, &mut last, &mut sums);
         }
         fours.add_to(&mut sums);
         sums
@@ -149,17 +149,17 @@ impl Pass<'_> {
     #[inline(always)]
     fn start(&self, correspondences: &[Correspondence; LANES], recent: &[[Place; LANES]; 2]) -> Option<[Place; LANES]> {
         let places =
-            [correspondences[0].place, correspondences[1].place, correspondences[2].place, correspondences[3].place];
+            [correspondences[0].facet, correspondences[1].facet, correspondences[2].facet, correspondences[3].facet];
         if !places.contains(&Place::UNKNOWN) {
             return Some(places);
         }
-        self.surface.four_extrapolated_places(&recent[0], &recent[1])
+        self.surface.extrapolate_x4(&recent[0], &recent[1])
     }
 
     /// Processes four points together if they are on the part and near the given places. Otherwise returns false and
     /// changes no correspondence and no sum.
     #[inline(always)]
-    fn four(
+    fn project_x4(
         &self,
         points: &[Point; LANES],
         correspondences: &mut [Correspondence; LANES],
@@ -167,14 +167,14 @@ impl Pass<'_> {
         sums: &mut FourSums,
     ) -> bool {
         let p = four_moved(&self.model_from_cmm, &side_by_side(points));
-        let Some(feet) = self.surface.four_feet(&p, &mut places) else { return false };
+        let Some(feet) = self.surface.project_x4(&p, &mut places) else { return false };
         let distance = feet.distance_mm - F64x4::splat(self.residual.subtract_mm);
         let (mut weight, mut loss, mut used) = ([0.0; LANES], [0.0; LANES], 0);
         for l in 0..LANES {
-            correspondences[l].place = places[l];
+            correspondences[l].facet = places[l];
             correspondences[l].distance_mm = distance.0[l];
             correspondences[l].beyond_steps = 0.0;
-            if correspondences[l].used {
+            if correspondences[l].in_fit {
                 (weight[l], loss[l]) = self.residual.loss.weigh(distance.0[l]);
                 used += 1;
             }
@@ -184,16 +184,16 @@ impl Pass<'_> {
     }
 
     #[inline]
-    fn one(&self, point: &Point, correspondence: &mut Correspondence, last: &mut Place, sums: &mut Sums) {
-        let p = self.model_from_cmm.point(point); // g^-1 Y
+    fn project_one(&self, point: &Point, correspondence: &mut Correspondence, last: &mut Place, sums: &mut Sums) {
+        let p = self.model_from_cmm.transform_point(point); // g^-1 Y
         // A point without an earlier place starts at the place of the point before it in the file, if there is one.
-        let start = if correspondence.place == Place::UNKNOWN { *last } else { correspondence.place };
-        let foot = self.surface.foot(&p, start);
-        *last = foot.place;
-        correspondence.place = foot.place;
+        let start = if correspondence.facet == Place::UNKNOWN { *last } else { correspondence.facet };
+        let foot = self.surface.project(&p, start);
+        *last = foot.facet;
+        correspondence.facet = foot.facet;
         correspondence.distance_mm = foot.distance_mm - self.residual.subtract_mm;
         correspondence.beyond_steps = beyond_steps(self.surface, &p, &foot);
-        if correspondence.used {
+        if correspondence.in_fit {
             let (weight, loss) = self.residual.loss.weigh(correspondence.distance_mm);
             sums.add(&self.scaling.row(&p, &foot.normal), correspondence.distance_mm, weight, loss);
         }
@@ -207,7 +207,7 @@ pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &Foot) -> f
         let contact = p - foot.normal * (foot.distance_mm + surface.radius_mm());
         !outline.contains(contact.x, contact.y)
     });
-    let steps = foot.beyond_steps as f32;
+    let steps = foot.beyond_edge_steps as f32;
     if is_outside { steps.max(1.0) } else { steps }
 }
 
@@ -226,7 +226,7 @@ fn four_moved(pose: &Pose, w: &Vector3x4) -> Vector3x4 {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FourFinal {
     pub(crate) centre: Vector3x4,
-    pub(crate) feet: FourFeet,
+    pub(crate) projections: FourFeet,
     pub(crate) row: [F64x4; 6],
 }
 
@@ -240,7 +240,7 @@ pub(crate) trait Report: Sync {
 
     /// Returns the reported items of four points. Inlined, so that it is compiled with the caller's vector
     /// instructions.
-    fn four(&self, correspondences: [&Correspondence; LANES], at: &FourFinal) -> [Self::Item; LANES];
+    fn report_x4(&self, correspondences: [&Correspondence; LANES], at: &FourFinal) -> [Self::Item; LANES];
 }
 
 /// Groups of four points per task of [`at_feet`].
@@ -256,13 +256,13 @@ pub(crate) fn at_feet<R: Report>(
     report: &R,
 ) -> Vec<R::Item> {
     let at_end =
-        AtEnd { surface, measured, correspondences, model_from_cmm: cmm_from_model.inverse(), scaling, report };
+        AtEnd { surface, measured, correspondences, model_from_cmm: cmm_from_model.inverse(), scaling, reporter: report };
     let arch = pulp::Arch::new();
     // Whole blocks, written in place. The last block is padded with the last point.
     let blocks: Vec<[[R::Item; LANES]; FOURS]> = (0..measured.len().div_ceil(LANES * FOURS))
         .into_par_iter()
         .with_min_len(CHUNK / (LANES * FOURS))
-        .map(|block| arch.dispatch(EndBlock { at_end: &at_end, block }))
+        .map(|block| arch.dispatch(EndBlock { final_pass: &at_end, block }))
         .collect();
     let mut items = blocks.into_flattened().into_flattened();
     items.truncate(measured.len());
@@ -276,11 +276,11 @@ struct AtEnd<'a, R> {
     correspondences: &'a [Correspondence],
     model_from_cmm: Pose,
     scaling: &'a Scaling,
-    report: &'a R,
+    reporter: &'a R,
 }
 
 struct EndBlock<'a, R> {
-    at_end: &'a AtEnd<'a, R>,
+    final_pass: &'a AtEnd<'a, R>,
     block: usize,
 }
 
@@ -291,7 +291,7 @@ impl<R: Report> pulp::NullaryFnOnce for EndBlock<'_, R> {
     fn call(self) -> Self::Output {
         let mut items = [[R::BLANK; LANES]; FOURS];
         for (four, items) in items.iter_mut().enumerate() {
-            *items = self.at_end.four((self.block * FOURS + four) * LANES);
+            *items = self.final_pass.report_group((self.block * FOURS + four) * LANES);
         }
         items
     }
@@ -300,7 +300,7 @@ impl<R: Report> pulp::NullaryFnOnce for EndBlock<'_, R> {
 impl<R: Report> AtEnd<'_, R> {
     /// Reports four points from the index `first` on. Past the end it repeats the last point.
     #[inline(always)]
-    fn four(&self, first: usize) -> [R::Item; LANES] {
+    fn report_group(&self, first: usize) -> [R::Item; LANES] {
         let end = self.measured.len() - 1;
         let (a, b, c, d) = (first.min(end), (first + 1).min(end), (first + 2).min(end), (first + 3).min(end));
         let correspondences =
@@ -308,22 +308,22 @@ impl<R: Report> AtEnd<'_, R> {
         let points = [self.measured[a], self.measured[b], self.measured[c], self.measured[d]];
         let centre = four_moved(&self.model_from_cmm, &side_by_side(&points));
         let mut places =
-            [correspondences[0].place, correspondences[1].place, correspondences[2].place, correspondences[3].place];
-        let together = self.surface.has_four_feet() && !places.contains(&Place::UNKNOWN);
-        let feet = match if together { self.surface.four_feet(&centre, &mut places) } else { None } {
+            [correspondences[0].facet, correspondences[1].facet, correspondences[2].facet, correspondences[3].facet];
+        let together = self.surface.supports_project_x4() && !places.contains(&Place::UNKNOWN);
+        let feet = match if together { self.surface.project_x4(&centre, &mut places) } else { None } {
             Some(feet) => feet,
-            None => self.four_single(&centre, correspondences),
+            None => self.project_individually(&centre, correspondences),
         };
-        self.report
-            .four(correspondences, &FourFinal { centre, feet, row: self.scaling.four_rows(&centre, &feet.normal) })
+        self.reporter
+            .report_x4(correspondences, &FourFinal { centre, projections: feet, row: self.scaling.four_rows(&centre, &feet.normal) })
     }
 
     /// Returns the projections of four points, each searched on its own.
     #[cold]
-    fn four_single(&self, centre: &Vector3x4, correspondences: [&Correspondence; LANES]) -> FourFeet {
+    fn project_individually(&self, centre: &Vector3x4, correspondences: [&Correspondence; LANES]) -> FourFeet {
         let foot = |l: usize| {
             let p = Point::new(centre[0].0[l], centre[1].0[l], centre[2].0[l]);
-            self.surface.foot(&p, correspondences[l].place)
+            self.surface.project(&p, correspondences[l].facet)
         };
         let feet: [_; LANES] = std::array::from_fn(foot);
         FourFeet {

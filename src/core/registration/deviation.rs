@@ -27,7 +27,7 @@ pub struct Deviation {
 #[non_exhaustive]
 pub enum PointStatus {
     /// Inlier: it counts in every figure.
-    Used,
+    Inlier,
     /// Outlier: it is far from the surface, and no neighbour confirms it.
     Outlier,
     /// The projection is beyond the edge of the nominal surface.
@@ -40,21 +40,21 @@ pub(super) struct Counts {
     pub(super) outliers: usize,
     pub(super) off_part: usize,
     /// Points on the part that were left out of the fit.
-    pub(super) left: usize,
+    pub(super) left_out_of_fit: usize,
 }
 
 impl Counts {
     /// Counts the points on all threads: with many points, memory access takes most of the time.
-    pub(super) fn of(deviations: &[Deviation]) -> Self {
+    pub(super) fn count(deviations: &[Deviation]) -> Self {
         let of_one = |d: &Deviation| Self {
             outliers: usize::from(d.status == PointStatus::Outlier),
             off_part: usize::from(d.status == PointStatus::OffPart),
-            left: usize::from(d.status != PointStatus::OffPart && !d.in_fit),
+            left_out_of_fit: usize::from(d.status != PointStatus::OffPart && !d.in_fit),
         };
         let add = |a: Self, b: Self| Self {
             outliers: a.outliers + b.outliers,
             off_part: a.off_part + b.off_part,
-            left: a.left + b.left,
+            left_out_of_fit: a.left_out_of_fit + b.left_out_of_fit,
         };
         let of_some = |some: &[Deviation]| some.iter().map(of_one).fold(Self::default(), add);
         deviations.par_chunks(1 << 14).map(of_some).reduce(Self::default, add)

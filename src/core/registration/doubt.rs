@@ -52,10 +52,10 @@ pub(super) fn doubts(part: &Part, found: &Registration, measured: &[Point], opti
 /// Returns warnings about many rejected points, and about points that cover little of the surface.
 fn of_points(found: &Registration) -> Vec<String> {
     let points = found.deviations.len();
-    let Counts { outliers, off_part, .. } = Counts::of(&found.deviations);
+    let Counts { outliers, off_part, .. } = Counts::count(&found.deviations);
     let share = |n: usize| n as f64 / points as f64;
     let mut doubts: Vec<String> = of_left_out(found).into_iter().collect();
-    doubts.extend(found.no_verdict());
+    doubts.extend(found.unjudgeable_reason());
     if share(outliers) > MOST_OUTLIERS {
         doubts.push(format!(
             "{outliers} of {points} points ({:.0} %) are rejected as outliers: look for dirt or coolant on the part, \
@@ -80,7 +80,7 @@ fn of_points(found: &Registration) -> Vec<String> {
             100.0 * share(in_gaps),
         ));
     }
-    let coverage = found.verdict.coverage;
+    let coverage = found.quality.coverage;
     if coverage < LEAST_COVERAGE {
         doubts.push(format!(
             "the {} points used cover only {:.0} % of the nominal surface, and the rest is unknown: check whether \
@@ -97,10 +97,10 @@ fn in_gaps(found: &Registration, off_part: usize) -> usize {
     /// Number of directions in the xy plane of the model frame.
     const SECTORS: usize = 8;
     /// Most points of each kind that are examined.
-    const MOST: usize = 2000;
+    const MAX_EXAMINED: usize = 2000;
     let some_of = |is_off: bool, count: usize| -> Vec<[f64; 2]> {
         let of = found.deviations.iter().filter(|d| (d.status == PointStatus::OffPart) == is_off);
-        of.step_by(count.div_ceil(MOST).max(1)).map(|d| [d.point.x, d.point.y]).collect()
+        of.step_by(count.div_ceil(MAX_EXAMINED).max(1)).map(|d| [d.point.x, d.point.y]).collect()
     };
     let (looked_at, some) = (some_of(true, off_part), some_of(false, found.deviations.len() - off_part));
     let is_surrounded = |place: &&[f64; 2]| {
@@ -119,16 +119,16 @@ fn in_gaps(found: &Registration, off_part: usize) -> usize {
 impl Registration {
     /// Returns why these points allow no judgement, or `None`. Too many of them contradict their neighbours, so it is
     /// unknown which of the two groups is the part.
-    pub fn no_verdict(&self) -> Option<String> {
+    pub fn unjudgeable_reason(&self) -> Option<String> {
         /// Largest share of the points on the part.
-        const MOST: f64 = 0.1;
-        let Counts { off_part, left, .. } = Counts::of(&self.deviations);
-        if left as f64 <= MOST * (self.deviations.len() - off_part) as f64 {
+        const MAX_CONTRADICTED_SHARE: f64 = 0.1;
+        let Counts { off_part, left_out_of_fit: left, .. } = Counts::count(&self.deviations);
+        if left as f64 <= MAX_CONTRADICTED_SHARE * (self.deviations.len() - off_part) as f64 {
             return None;
         }
         let on_part: Vec<&Deviation> = self.deviations.iter().filter(|d| d.status != PointStatus::OffPart).collect();
         let contradicted = contradicted(&self.deviations);
-        if contradicted as f64 <= MOST * on_part.len() as f64 {
+        if contradicted as f64 <= MAX_CONTRADICTED_SHARE * on_part.len() as f64 {
             return None;
         }
         let figures = |some: &mut dyn Iterator<Item = f64>| {
@@ -152,10 +152,10 @@ impl Registration {
 /// Warns that the nominal points have noise of their own, if it contributes noticeably to the deviations.
 fn of_nominal(part: &Part, found: &Registration) -> Option<String> {
     /// Limits for the warning; both must be exceeded. A file with four digits of a millimetre has a noise of 0.03 um.
-    const LEAST_MM: f64 = 1e-4;
-    const LEAST_OF_RMS: f64 = 0.1;
-    let scatter_mm = part.nominal.scatter_mm();
-    (scatter_mm > LEAST_MM.max(LEAST_OF_RMS * found.verdict.rms_mm)).then(|| {
+    const MIN_NOISE_MM: f64 = 1e-4;
+    const MIN_RMS_SHARE: f64 = 0.1;
+    let scatter_mm = part.nominal.noise_sigma_mm();
+    (scatter_mm > MIN_NOISE_MM.max(MIN_RMS_SHARE * found.quality.rms_mm)).then(|| {
         format!(
             "the nominal points have a noise of {} about a smooth surface, and each deviation has about as much: \
              give them with more digits, or give the surface that they come from",
@@ -166,7 +166,7 @@ fn of_nominal(part: &Part, found: &Registration) -> Option<String> {
 
 /// Names the rejected points, and gives the figures that include them.
 fn of_left_out(found: &Registration) -> Option<String> {
-    let WithLeftOut { points, rms_mm, pv_mm, places } = found.with_left_out()?;
+    let WithLeftOut { outliers: points, rms_mm, pv_mm, description: places } = found.figures_with_outliers()?;
     let were = if points == 1 { "1 point was".to_owned() } else { format!("{points} points were") };
     Some(format!(
         "{were} rejected, because no neighbour confirms the deviation: {places}; with all points PV is {} and RMS \
@@ -183,7 +183,7 @@ pub(super) fn of_radius(part: &Part, found: &Registration, measured: &[Point], o
         return None;
     }
     let sample: Vec<Point> = spread(measured, TRIED).copied().collect();
-    let told_mm = settled(given_mm + found.told_radius()?.more_mm, given_mm, &|radius_mm| {
+    let told_mm = settled(given_mm + found.estimate_radius()?.difference_mm, given_mm, &|radius_mm| {
         refit(part, found, &sample, options, radius_mm)
     })?;
     let is_contact = told_mm.abs() < MOST_OF_CONTACT * given_mm;
@@ -191,7 +191,7 @@ pub(super) fn of_radius(part: &Part, found: &Registration, measured: &[Point], o
         return None;
     }
     let other = refit(part, found, &sample, options, if is_contact { 0.0 } else { told_mm })?;
-    let (rms_mm, other_rms_mm) = (found.verdict.rms_mm, other.verdict.rms_mm);
+    let (rms_mm, other_rms_mm) = (found.quality.rms_mm, other.quality.rms_mm);
     is_better(part, rms_mm, other_rms_mm).then(|| {
         let (rms, other_rms) = (length(rms_mm), length(other_rms_mm));
         if is_contact {
@@ -223,7 +223,7 @@ fn refit(part: &Part, found: &Registration, sample: &[Point], given: &Options, r
         side: if is_ball && radius_mm < 0.0 { found.side.other() } else { found.side }.into(),
         ..*given
     };
-    let part = Part::check(part.nominal, sample, &options).ok()?;
+    let part = Part::new(part.nominal, sample, &options).ok()?;
     super::fit(&part, sample, &options).ok()
 }
 
@@ -238,30 +238,30 @@ fn is_better(part: &Part, rms_mm: f64, other_rms_mm: f64) -> bool {
 fn can_be_doubted(part: &Part, found: &Registration, options: &Options) -> bool {
     /// The model is linear, and a wrong radius is far off. So this test lets through a little more than the final one.
     const MARGIN: f64 = 1.15;
-    let (given_mm, rms_mm) = (options.probe_radius_mm, found.verdict.rms_mm);
+    let (given_mm, rms_mm) = (options.probe_radius_mm, found.quality.rms_mm);
     // With a locked coordinate, a wrong position of the fixture would look like a wrong radius.
     let is_ball = options.method != Method::Contact && given_mm >= LEAST_BALL_MM && !options.locked.contains(&true);
-    if !is_ball || found.verdict.used < 7 + LEAST_FREEDOM || rms_mm < LEAST_RMS_OF_SIZE * part.size_mm {
+    if !is_ball || found.quality.inliers < 7 + LEAST_FREEDOM || rms_mm < LEAST_RMS_OF_SIZE * part.size_mm {
         return false;
     }
-    found.told_radius().is_some_and(|told| {
-        let off_mm = told.more_mm.abs();
+    found.estimate_radius().is_some_and(|told| {
+        let off_mm = told.difference_mm.abs();
         MARGIN * off_mm >= LEAST_SHARE_OFF * given_mm
             && off_mm > 5.0 * told.sigma_mm
-            && is_better(part, MARGIN * rms_mm, told.rms_left * rms_mm)
+            && is_better(part, MARGIN * rms_mm, told.rms_share * rms_mm)
     })
 }
 
 /// Iterates the radius that the points give until it no longer changes, and returns it in mm. It may change sign, to
 /// the other side of the surface. Returns `None` if a fit fails.
 fn settled(first_mm: f64, given_mm: f64, refit: &impl Fn(f64) -> Option<Registration>) -> Option<f64> {
-    const TURNS: usize = 5;
+    const MAX_ITERATIONS: usize = 5;
     let mut radius_mm = first_mm;
-    for _ in 0..TURNS {
+    for _ in 0..MAX_ITERATIONS {
         if radius_mm.abs() < LEAST_BALL_MM {
             radius_mm = 0.0;
         }
-        let more_mm = refit(radius_mm)?.told_radius()?.more_mm * if radius_mm < 0.0 { -1.0 } else { 1.0 };
+        let more_mm = refit(radius_mm)?.estimate_radius()?.difference_mm * if radius_mm < 0.0 { -1.0 } else { 1.0 };
         radius_mm += more_mm;
         if more_mm.abs() < 0.01 * given_mm {
             break;

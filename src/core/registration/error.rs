@@ -21,14 +21,14 @@ pub enum RegistrationError {
         "there are {points} measured points; at least {least} are required, one more than the pose has free \
          directions; measure more, or lock the directions that the fixture holds"
     )]
-    TooFewPoints { points: usize, least: usize },
+    TooFewPoints { points: usize, min_points: usize },
     #[error(
         "the measured points lie on or near one line: {width_mm:.3} mm wide, with {distance_mm:.3} mm from point to \
          point; they do not determine the rotation of the part about that line, nor its position across it; measure \
          a strip at least {least_mm:.3} mm wide, or give a start pose and lock {} and {}",
-        hold[0].name(), hold[1].name()
+        to_lock[0].name(), to_lock[1].name()
     )]
-    Narrow { width_mm: f64, distance_mm: f64, least_mm: f64, hold: [Coordinate; 2] },
+    Narrow { width_mm: f64, distance_mm: f64, min_width_mm: f64, to_lock: [Coordinate; 2] },
     #[error("measured point {} is not finite; remove it or correct it", index + 1)]
     NotFinite { index: usize },
     #[error(

@@ -32,18 +32,18 @@ pub(crate) struct Problem<'a> {
     pub(crate) residual: ResidualModel,
     pub(crate) measured: &'a [Point],
     /// Centroid of the measured points, and their rms distance from it.
-    pub(crate) middle: Point,
+    pub(crate) centroid: Point,
     pub(crate) size_mm: f64,
     /// Locked coordinates of the twist: x, y, z, rx, ry, rz of the model frame.
     pub(crate) locked: [bool; 6],
     /// Smallest singular value of a direction that the surface determines, as a share of the root of the sum of their
     /// squares.
-    pub(crate) least_share: f64,
+    pub(crate) min_singular_share: f64,
     /// Relative decrease 1 - f(l+1) / f(l) at which the iteration stops: epsilon in the paper.
     pub(crate) tolerance: f64,
     /// Initial radius of the ball.
     pub(crate) ball_radius: f64,
-    pub(crate) most_iterations: usize,
+    pub(crate) max_iterations: usize,
 }
 
 /// End of a descent.
@@ -80,7 +80,7 @@ struct BallStep {
     scaled: Vector6<f64>,
     length: f64,
     /// Upper bound of the decrease of the objective, by the linear problem.
-    promised_mm2: f64,
+    predicted_decrease_mm2: f64,
     /// Number of directions that the surface determines.
     rank: usize,
 }
@@ -103,12 +103,12 @@ impl Problem<'_> {
     ) -> Result<Descent, RegistrationError> {
         let mut at = match known {
             Some(sums) => Standing { pose: start, scaling: self.scaling_at(&start), sums },
-            None => self.stand(start, correspondences),
+            None => self.linearize_at(start, correspondences),
         };
         let (mut ball_radius, mut rank, mut converged) = (self.ball_radius, 0, false);
         // True if the correspondences belong to the current pose, false if they belong to a step that was undone.
         let mut current = true;
-        for _ in 0..self.most_iterations {
+        for _ in 0..self.max_iterations {
             let step = self.step_within(ball_radius, &at)?;
             rank = step.rank;
             converged = self.is_at_minimum(&step, &at.sums, trace.is_empty());
@@ -116,7 +116,7 @@ impl Problem<'_> {
                 break;
             }
             let there = (at.pose * Pose::exp(&at.scaling.twist(&step.scaled))).orthonormalised(); // eq. (10), left side
-            let candidate = self.stand(there, correspondences);
+            let candidate = self.linearize_at(there, correspondences);
             let Sums { objective_mm2, points, .. } = candidate.sums;
             current = objective_mm2 <= at.sums.objective_mm2;
             trace.push(Iteration { objective_mm2, step: step.length, ball_radius, taken: current, points });
@@ -135,16 +135,16 @@ impl Problem<'_> {
             }
         }
         if !current {
-            at = self.stand(at.pose, correspondences);
+            at = self.linearize_at(at.pose, correspondences);
         }
         let Standing { pose, scaling, sums } = at;
         Ok(Descent { cmm_from_model: pose, objective_mm2: sums.objective_mm2, scaling, sums, rank, converged })
     }
 
     /// Projects all points under a pose and sums the linear problem there.
-    fn stand(&self, pose: Pose, correspondences: &mut [Correspondence]) -> Standing {
+    fn linearize_at(&self, pose: Pose, correspondences: &mut [Correspondence]) -> Standing {
         let scaling = self.scaling_at(&pose);
-        Standing { pose, scaling, sums: self.feet(correspondences, &pose, &scaling) }
+        Standing { pose, scaling, sums: self.project_all(correspondences, &pose, &scaling) }
     }
 
     /// Returns the best step of the linear problem within the ball, along the free directions that the surface
@@ -156,26 +156,26 @@ impl Problem<'_> {
         }
         let free = free_directions(&self.locked, &at.scaling);
         let spectrum = Spectrum::new(&(free * sums.gram() * free));
-        let rank = spectrum.rank(self.least_share, sums.gram().trace());
+        let rank = spectrum.rank(self.min_singular_share, sums.gram().trace());
         let right = free * sums.right();
         let m = spectrum.step(&right, rank, ball_radius);
         // m.(2 A^T b - A^T A m) <= 2 m.(A^T b).
-        Ok(BallStep { scaled: m, length: m.norm(), promised_mm2: 2.0 * m.dot(&right), rank })
+        Ok(BallStep { scaled: m, length: m.norm(), predicted_decrease_mm2: 2.0 * m.dot(&right), rank })
     }
 
     /// Returns true if a step is not worth a trial. The first step of a registration is tried if it moves anything.
     fn is_at_minimum(&self, step: &BallStep, sums: &Sums, is_first: bool) -> bool {
-        let little = !is_first && step.promised_mm2 <= NO_GAIN * self.tolerance * sums.objective_mm2;
+        let little = !is_first && step.predicted_decrease_mm2 <= NO_GAIN * self.tolerance * sums.objective_mm2;
         step.length < STILL || sums.objective_mm2 == 0.0 || little
     }
 
     /// Returns the centre and the size to which the twist of a step from a pose refers.
     pub(crate) fn scaling_at(&self, pose: &Pose) -> Scaling {
-        Scaling { centre: pose.inverse().point(&self.middle), size_mm: self.size_mm }
+        Scaling { centre: pose.inverse().transform_point(&self.centroid), size_mm: self.size_mm }
     }
 
     /// Projects all points under a pose and returns the sums of the linear problem.
-    pub(crate) fn feet(&self, correspondences: &mut [Correspondence], pose: &Pose, scaling: &Scaling) -> Sums {
+    pub(crate) fn project_all(&self, correspondences: &mut [Correspondence], pose: &Pose, scaling: &Scaling) -> Sums {
         correspond(&self.surface, &self.residual, self.measured, correspondences, pose, scaling)
     }
 }

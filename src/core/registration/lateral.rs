@@ -31,14 +31,14 @@ pub struct MapLimits {
     /// Coverage factor of the standard uncertainties.
     pub coverage_factor: f64,
     /// Largest error of the map, as a share of the rms that it corrects.
-    pub share: f64,
+    pub max_error_share: f64,
     /// Largest lateral error of the map in mm, with the coverage factor.
-    pub place_mm: f64,
+    pub max_lateral_mm: f64,
 }
 
 impl Default for MapLimits {
     fn default() -> Self {
-        Self { coverage_factor: 2.0, share: 0.1, place_mm: 1.0 }
+        Self { coverage_factor: 2.0, max_error_share: 0.1, max_lateral_mm: 1.0 }
     }
 }
 
@@ -60,7 +60,7 @@ pub struct LateralError {
 /// Equation: for the twist [v; omega] of covariance C a point moves by v + omega x p. The covariance of this motion is
 /// J C J^T with J = [1, -p^], projected onto the tangent plane; its largest eigenvalue counts.
 pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_factor: f64) -> LateralError {
-    let used: Vec<&Deviation> = found.deviations.iter().filter(|d| d.status == PointStatus::Used).collect();
+    let used: Vec<&Deviation> = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier).collect();
     let lateral_mm = used.iter().map(|d| lateral_sigma(covariance, d)).fold(0.0, f64::max);
     let slope = slope(&used);
     LateralError { lateral_mm, slope, error_mm: coverage_factor * lateral_mm * slope }
@@ -71,13 +71,13 @@ pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_f
 /// The module documentation gives the criterion.
 pub fn weak_for_compensation(found: &Registration, covariance: &Matrix6<f64>, limits: &MapLimits) -> Option<String> {
     let LateralError { lateral_mm, slope, error_mm } = lateral_error(found, covariance, limits.coverage_factor);
-    let rms_mm = found.verdict.rms_mm;
-    let limit_mm = limits.share * rms_mm;
+    let rms_mm = found.quality.rms_mm;
+    let limit_mm = limits.max_error_share * rms_mm;
     let beside_mm = limits.coverage_factor * lateral_mm;
-    if error_mm <= limit_mm && beside_mm <= limits.place_mm {
+    if error_mm <= limit_mm && beside_mm <= limits.max_lateral_mm {
         return None;
     }
-    let seen = found.verdict.weak_directions.iter().filter(|w| !w.held);
+    let seen = found.quality.weak_directions.iter().filter(|w| !w.held);
     let weak: Vec<&str> = seen.map(|w| w.words.as_str()).collect();
     let weak = if weak.is_empty() { String::new() } else { format!(" ({})", weak.join("; ")) };
     Some(format!(
@@ -86,11 +86,11 @@ pub fn weak_for_compensation(found: &Registration, covariance: &Matrix6<f64>, li
          µm/mm, this makes the correction wrong by {:.1} µm, limit {:.1} µm, {:.0} % of the {:.1} µm rms to be \
          corrected; at edges and seams by more. Lock these directions in the recipe if the fixture holds the part \
          better than that (registration.lock = [\"x\", \"y\", \"rz\"]), or measure edges or marks that show them",
-        limits.place_mm,
+        limits.max_lateral_mm,
         1e3 * slope,
         1e3 * error_mm,
         1e3 * limit_mm,
-        1e2 * limits.share,
+        1e2 * limits.max_error_share,
         1e3 * rms_mm,
     ))
 }
@@ -145,11 +145,11 @@ mod tests {
     use super::*;
 
     fn of(found: &Registration, coverage_factor: f64) -> LateralError {
-        lateral_error(found, &found.verdict.covariance, coverage_factor)
+        lateral_error(found, &found.quality.covariance, coverage_factor)
     }
 
     fn weak(found: &Registration, limits: &MapLimits) -> Option<String> {
-        weak_for_compensation(found, &found.verdict.covariance, limits)
+        weak_for_compensation(found, &found.quality.covariance, limits)
     }
     use crate::geometry::{Point, Pose};
     use crate::registration::{Verdict, WeakDirection};
@@ -170,7 +170,7 @@ mod tests {
                 normal: Vector::z(),
                 deviation_mm: HEIGHT_MM * (x / WAVE_MM).sin(),
                 uncertainty_mm: 0.0,
-                status: PointStatus::Used,
+                status: PointStatus::Inlier,
                 in_fit: true,
             })
             .collect();
@@ -188,7 +188,7 @@ mod tests {
         let objective_mm2 = deviations.iter().map(|d| d.deviation_mm * d.deviation_mm).sum::<f64>();
         let words = "x and y position repeats only to 3.4 mm".to_owned();
         let verdict = Verdict {
-            used: deviations.len(),
+            inliers: deviations.len(),
             objective_mm2,
             rms_mm: (objective_mm2 / n).sqrt(),
             pv_mm: 2.0 * HEIGHT_MM,
@@ -202,7 +202,7 @@ mod tests {
             iterations: 1,
             converged: true,
         };
-        Registration { cmm_from_model: Pose::identity(), deviations, trace: Vec::new(), side: Side::Normal, verdict }
+        Registration { cmm_from_model: Pose::identity(), deviations, trace: Vec::new(), side: Side::Normal, quality: verdict }
     }
 
     #[test]
@@ -228,13 +228,13 @@ mod tests {
     #[test]
     fn a_map_is_refused_where_the_error_is_above_its_share_and_not_before() {
         let at = |sigma: f64| waved([sigma, 0.0, 0.0, 0.0, 0.0, 0.0], false);
-        let limits = MapLimits { place_mm: 1e3, ..MapLimits::default() };
+        let limits = MapLimits { max_lateral_mm: 1e3, ..MapLimits::default() };
         let unit = of(&at(1.0), limits.coverage_factor).error_mm;
-        let border = limits.share * at(1.0).verdict.rms_mm / unit;
+        let border = limits.max_error_share * at(1.0).quality.rms_mm / unit;
         assert_eq!(weak(&at(0.999 * border), &limits), None);
         let why = weak(&at(1.001 * border), &limits).unwrap();
         assert!(why.contains("repeats only to 3.4 mm") && why.contains("Lock these directions in the recipe"), "{why}");
-        let near = MapLimits { share: 1e3, ..MapLimits::default() };
+        let near = MapLimits { max_error_share: 1e3, ..MapLimits::default() };
         assert_eq!(weak(&at(0.499), &near), None);
         let why = weak(&at(0.501), &near).unwrap();
         assert!(why.contains("may be displaced by 1.00 mm, limit 1.00 mm"), "{why}");

@@ -179,7 +179,7 @@ mod tests {
             let distance = |step: f64| {
                 let mut m = Vector6::zeros();
                 m[k] = step;
-                let moved = Pose::exp(&scaling.twist(&m)).inverse().point(&p);
+                let moved = Pose::exp(&scaling.twist(&m)).inverse().transform_point(&p);
                 (moved - anchor).dot(&normal)
             };
             let slope = (distance(1e-6) - distance(-1e-6)) / 2e-6;

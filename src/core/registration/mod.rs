@@ -64,19 +64,19 @@ pub use verdict::{Verdict, WeakDirection};
 /// # Errors
 /// Input that cannot be registered, a cloud that does not fit the surface, and an iteration that does not converge.
 pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
-    let part = Part::check(nominal, measured, options)?;
+    let part = Part::new(nominal, measured, options)?;
     narrow::check_thread(measured, options)?;
     let mut registration =
         fit(&part, measured, options).map_err(|error| or_mirrored(&part, measured, options, error))?;
     confirm(&part, &registration, measured, options)?;
     let doubts = doubt::doubts(&part, &registration, measured, options);
-    registration.verdict.warnings.extend(doubts);
+    registration.quality.warnings.extend(doubts);
     Ok(registration)
 }
 
 /// Estimates the pose without a test of how well it fits.
 fn fit(part: &Part, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
-    if let Some(side) = options.side.given() {
+    if let Some(side) = options.side.side() {
         part.check_fold(options, side)?;
     }
     let initial = initial_pose(part, measured, options)?;
@@ -88,7 +88,7 @@ fn fit(part: &Part, measured: &[Point], options: &Options) -> Result<Registratio
     let mut correspondences: Vec<Correspondence> = measured.par_iter().map(|_| Correspondence::NEW).collect();
     let descent = trim_and_refit(&problem, &initial, options, &mut correspondences, &mut trace)?;
     if let Some(least_share) = sampling::least_share(&problem, &descent, &correspondences) {
-        return fit(&Part { least_share, ..*part }, measured, options);
+        return fit(&Part { min_singular_share: least_share, ..*part }, measured, options);
     }
     report(part, &problem, descent, correspondences, trace, &initial, options)
 }
@@ -117,7 +117,7 @@ fn report(
     initial: &InitialPose,
     options: &Options,
 ) -> Result<Registration, RegistrationError> {
-    if let Some(fold) = problem.surface.fold_where_touched(correspondences.iter().map(|t| t.place)) {
+    if let Some(fold) = problem.surface.find_fold_among(correspondences.iter().map(|t| t.facet)) {
         return Err(fold.into());
     }
     let mut verdict = verdict::judge(problem, &descent, &correspondences, initial, trace.len());
@@ -128,7 +128,7 @@ fn report(
     alone::count_what_agrees(&mut deviations, &mut verdict, options.outlier_sigmas);
     verdict.coverage = verdict::coverage(part.nominal, &deviations);
     let trace = with_the_end(trace, &verdict, options);
-    Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: initial.side, verdict })
+    Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: initial.side, quality: verdict })
 }
 
 /// Difference of two distances that is only rounding, in mm.
@@ -137,7 +137,7 @@ const ROUNDING_MM: f64 = 1e-12;
 /// Returns the trace with the reported state as its last entry. Appends an entry if the last step was undone, or if
 /// more points count than at the last accepted step.
 fn with_the_end(mut trace: Vec<Iteration>, verdict: &Verdict, options: &Options) -> Vec<Iteration> {
-    let Verdict { objective_mm2, used, .. } = *verdict;
+    let Verdict { objective_mm2, inliers: used, .. } = *verdict;
     let is_told = |taken: &&Iteration| {
         let off_mm2 = (taken.objective_mm2 - objective_mm2).abs();
         // Sums in another order differ by rounding. If the points lie on the surface, the sums contain nothing else.
@@ -158,7 +158,7 @@ fn with_the_end(mut trace: Vec<Iteration>, verdict: &Verdict, options: &Options)
 /// A strip that is too narrow, a mirror image, or an rms above the limit.
 fn confirm(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
     narrow::check_strip(&found.deviations, options)?;
-    let rms_mm = found.verdict.rms_mm;
+    let rms_mm = found.quality.rms_mm;
     let limit_mm = part.rms_limit_mm(options);
     let doubtful = rms_mm > limit_mm || rms_mm > (0.02 * part.nominal.relief_mm()).max(10.0 * LEAST_SIGMA_MM);
     if !doubtful {

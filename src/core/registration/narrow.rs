@@ -26,13 +26,13 @@ const WIDE: f64 = 0.2;
 /// Rejects a thread before any pose is tried, unless the undetermined directions are locked.
 pub(super) fn check_thread(measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
     let few: Vec<Point> = measured.iter().step_by(measured.len().div_ceil(MOST)).copied().collect();
-    let Some(_) = Thread::of(few) else { return Ok(()) };
-    let Some(thread) = Thread::of(measured.to_vec()) else { return Ok(()) };
+    let Some(_) = Thread::detect(few) else { return Ok(()) };
+    let Some(thread) = Thread::detect(measured.to_vec()) else { return Ok(()) };
     let model_from_cmm = match &options.start {
         Start::Pose(pose) => pose.inverse(),
         Start::Search => Pose::identity(),
     };
-    let needed = untold(model_from_cmm.direction(&thread.axis), Vector::z());
+    let needed = untold(model_from_cmm.transform_direction(&thread.axis), Vector::z());
     if are_held(&needed, options) { Ok(()) } else { Err(refused(thread.width_mm, thread.distance_mm, needed)) }
 }
 
@@ -46,7 +46,7 @@ struct Thread {
 impl Thread {
     /// Returns the thread that the points form, or `None`. In the order along the longest axis, the points of a plane
     /// go to and fro across it; the points of a line do not.
-    fn of(mut points: Vec<Point>) -> Option<Self> {
+    fn detect(mut points: Vec<Point>) -> Option<Self> {
         let (middle, axes) = principal(points.iter().copied());
         let axis: Vector = axes.column(2).into();
         let at = |p: &Point| (p - middle).dot(&axis);
@@ -68,7 +68,7 @@ impl Thread {
 
 /// Rejects a strip of contacts that is too narrow for its points, unless the undetermined directions are locked.
 pub(super) fn check_strip(deviations: &[Deviation], options: &Options) -> Result<(), RegistrationError> {
-    let used = || deviations.iter().filter(|d| d.status == PointStatus::Used);
+    let used = || deviations.iter().filter(|d| d.status == PointStatus::Inlier);
     let normal = used().map(|d| d.normal).sum::<Vector>();
     if normal.norm() == 0.0 {
         return Ok(());
@@ -106,17 +106,17 @@ pub(super) fn check_strip(deviations: &[Deviation], options: &Options) -> Result
 /// Returns the shift across a line and the rotation about it, as the nearest coordinates.
 fn untold(line: Vector, normal: Vector) -> [Coordinate; 2] {
     const SHIFTS: [Coordinate; 3] = [Coordinate::X, Coordinate::Y, Coordinate::Z];
-    const TURNS: [Coordinate; 3] = [Coordinate::Rx, Coordinate::Ry, Coordinate::Rz];
-    [SHIFTS[normal.cross(&line).iamax()], TURNS[line.iamax()]]
+    const ROTATIONS: [Coordinate; 3] = [Coordinate::Rx, Coordinate::Ry, Coordinate::Rz];
+    [SHIFTS[normal.cross(&line).iamax()], ROTATIONS[line.iamax()]]
 }
 
 fn are_held(needed: &[Coordinate; 2], options: &Options) -> bool {
-    let held = Coordinate::locked(needed);
+    let held = Coordinate::locked_flags(needed);
     held.iter().zip(&options.locked).all(|(needed, locked)| !needed || *locked)
 }
 
 fn refused(width_mm: f64, distance_mm: f64, hold: [Coordinate; 2]) -> RegistrationError {
-    RegistrationError::Narrow { width_mm, distance_mm, least_mm: LEAST_DISTANCES * distance_mm, hold }
+    RegistrationError::Narrow { width_mm, distance_mm, min_width_mm: LEAST_DISTANCES * distance_mm, to_lock: hold }
 }
 
 /// Returns the centroid of the points, and their principal axes from the shortest to the longest, one per column.

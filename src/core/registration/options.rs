@@ -50,7 +50,7 @@ pub enum ProbeSide {
 
 impl ProbeSide {
     /// Returns the side, or `None` for [`ProbeSide::Auto`].
-    pub fn given(self) -> Option<Side> {
+    pub fn side(self) -> Option<Side> {
         match self {
             Self::Auto => None,
             Self::Above => Some(Side::Normal),
@@ -90,7 +90,7 @@ impl Coordinate {
 
     /// Returns one flag for each of x, y, z, rx, ry, rz, true if it is among `coordinates`; the form of
     /// [`Options::locked`].
-    pub fn locked(coordinates: &[Self]) -> [bool; 6] {
+    pub fn locked_flags(coordinates: &[Self]) -> [bool; 6] {
         [Self::X, Self::Y, Self::Z, Self::Rx, Self::Ry, Self::Rz].map(|coordinate| coordinates.contains(&coordinate))
     }
 }
@@ -103,7 +103,7 @@ pub struct Options {
     /// Meaning of the measured points.
     pub method: Method,
     /// Shape of the nominal surface between its points.
-    pub distance: Distance,
+    pub distance_model: Distance,
     /// Start of the search for the pose.
     pub start: Start,
     /// Side of the nominal surface on which the probe centres lie.
@@ -120,7 +120,7 @@ pub struct Options {
     /// Initial radius of the ball, in radians and in units of the cloud's rms size: alpha in eq. (15).
     pub ball_radius: f64,
     /// Maximum number of iterations before the registration fails.
-    pub most_iterations: usize,
+    pub max_iterations: usize,
     /// Largest rms deviation of an accepted fit, in mm; `None` for 0.2 mm plus 1e-4 of the cloud's rms size.
     pub rms_limit_mm: Option<f64>,
 }
@@ -131,7 +131,7 @@ impl Options {
         Self {
             probe_radius_mm,
             method: Method::default(),
-            distance: Distance::default(),
+            distance_model: Distance::default(),
             start: Start::default(),
             side: ProbeSide::default(),
             locked: [false; 6],
@@ -139,7 +139,7 @@ impl Options {
             outlier_sigmas: 6.0,
             tolerance: 1e-9,
             ball_radius: 0.6,
-            most_iterations: 100,
+            max_iterations: 100,
             rms_limit_mm: None,
         }
     }

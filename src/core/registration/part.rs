@@ -20,12 +20,12 @@ pub(super) struct Part<'a> {
     /// Length subtracted from each distance, in mm.
     pub(super) subtract_mm: f64,
     /// Centroid of the measured cloud.
-    pub(super) middle: Point,
+    pub(super) centroid: Point,
     /// Rms size of the measured cloud, in mm.
     pub(super) size_mm: f64,
     /// Smallest singular value of a direction that the surface determines, as a share of the root of the sum of their
     /// squares.
-    pub(super) least_share: f64,
+    pub(super) min_singular_share: f64,
 }
 
 impl<'a> Part<'a> {
@@ -34,7 +34,7 @@ impl<'a> Part<'a> {
     /// # Errors
     /// A fully locked pose without a start pose, too few, non-finite, collinear or repeated points, a cloud of the
     /// wrong size, and a probe radius outside its limits.
-    pub(super) fn check(
+    pub(super) fn new(
         nominal: &'a Nominal,
         measured: &[Point],
         options: &Options,
@@ -47,7 +47,7 @@ impl<'a> Part<'a> {
         // One more than the free directions. With fewer, nothing shows how well the pose fits.
         let least = 7 - options.locked.iter().filter(|locked| **locked).count();
         if measured.len() < least {
-            return Err(RegistrationError::TooFewPoints { points: measured.len(), least });
+            return Err(RegistrationError::TooFewPoints { points: measured.len(), min_points: least });
         }
         if let Some(index) = measured.par_iter().position_first(|p| !(p.x + p.y + p.z).is_finite()) {
             return Err(RegistrationError::NotFinite { index });
@@ -73,21 +73,21 @@ impl<'a> Part<'a> {
             Method::Contact => (0.0, 0.0),
             Method::SubtractRadius => (0.0, radius_mm),
         };
-        let least_share = 1e-6_f64.max(3.0 * nominal.normal_error());
-        Ok(Self { nominal, offset_mm, subtract_mm, middle, size_mm, least_share })
+        let least_share = 1e-6_f64.max(3.0 * nominal.normal_error_rad());
+        Ok(Self { nominal, offset_mm, subtract_mm, centroid: middle, size_mm, min_singular_share: least_share })
     }
 
     pub(super) fn surface(&self, options: &Options, side: Side) -> OffsetSurface<'a> {
-        let lookup = if options.method == Method::SubtractRadius { Lookup::Projection } else { Lookup::Foot };
+        let lookup = if options.method == Method::SubtractRadius { Lookup::AlongZ } else { Lookup::ContainingFacet };
         OffsetSurface::new(self.nominal, self.offset_mm, side)
             .expect("the radius was checked")
-            .with_distance(options.distance)
+            .with_distance_model(options.distance_model)
             .with_lookup(lookup)
     }
 
     /// Rejects a probe that does not fit into the surface.
     pub(super) fn check_fold(&self, options: &Options, side: Side) -> Result<(), RegistrationError> {
-        match self.surface(options, side).fold() {
+        match self.surface(options, side).find_fold() {
             Some(fold) => Err(fold.into()),
             None => Ok(()),
         }
@@ -101,13 +101,13 @@ impl<'a> Part<'a> {
             surface: self.surface(options, side),
             residual: ResidualModel { subtract_mm: self.subtract_mm, loss: ScaledLoss::new(Loss::None, 1.0) },
             measured,
-            middle: self.middle,
+            centroid: self.centroid,
             size_mm: self.size_mm,
             locked: options.locked,
-            least_share: self.least_share,
+            min_singular_share: self.min_singular_share,
             tolerance: options.tolerance,
             ball_radius: options.ball_radius,
-            most_iterations: options.most_iterations,
+            max_iterations: options.max_iterations,
         }
     }
 
@@ -121,14 +121,14 @@ impl<'a> Part<'a> {
 /// A hash of the coordinates selects a sample of some thousand points, for any size of the cloud. Two equal points are
 /// therefore either both in the sample or both not.
 fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
-    const LOOKED_AT: usize = 8192;
+    const MAX_EXAMINED: usize = 8192;
     let mixed = |p: &Point| {
         let [x, y, z] = [p.x, p.y, p.z].map(|c| (c + 0.0).to_bits());
         let mixed = x.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ y.rotate_left(21).wrapping_mul(0xD6E8_FEB8_6659_FD93) ^ z;
         let mixed = (mixed ^ (mixed >> 32)).wrapping_mul(0xD6E8_FEB8_6659_FD93);
         mixed ^ (mixed >> 29)
     };
-    let one_in = measured.len().div_ceil(LOOKED_AT) as u64;
+    let one_in = measured.len().div_ceil(MAX_EXAMINED) as u64;
     let mixed = |(k, p): (usize, &Point)| (mixed(p), k);
     let mut chosen: Vec<(u64, usize)> =
         measured.par_iter().enumerate().with_min_len(4096).map(mixed).filter(|(h, _)| h % one_in == 0).collect();

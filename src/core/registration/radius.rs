@@ -19,11 +19,11 @@ use super::result::Registration;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ToldRadius {
     /// Estimated radius minus the given one, in mm.
-    pub(super) more_mm: f64,
+    pub(super) difference_mm: f64,
     /// Standard uncertainty of the estimate in mm, from the remaining residuals, which are assumed independent.
     pub(super) sigma_mm: f64,
     /// Share of the rms that remains with the estimated radius.
-    pub(super) rms_left: f64,
+    pub(super) rms_share: f64,
 }
 
 impl Registration {
@@ -32,11 +32,11 @@ impl Registration {
     /// ```text
     ///  dr = sum r_i (1 - a_i g) / sum (1 - a_i g)^2
     /// ```
-    pub(super) fn told_radius(&self) -> Option<ToldRadius> {
-        let variance = self.verdict.residual_sigma_mm.powi(2);
-        let used = || self.deviations.iter().filter(|d| d.status == PointStatus::Used);
+    pub(super) fn estimate_radius(&self) -> Option<ToldRadius> {
+        let variance = self.quality.residual_sigma_mm.powi(2);
+        let used = || self.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         let sum: Vector6<f64> = used().map(row).sum();
-        let motion = self.verdict.covariance * sum / variance;
+        let motion = self.quality.covariance * sum / variance;
         let (mut cross, mut lever, mut squares, mut points) = (0.0, 0.0, 0.0, 0);
         for deviation in used() {
             let left = 1.0 - row(deviation).dot(&motion);
@@ -48,8 +48,8 @@ impl Registration {
         let more_mm = cross / lever;
         let rest = (squares - cross * more_mm).max(0.0);
         let sigma_mm = (rest / f64::from((points - 7).max(1)) / lever).sqrt();
-        let told = ToldRadius { more_mm, sigma_mm, rms_left: (rest / squares).sqrt() };
-        (more_mm.is_finite() && sigma_mm.is_finite() && told.rms_left.is_finite()).then_some(told)
+        let told = ToldRadius { difference_mm: more_mm, sigma_mm, rms_share: (rest / squares).sqrt() };
+        (more_mm.is_finite() && sigma_mm.is_finite() && told.rms_share.is_finite()).then_some(told)
     }
 
     /// Adds the standard uncertainty of the probe radius, in mm, to the covariance of the pose and to the uncertainties
@@ -58,15 +58,15 @@ impl Registration {
     /// (A^T A)^-1 is taken from the covariance, so directions that are undetermined or locked do not change. If the
     /// residuals are zero, the matrix is not available and nothing changes. Equation: GUM, 5.1.2, for one more input. A
     /// robust loss is treated as squares.
-    pub fn allow_for_radius(&mut self, radius_sigma_mm: f64) {
-        let variance = self.verdict.residual_sigma_mm.powi(2);
+    pub fn add_radius_uncertainty(&mut self, radius_sigma_mm: f64) {
+        let variance = self.quality.residual_sigma_mm.powi(2);
         if !(variance > 0.0 && radius_sigma_mm > 0.0 && radius_sigma_mm.is_finite()) {
             return;
         }
-        let used = self.deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let used = self.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         let sum: Vector6<f64> = used.map(row).sum();
-        let motion = self.verdict.covariance * sum / variance;
-        self.verdict.covariance += motion * motion.transpose() * radius_sigma_mm.powi(2);
+        let motion = self.quality.covariance * sum / variance;
+        self.quality.covariance += motion * motion.transpose() * radius_sigma_mm.powi(2);
         for deviation in &mut self.deviations {
             let left = 1.0 - row(deviation).dot(&motion);
             deviation.uncertainty_mm = deviation.uncertainty_mm.hypot(left * radius_sigma_mm);

@@ -24,39 +24,39 @@ pub(super) fn trim_and_refit(
 ) -> Result<Descent, RegistrationError> {
     /// Rounds after which points are only rejected and no longer accepted again, so that the sets cannot alternate for
     /// ever.
-    const BOTH_WAYS: usize = 8;
-    const MOST_ROUNDS: usize = 16;
+    const REVERSIBLE_ROUNDS: usize = 8;
+    const MAX_ROUNDS: usize = 16;
     let mut problem = *problem;
     let mut pose = initial.cmm_from_model;
-    if initial.near {
+    if initial.is_refined {
         problem.ball_radius = problem.ball_radius.min(0.05);
     }
     let counts: &[usize] =
-        if problem.surface.fits_normals() { &COARSE_COUNTS_WHERE_NORMALS_COST } else { &COARSE_COUNTS };
+        if problem.surface.has_lazy_normals() { &COARSE_COUNTS_WHERE_NORMALS_COST } else { &COARSE_COUNTS };
     for few in counts.iter().filter(|few| problem.measured.len() >= 2 * **few) {
-        pose = descend_coarsely(&problem, pose, *few, if initial.near { Some(options) } else { None }, trace)?;
+        pose = descend_coarsely(&problem, pose, *few, if initial.is_refined { Some(options) } else { None }, trace)?;
     }
     prefetch(&problem, correspondences, &pose);
-    let sums = problem.feet(correspondences, &pose, &problem.scaling_at(&pose));
+    let sums = problem.project_all(correspondences, &pose, &problem.scaling_at(&pose));
     let mut changed = find_again(&problem, correspondences, &pose);
-    if initial.near {
+    if initial.is_refined {
         changed += screen(&problem, options, correspondences, true);
     }
     let mut known = (changed == 0 && options.loss == Loss::None).then_some(sums);
     let mut round = 0;
     loop {
-        rescale(&mut problem, options, correspondences, round > 0 || initial.near);
+        rescale(&mut problem, options, correspondences, round > 0 || initial.is_refined);
         let descent = problem.descend(pose, known.take(), correspondences, trace)?;
         if !descent.converged {
-            let (iterations, objective_mm2) = (options.most_iterations, descent.objective_mm2);
+            let (iterations, objective_mm2) = (options.max_iterations, descent.objective_mm2);
             return Err(RegistrationError::NotConverged { iterations, objective_mm2 });
         }
         pose = descent.cmm_from_model;
         round += 1;
         let changed = find_again(&problem, correspondences, &pose)
-            + screen(&problem, options, correspondences, round < BOTH_WAYS);
+            + screen(&problem, options, correspondences, round < REVERSIBLE_ROUNDS);
         let robust_settling = options.loss != Loss::None && round < 4;
-        if (changed == 0 && !robust_settling) || round == MOST_ROUNDS {
+        if (changed == 0 && !robust_settling) || round == MAX_ROUNDS {
             return finish(descent, correspondences.len(), options.locked == [true; 6]);
         }
     }
@@ -72,13 +72,13 @@ const COARSE_COUNTS_WHERE_NORMALS_COST: [usize; 1] = [2048];
 
 /// Sets the start places of the projections near the points, and fits the normals there all at once.
 fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) {
-    if !problem.surface.fits_normals() {
+    if !problem.surface.has_lazy_normals() {
         return;
     }
     let model_from_cmm = pose.inverse();
-    let points: Vec<Point> = problem.measured.par_iter().map(|p| model_from_cmm.point(p)).collect();
+    let points: Vec<Point> = problem.measured.par_iter().map(|p| model_from_cmm.transform_point(p)).collect();
     for (correspondence, place) in correspondences.iter_mut().zip(problem.surface.prefetch(&points)) {
-        correspondence.place = place;
+        correspondence.facet = place;
     }
 }
 
@@ -97,10 +97,10 @@ fn descend_coarsely(
     let few: Vec<Point> = spread(problem.measured, count).copied().collect();
     let mut correspondences = vec![Correspondence::NEW; few.len()];
     let (middle, size_mm) = middle_and_size(&few);
-    let coarse = Problem { measured: &few, middle, size_mm, ..*problem };
+    let coarse = Problem { measured: &few, centroid: middle, size_mm, ..*problem };
     prefetch(&coarse, &mut correspondences, &pose);
     if let Some(options) = screened {
-        coarse.feet(&mut correspondences, &pose, &coarse.scaling_at(&pose));
+        coarse.project_all(&mut correspondences, &pose, &coarse.scaling_at(&pose));
         screen(&coarse, options, &mut correspondences, true);
     }
     Ok(coarse.descend(pose, None, &mut correspondences, trace)?.cmm_from_model)
@@ -154,14 +154,14 @@ fn find_again(problem: &Problem, correspondences: &mut [Correspondence], pose: &
         if !t.is_off_part() && !far(t) {
             return false;
         }
-        let p = model_from_cmm.point(p);
-        let foot = problem.surface.foot_from_anywhere(&p);
+        let p = model_from_cmm.transform_point(p);
+        let foot = problem.surface.project_without_start(&p);
         let distance_mm = foot.distance_mm - problem.residual.subtract_mm;
         let beyond_steps = beyond_steps(&problem.surface, &p, &foot);
         let is_on_part = beyond_steps <= ON_PART_STEPS;
         let is_nearer = is_on_part && (t.is_off_part() || distance_mm.abs() < 0.5 * t.distance_mm.abs());
         if is_nearer {
-            (t.place, t.distance_mm, t.beyond_steps) = (foot.place, distance_mm, beyond_steps);
+            (t.facet, t.distance_mm, t.beyond_steps) = (foot.facet, distance_mm, beyond_steps);
         }
         is_nearer
     };
@@ -190,8 +190,8 @@ fn screen(problem: &Problem, options: &Options, correspondences: &mut [Correspon
     let mut changed = 0;
     for (k, correspondence) in correspondences.iter_mut().enumerate() {
         let fits = !correspondence.is_off_part() && !outlier.get(k).copied().unwrap_or(false);
-        if fits != correspondence.used && (both_ways || !fits) {
-            correspondence.used = fits;
+        if fits != correspondence.in_fit && (both_ways || !fits) {
+            correspondence.in_fit = fits;
             changed += 1;
         }
     }
@@ -203,14 +203,14 @@ fn screen(problem: &Problem, options: &Options, correspondences: &mut [Correspon
 /// Neighbours nearer than half the mean spacing are twins: repeats of the same place with the same fault. They are left
 /// out. A suspect with only twins around it is isolated.
 fn isolated(measured: &[Point], correspondences: &[Correspondence], suspects: &[usize], limit_mm: f64) -> Vec<bool> {
-    const ASKED: usize = 8;
-    const NEAREST: u32 = 64;
-    let tree = Nearest::of(measured.iter().copied());
+    const NEIGHBOURS: usize = 8;
+    const SEARCHED: u32 = 64;
+    let tree = Nearest::new(measured.iter().copied());
     // Points spread over a square of rms size s are s sqrt(6 / n) apart.
     let twin_mm = 0.5 * middle_and_size(measured).1 * (6.0 / measured.len() as f64).sqrt();
     let is_isolated = |&k: &usize| {
-        let others = tree.to(&measured[k], NEAREST).filter(|(_, square)| *square > twin_mm * twin_mm);
-        let mut around: Vec<f64> = others.take(ASKED).map(|(n, _)| correspondences[n].distance_mm).collect();
+        let others = tree.nearest(&measured[k], SEARCHED).filter(|(_, square)| *square > twin_mm * twin_mm);
+        let mut around: Vec<f64> = others.take(NEIGHBOURS).map(|(n, _)| correspondences[n].distance_mm).collect();
         around.sort_unstable_by(f64::total_cmp);
         around.get(around.len() / 2).is_none_or(|median| (correspondences[k].distance_mm - median).abs() > limit_mm)
     };

@@ -19,20 +19,20 @@ pub struct Registration {
     /// Side of the nominal surface on which the probe was.
     pub side: Side,
     /// Uncertainty of the pose, figures and warnings.
-    pub verdict: Verdict,
+    pub quality: Verdict,
 }
 
 /// Figures of the deviations that include the outliers on the part.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WithLeftOut {
     /// Number of outliers.
-    pub points: usize,
+    pub outliers: usize,
     /// Root mean square of the deviations of all points on the part, in millimetres.
     pub rms_mm: f64,
     /// Largest minus smallest deviation of these points, in millimetres.
     pub pv_mm: f64,
     /// Text that names the first outliers, with their places in the model frame and their deviations.
-    pub places: String,
+    pub description: String,
 }
 
 /// Number of outliers that are named one by one; the rest are counted.
@@ -40,17 +40,17 @@ const NAMED: usize = 5;
 
 impl Registration {
     /// Returns the outliers, each with its index.
-    pub fn left_out(&self) -> impl Iterator<Item = (usize, &Deviation)> {
+    pub fn outliers(&self) -> impl Iterator<Item = (usize, &Deviation)> {
         self.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Outlier)
     }
 
     /// Returns the figures that include the outliers; `None` if there are no outliers.
-    pub fn with_left_out(&self) -> Option<WithLeftOut> {
-        let points = Counts::of(&self.deviations).outliers;
+    pub fn figures_with_outliers(&self) -> Option<WithLeftOut> {
+        let points = Counts::count(&self.deviations).outliers;
         if points == 0 {
             return None;
         }
-        let named = self.left_out().take(NAMED).map(|(k, d)| {
+        let named = self.outliers().take(NAMED).map(|(k, d)| {
             format!("point {k} at ({:.1}, {:.1}) mm by {:+.1} µm", d.point.x, d.point.y, 1e3 * d.deviation_mm)
         });
         let more = (points > NAMED).then(|| format!("and {} more", points - NAMED));
@@ -59,6 +59,6 @@ impl Registration {
         let add =
             |(low, high, squares, n): (f64, f64, f64, usize), d: f64| (low.min(d), high.max(d), squares + d * d, n + 1);
         let (low, high, squares, n) = on_part.fold((f64::INFINITY, f64::NEG_INFINITY, 0.0, 0), add);
-        Some(WithLeftOut { points, rms_mm: (squares / n as f64).sqrt(), pv_mm: high - low, places })
+        Some(WithLeftOut { outliers: points, rms_mm: (squares / n as f64).sqrt(), pv_mm: high - low, description: places })
     }
 }

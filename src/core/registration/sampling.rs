@@ -26,17 +26,17 @@ pub(super) fn least_share(problem: &Problem, descent: &Descent, correspondences:
     if descent.rank == 0 || share(descent.rank - 1) > DOUBTED {
         return None;
     }
-    let half = problem.surface.nominal().every_second()?;
+    let half = problem.surface.nominal().coarsened()?;
     let surface = &problem.surface;
-    let coarse = OffsetSurface::new(&half, surface.radius_mm(), surface.side()).ok()?.with_distance(surface.distance());
+    let coarse = OffsetSurface::new(&half, surface.radius_mm(), surface.side()).ok()?.with_distance_model(surface.distance_model());
     let model_from_cmm = descent.cmm_from_model.inverse();
-    let used: Vec<usize> = (0..correspondences.len()).filter(|&k| correspondences[k].used).collect();
+    let used: Vec<usize> = (0..correspondences.len()).filter(|&k| correspondences[k].in_fit).collect();
     let rows: Vec<[[f64; 6]; 2]> = used
         .iter()
         .step_by(used.len().div_ceil(MOST).max(1))
         .map(|&k| {
-            let p = model_from_cmm.point(&problem.measured[k]);
-            [surface, &coarse].map(|on| descent.scaling.row(&p, &on.foot(&p, Place::UNKNOWN).normal))
+            let p = model_from_cmm.transform_point(&problem.measured[k]);
+            [surface, &coarse].map(|on| descent.scaling.row(&p, &on.project(&p, Place::UNKNOWN).normal))
         })
         .collect();
     let is_of_the_sampling = |k: &usize| {

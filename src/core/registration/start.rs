@@ -26,7 +26,7 @@ pub(crate) struct InitialPose {
     /// True if the side was given, or determined by the data. Otherwise it was assumed.
     pub(crate) side_known: bool,
     /// True if the pose is already refined, so that outliers can be detected at once.
-    pub(crate) near: bool,
+    pub(crate) is_refined: bool,
     /// Other poses, clearly different, that fit about as well.
     pub(crate) alternatives: Vec<Candidate>,
 }
@@ -40,7 +40,7 @@ pub(crate) struct Candidate {
     /// The same over the points on the part only.
     on_part_rms_mm: f64,
     /// Share of the points whose projections lie beyond the edge.
-    off_part: f64,
+    off_part_share: f64,
     side: Side,
 }
 
@@ -48,7 +48,7 @@ impl Candidate {
     /// Orders candidates by fit, the better first. Of two that fit alike, the one with more points on the part is
     /// first.
     fn by_fit(&self, other: &Self) -> std::cmp::Ordering {
-        let badness = |c: &Self| c.rms_mm * (1.0 + 4.0 * c.off_part);
+        let badness = |c: &Self| c.rms_mm * (1.0 + 4.0 * c.off_part_share);
         badness(self).total_cmp(&badness(other))
     }
 }
@@ -85,7 +85,7 @@ pub(crate) fn initial_pose(
 ) -> Result<InitialPose, RegistrationError> {
     let search = Search::new(part, measured, options);
     match options.start {
-        Start::Pose(pose) => search.side_at(pose),
+        Start::Pose(pose) => search.determine_side(pose),
         Start::Search => search.search(),
     }
 }
@@ -103,7 +103,7 @@ pub(crate) fn free_rms(part: &Part, measured: &[Point], options: &Options, side:
 
 /// Returns the rms of the cloud as measured and mirrored, in mm, if only the mirrored cloud fits; otherwise `None`.
 pub(crate) fn mirror_image(part: &Part, measured: &[Point], options: &Options) -> Option<(f64, f64)> {
-    let sides = options.side.given().map_or(vec![Side::Normal, Side::Opposite], |side| vec![side]);
+    let sides = options.side.side().map_or(vec![Side::Normal, Side::Opposite], |side| vec![side]);
     let best = |points: &[Point]| {
         sides.iter().filter_map(|side| searched_rms(part, points, options, *side)).min_by(f64::total_cmp)
     };
@@ -123,7 +123,7 @@ fn mirrored(measured: &[Point]) -> Vec<Point> {
 fn searched_rms(part: &Part, points: &[Point], options: &Options, side: Side) -> Option<f64> {
     let options = Options { side: side.into(), locked: [false; 6], ..*options };
     let search = Search::new(part, points, &options);
-    search.compared(&search.candidates(side), side).first().map(|c| c.rms_mm)
+    search.refine_and_compare(&search.candidates(side), side).first().map(|c| c.rms_mm)
 }
 
 /// Returns a sample of the points, evenly along their order. The sample is jittered, so that it does not follow one
@@ -151,27 +151,27 @@ impl<'a> Search<'a> {
     }
 
     /// Keeps a given pose and determines the side on which the points fit.
-    fn side_at(&self, pose: Pose) -> Result<InitialPose, RegistrationError> {
+    fn determine_side(&self, pose: Pose) -> Result<InitialPose, RegistrationError> {
         // A given pose can refer to either side.
         let at = |side: Side| {
             let as_given = self.refine(pose, side, &self.some, 2, 8);
             if as_given.rms_mm <= self.part.rms_limit_mm(self.options) {
                 return as_given;
             }
-            let across = self.refine(self.across_to(pose, side), side, &self.some, 2, 8);
+            let across = self.refine(self.move_across(pose, side), side, &self.some, 2, 8);
             if across.rms_mm < as_given.rms_mm { across } else { as_given }
         };
         let (normal, opposite) = rayon::join(|| at(Side::Normal), || at(Side::Opposite));
         let (side, _, side_known) = self.choose_side(normal, opposite)?;
         let side = if side_known { side } else { self.nearer_side(&pose) };
-        Ok(InitialPose { cmm_from_model: pose, side, side_known, near: false, alternatives: Vec::new() })
+        Ok(InitialPose { cmm_from_model: pose, side, side_known, is_refined: false, alternatives: Vec::new() })
     }
 
     /// Returns the side of the nominal surface on which most points lie under a pose.
     fn nearer_side(&self, pose: &Pose) -> Side {
         let nominal = OffsetSurface::new(self.part.nominal, 0.0, Side::Normal).expect("0 is a radius");
         let inverse = pose.inverse();
-        let above = self.many.iter().filter(|p| nominal.foot(&inverse.point(p), Place::UNKNOWN).distance_mm >= 0.0);
+        let above = self.many.iter().filter(|p| nominal.project(&inverse.transform_point(p), Place::UNKNOWN).distance_mm >= 0.0);
         if above.count() * 2 >= self.many.len() { Side::Normal } else { Side::Opposite }
     }
 
@@ -181,23 +181,23 @@ impl<'a> Search<'a> {
     /// small distance compared with the differences between right and wrong poses. Only the best candidates are
     /// compared on both sides.
     fn search(&self) -> Result<InitialPose, RegistrationError> {
-        let side = self.options.side.given().unwrap_or_default();
+        let side = self.options.side.side().unwrap_or_default();
         let candidates = self.candidates(side);
-        let there = self.compared(&candidates, side);
+        let there = self.refine_and_compare(&candidates, side);
         let through: Vec<Candidate> = candidates
             .iter()
-            .map(|c| Candidate { cmm_from_model: self.across_to(c.cmm_from_model, side.other()), ..*c })
+            .map(|c| Candidate { cmm_from_model: self.move_across(c.cmm_from_model, side.other()), ..*c })
             .collect();
-        let across = self.compared(&through, side.other());
+        let across = self.refine_and_compare(&through, side.other());
         let (normal, opposite) = if side == Side::Normal { (&there, &across) } else { (&across, &there) };
         let (Some(&at_normal), Some(&at_opposite)) = (normal.first(), opposite.first()) else {
             return Err(RegistrationError::Undetermined);
         };
         let (side, best, side_known) = self.choose_side(at_normal, at_opposite)?;
         let all = if side == Side::Normal { normal } else { opposite };
-        let best = self.nearest_to_the_frame(best, all);
+        let best = self.prefer_file_frame(best, all);
         let alternatives = self.alternatives(&best, all);
-        Ok(InitialPose { cmm_from_model: best.cmm_from_model, side, side_known, near: true, alternatives })
+        Ok(InitialPose { cmm_from_model: best.cmm_from_model, side, side_known, is_refined: true, alternatives })
     }
 
     /// Selects the side from the best fits on the two sides. Returns the side, its candidate, and true if the side is
@@ -211,9 +211,9 @@ impl<'a> Search<'a> {
         let told = |better: &Candidate, worse: &Candidate| {
             // The distance of the points beyond the edge says nothing about the side.
             let is_nearer = better.on_part_rms_mm * SIDE_RATIO < worse.on_part_rms_mm;
-            self.part.offset_mm == 0.0 || is_nearer && better.off_part <= worse.off_part + SIDE_OFF_PART
+            self.part.offset_mm == 0.0 || is_nearer && better.off_part_share <= worse.off_part_share + SIDE_OFF_PART
         };
-        match self.options.side.given() {
+        match self.options.side.side() {
             None if self.part.offset_mm > 0.0 && told(&opposite, &normal) => Ok((Side::Opposite, opposite, true)),
             None => Ok((Side::Normal, normal, told(&normal, &opposite))),
             Some(side) => {
@@ -229,7 +229,7 @@ impl<'a> Search<'a> {
 
     /// Returns the pose for one side from the pose for the other: the surface is shifted by two radii along its mean
     /// normal.
-    fn across_to(&self, pose: Pose, side: Side) -> Pose {
+    fn move_across(&self, pose: Pose, side: Side) -> Pose {
         let mean = self.part.nominal.mean_normal();
         let shift = mean * (-2.0 * self.part.offset_mm * side.sign());
         pose * Pose { translation_mm: shift, ..Pose::identity() }
@@ -251,7 +251,7 @@ impl<'a> Search<'a> {
         let promising = scored(starts, &glanced).take(PROMISING).collect();
         let mut kept: Vec<Pose> = Vec::new();
         for pose in scored(promising, &self.few) {
-            if kept.len() < KEPT && kept.iter().all(|k| self.apart(k, &pose) > 0.1) {
+            if kept.len() < KEPT && kept.iter().all(|k| self.pose_distance(k, &pose) > 0.1) {
                 kept.push(pose);
             }
         }
@@ -262,14 +262,14 @@ impl<'a> Search<'a> {
     }
 
     /// Refines the best candidates fully on one side. Returns them with the best first, each pose once.
-    fn compared(&self, candidates: &[Candidate], side: Side) -> Vec<Candidate> {
+    fn refine_and_compare(&self, candidates: &[Candidate], side: Side) -> Vec<Candidate> {
         let best = &candidates[..candidates.len().min(COMPARED_AT_MOST)];
         let mut compared: Vec<Candidate> =
             best.par_iter().map(|c| self.refine(c.cmm_from_model, side, &self.many, 4, 10)).collect();
         compared.sort_by(Candidate::by_fit);
         let mut distinct: Vec<Candidate> = Vec::new();
         for c in compared {
-            if distinct.iter().all(|d| self.apart(&d.cmm_from_model, &c.cmm_from_model) > 0.01) {
+            if distinct.iter().all(|d| self.pose_distance(&d.cmm_from_model, &c.cmm_from_model) > 0.01) {
                 distinct.push(c);
             }
         }
@@ -278,10 +278,10 @@ impl<'a> Search<'a> {
 
     /// Returns the difference of two poses: the rotation in radians plus the shift of the cloud's centroid in units of
     /// its size.
-    fn apart(&self, a: &Pose, b: &Pose) -> f64 {
+    fn pose_distance(&self, a: &Pose, b: &Pose) -> f64 {
         let between = a.inverse() * *b;
         let centre = self.few.iter().map(|p| p.coords).sum::<Vector>() / self.few.len() as f64;
-        let shift = (a.inverse().point(&Point::from(centre)) - b.inverse().point(&Point::from(centre))).norm();
+        let shift = (a.inverse().transform_point(&Point::from(centre)) - b.inverse().transform_point(&Point::from(centre))).norm();
         between.angle_rad() + shift / self.part.size_mm
     }
 
@@ -293,19 +293,19 @@ impl<'a> Search<'a> {
     /// Returns the root mean square, in mm, of the truncated distances from the part itself, not from its continuation.
     fn score(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> f64 {
         let limit2 = self.truncation_mm().powi(2);
-        let sum: f64 = self.squares(surface, cmm_from_model, points).map(|d2| d2.min(limit2)).sum();
+        let sum: f64 = self.squared_distances_mm2(surface, cmm_from_model, points).map(|d2| d2.min(limit2)).sum();
         (sum / points.len() as f64).sqrt()
     }
 
     /// Returns how well points fit under a pose, from the smallest nine tenths of the distances. Outliers in the rest
     /// have no influence.
-    fn looked_at(&self, surface: &OffsetSurface, cmm_from_model: Pose, points: &[Point]) -> Candidate {
+    fn assess_candidate(&self, surface: &OffsetSurface, cmm_from_model: Pose, points: &[Point]) -> Candidate {
         let inverse = cmm_from_model.inverse();
         let (mut all, mut on_part) = (Vec::with_capacity(points.len()), Vec::with_capacity(points.len()));
-        for p in points.iter().map(|p| inverse.point(p)) {
-            let foot = surface.foot(&p, Place::UNKNOWN);
+        for p in points.iter().map(|p| inverse.transform_point(p)) {
+            let foot = surface.project(&p, Place::UNKNOWN);
             let square = (foot.distance_mm - self.part.subtract_mm).powi(2);
-            all.push(square + foot.beyond_mm.powi(2));
+            all.push(square + foot.beyond_edge_mm.powi(2));
             if beyond_steps(surface, &p, &foot) <= ON_PART_STEPS {
                 on_part.push(square);
             }
@@ -317,11 +317,11 @@ impl<'a> Search<'a> {
             (kept.iter().sum::<f64>() / kept.len().max(1) as f64).sqrt()
         };
         let (rms_mm, on_part_rms_mm) = (trimmed_rms_mm(all), trimmed_rms_mm(on_part));
-        Candidate { cmm_from_model, rms_mm, on_part_rms_mm, off_part, side: surface.side() }
+        Candidate { cmm_from_model, rms_mm, on_part_rms_mm, off_part_share: off_part, side: surface.side() }
     }
 
     /// Returns the squared distances from the part itself in mm^2, including the distance beyond its edge.
-    fn squares<'b>(
+    fn squared_distances_mm2<'b>(
         &self,
         surface: &'b OffsetSurface,
         cmm_from_model: &Pose,
@@ -330,8 +330,8 @@ impl<'a> Search<'a> {
         let model_from_cmm = cmm_from_model.inverse();
         let subtract_mm = self.part.subtract_mm;
         points.iter().map(move |p| {
-            let foot = surface.foot(&model_from_cmm.point(p), Place::UNKNOWN);
-            (foot.distance_mm - subtract_mm).powi(2) + foot.beyond_mm.powi(2)
+            let foot = surface.project(&model_from_cmm.transform_point(p), Place::UNKNOWN);
+            (foot.distance_mm - subtract_mm).powi(2) + foot.beyond_edge_mm.powi(2)
         })
     }
 
@@ -339,11 +339,11 @@ impl<'a> Search<'a> {
     fn refine(&self, start: Pose, side: Side, points: &[Point], rounds: usize, iterations: usize) -> Candidate {
         let (middle, size_mm) = middle_and_size(points);
         let mut problem = Problem {
-            middle,
+            centroid: middle,
             size_mm,
             tolerance: 1e-6,
             ball_radius: 0.4,
-            most_iterations: iterations,
+            max_iterations: iterations,
             ..self.part.problem(points, self.options, side)
         };
         let mut pose = start;
@@ -360,20 +360,20 @@ impl<'a> Search<'a> {
                 Err(_) => break,
             }
         }
-        self.looked_at(&problem.surface, pose, points)
+        self.assess_candidate(&problem.surface, pose, points)
     }
 
     /// Returns the pose with the smallest rotation from the frame of the file, among those that fit as well as the
     /// best. If the surface does not determine a rotation, only that frame does.
-    fn nearest_to_the_frame(&self, best: Candidate, all: &[Candidate]) -> Candidate {
+    fn prefer_file_frame(&self, best: Candidate, all: &[Candidate]) -> Candidate {
         /// Largest ratio of two rms that differ by chance.
-        const ALIKE: f64 = 1.1;
+        const MAX_RMS_RATIO: f64 = 1.1;
         /// Smallest difference of rms that distinguishes two fits, in mm.
-        const LEAST_MM: f64 = 1e-5;
+        const MIN_DIFFERENCE_MM: f64 = 1e-5;
         /// Largest ratio of rms for a fit that is not yet converged.
-        const AT_MOST: f64 = 3.0;
+        const MAX_UNCONVERGED_RATIO: f64 = 3.0;
         /// Difference below which two poses are the same.
-        const APART: f64 = 0.01;
+        const MAX_POSE_DISTANCE: f64 = 0.01;
         let nominal = self.part.nominal.sample(REFINED);
         let middle_of = |points: &[Point]| points.iter().map(|p| p.coords).sum::<Vector>() / points.len().max(1) as f64;
         let offset = self.part.nominal.mean_normal() * (best.side.sign() * self.part.offset_mm);
@@ -382,27 +382,27 @@ impl<'a> Search<'a> {
         let refined = |translation_mm: Vector| {
             let start = Pose { translation_mm, ..Pose::identity() };
             let glanced = self.refine(start, best.side, &self.some, 2, 6);
-            let may_be = glanced.rms_mm <= AT_MOST * best.rms_mm + LEAST_MM
-                && self.apart(&glanced.cmm_from_model, &best.cmm_from_model) > APART;
+            let may_be = glanced.rms_mm <= MAX_UNCONVERGED_RATIO * best.rms_mm + MIN_DIFFERENCE_MM
+                && self.pose_distance(&glanced.cmm_from_model, &best.cmm_from_model) > MAX_POSE_DISTANCE;
             may_be.then(|| self.refine(glanced.cmm_from_model, best.side, &self.many, 4, 10))
         };
         let as_filed = rayon::join(|| refined(Vector::zeros()), || refined(centred));
         let as_filed = [as_filed.0, as_filed.1].into_iter().flatten().collect::<Vec<_>>();
         let fits_as_well = |c: &&Candidate| {
-            c.side == best.side && c.rms_mm <= ALIKE * best.rms_mm + LEAST_MM && c.off_part <= best.off_part
+            c.side == best.side && c.rms_mm <= MAX_RMS_RATIO * best.rms_mm + MIN_DIFFERENCE_MM && c.off_part_share <= best.off_part_share
         };
         let turn = |c: &Candidate| c.cmm_from_model.angle_rad();
         let least = as_filed.iter().chain(all).filter(fits_as_well).min_by(|a, b| turn(a).total_cmp(&turn(b)));
-        least.filter(|c| self.apart(&c.cmm_from_model, &best.cmm_from_model) > APART).copied().unwrap_or(best)
+        least.filter(|c| self.pose_distance(&c.cmm_from_model, &best.cmm_from_model) > MAX_POSE_DISTANCE).copied().unwrap_or(best)
     }
 
     /// Returns other poses that fit nearly as well as the best.
     fn alternatives(&self, best: &Candidate, all: &[Candidate]) -> Vec<Candidate> {
         all.iter()
             .filter(|c| {
-                c.rms_mm < 1.5 * best.rms_mm + 1e-6 && c.side == best.side && c.off_part <= best.off_part + 0.02
+                c.rms_mm < 1.5 * best.rms_mm + 1e-6 && c.side == best.side && c.off_part_share <= best.off_part_share + 0.02
             })
-            .filter(|c| self.apart(&c.cmm_from_model, &best.cmm_from_model) > 0.05)
+            .filter(|c| self.pose_distance(&c.cmm_from_model, &best.cmm_from_model) > 0.05)
             .copied()
             .collect()
     }
@@ -410,7 +410,7 @@ impl<'a> Search<'a> {
     /// Returns poses that lay the principal axes of the two clouds on each other: both faces, in steps of 15 degrees
     /// about the shortest axis.
     fn by_principal_axes(&self, side: Side) -> Vec<Pose> {
-        const TURNS: usize = 24;
+        const STEPS_PER_TURN: usize = 24;
         let frame = |points: &[Point]| {
             let (centre, eigen) = principal_axes(points);
             let (least, most) = (eigen.eigenvalues.imin(), eigen.eigenvalues.imax());
@@ -423,10 +423,10 @@ impl<'a> Search<'a> {
         let m_centre = m_centre + self.part.nominal.mean_normal() * (side.sign() * self.part.offset_mm);
         let (w_centre, w_normal, w_first) = frame(&self.many);
         let model = Frame::new(m_centre, m_normal, m_first);
-        let mut starts = Vec::with_capacity(2 * TURNS);
+        let mut starts = Vec::with_capacity(2 * STEPS_PER_TURN);
         for face in [1.0, -1.0] {
-            for turn in 0..TURNS {
-                let angle = std::f64::consts::TAU * turn as f64 / TURNS as f64;
+            for turn in 0..STEPS_PER_TURN {
+                let angle = std::f64::consts::TAU * turn as f64 / STEPS_PER_TURN as f64;
                 let second = w_normal.cross(&w_first);
                 let first = w_first * angle.cos() + second * angle.sin();
                 starts.push(Frame::new(w_centre, w_normal * face, first).from(&model));
@@ -444,7 +444,7 @@ impl<'a> Search<'a> {
         let offset: Vec<Feature> = on_nominal.iter().filter_map(|f| f.offset(self.part.offset_mm, side)).collect();
         let sample: Vec<Point> = spread(self.measured, 2000).copied().collect();
         let measured = most_telling(features(&sample, None));
-        measured.iter().flat_map(|m| [*m, m.turned_over()]).flat_map(|m| laid_on(&m, &offset)).collect()
+        measured.iter().flat_map(|m| [*m, m.flipped()]).flat_map(|m| laid_on(&m, &offset)).collect()
     }
 }
 
@@ -452,7 +452,7 @@ impl<'a> Search<'a> {
 fn leave_out_what_is_off_the_part(correspondences: &mut [Correspondence]) {
     let off = correspondences.iter().filter(|t| t.is_off_part()).count();
     let may_be = 2 * off < correspondences.len();
-    correspondences.iter_mut().for_each(|t| t.used = !(may_be && t.is_off_part()));
+    correspondences.iter_mut().for_each(|t| t.in_fit = !(may_be && t.is_off_part()));
 }
 
 /// Returns the features whose two curvatures differ most, because their directions are certain: a sample spread over

@@ -22,7 +22,7 @@ use super::start::InitialPose;
 #[derive(Clone, Debug)]
 pub struct Verdict {
     /// Number of points used: the inliers.
-    pub used: usize,
+    pub inliers: usize,
     /// Sum of the squared deviations of the points used, in mm^2; eq. (7).
     pub objective_mm2: f64,
     /// Root mean square of the deviations of the points used, in millimetres.
@@ -75,7 +75,7 @@ pub(crate) fn judge(
     initial: &InitialPose,
     iterations: usize,
 ) -> Verdict {
-    let Spread { used: n, squares_mm2: objective_mm2, low_mm, high_mm } = Spread::of(correspondences);
+    let Spread { used: n, squares_mm2: objective_mm2, low_mm, high_mm } = Spread::summarize(correspondences);
     let free = free_directions(&problem.locked, &descent.scaling);
     let spectrum = Spectrum::new(&(free * descent.sums.gram() * free));
     let rank = descent.rank;
@@ -92,7 +92,7 @@ pub(crate) fn judge(
     let alternatives: Vec<(Pose, f64)> =
         initial.alternatives.iter().filter(|_| all_seen).map(|c| (c.cmm_from_model, c.rms_mm)).collect();
     Verdict {
-        used: n,
+        inliers: n,
         objective_mm2,
         rms_mm: (objective_mm2 / n as f64).sqrt(),
         pv_mm: high_mm - low_mm,
@@ -120,14 +120,14 @@ struct Spread {
 impl Spread {
     const NONE: Self = Self { used: 0, squares_mm2: 0.0, low_mm: f64::INFINITY, high_mm: f64::NEG_INFINITY };
 
-    fn of(correspondences: &[Correspondence]) -> Self {
+    fn summarize(correspondences: &[Correspondence]) -> Self {
         let add = |sum: Self, d: f64| Self {
             used: sum.used + 1,
             squares_mm2: sum.squares_mm2 + d * d,
             low_mm: sum.low_mm.min(d),
             high_mm: sum.high_mm.max(d),
         };
-        let part = |c: &[Correspondence]| c.iter().filter(|t| t.used).map(|t| t.distance_mm).fold(Self::NONE, add);
+        let part = |c: &[Correspondence]| c.iter().filter(|t| t.in_fit).map(|t| t.distance_mm).fold(Self::NONE, add);
         // Chunks are added in order, so the bits are the same on any number of threads.
         let parts: Vec<Self> = correspondences.par_chunks(1 << 14).map(part).collect();
         parts.iter().fold(Self::NONE, |a, b| Self {
@@ -320,24 +320,24 @@ pub(super) fn length(mm: f64) -> String {
 /// missing corner. For few points, a place is covered if a point is near: within 1.1 times the spacing of that number
 /// of points spread evenly over the surface. So a full pattern leaves no gap, and a line covers only its own strip.
 pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
-    const MOST: usize = 50_000;
+    const MAX_POINTS: usize = 50_000;
     // A disc and a rectangle have an area of about 2.5^2 times the square of their rms size.
     const SIDE: f64 = 2.5;
     const WITHIN: f64 = 1.1;
     let size = nominal.size_mm();
-    let stride = deviations.len().div_ceil(MOST);
-    let used: Vec<&Deviation> = deviations.iter().step_by(stride).filter(|d| d.status == PointStatus::Used).collect();
+    let stride = deviations.len().div_ceil(MAX_POINTS);
+    let used: Vec<&Deviation> = deviations.iter().step_by(stride).filter(|d| d.status == PointStatus::Inlier).collect();
     let edge = size / 15.0;
     let within = WITHIN * SIDE * size / (used.len() as f64).sqrt();
     if within > 0.5 * edge {
         return covered_within(within, &nominal.sample(4_000), &used);
     }
     let sample = nominal.sample(20_000);
-    let mut cells = Cells::around(&sample, edge);
+    let mut cells = Cells::new(&sample, edge);
     for deviation in used {
-        cells.touch(&deviation.point);
+        cells.mark(&deviation.point);
     }
-    sample.iter().filter(|p| cells.is_touched(p)).count() as f64 / sample.len() as f64
+    sample.iter().filter(|p| cells.is_marked(p)).count() as f64 / sample.len() as f64
 }
 
 /// Returns the share of the places that have a point within a distance.
@@ -363,15 +363,15 @@ struct Cells {
     low: [i32; 3],
     counts: [usize; 3],
     per_mm: f64,
-    touched: Vec<bool>,
+    marked: Vec<bool>,
 }
 
 impl Cells {
     /// Most cells along an axis. If a point far from all others extends the range beyond this, the last cell covers the
     /// rest.
-    const MOST: i64 = 256;
+    const MAX_PER_AXIS: i64 = 256;
 
-    fn around(points: &[Point], edge_mm: f64) -> Self {
+    fn new(points: &[Point], edge_mm: f64) -> Self {
         let per_mm = 1.0 / edge_mm;
         let (mut low, mut high) = ([i32::MAX; 3], [i32::MIN; 3]);
         for p in points {
@@ -380,9 +380,9 @@ impl Cells {
                 (low[c], high[c]) = (low[c].min(at[c]), high[c].max(at[c]));
             }
         }
-        let count = |c: usize| (i64::from(high[c]) - i64::from(low[c]) + 1).clamp(1, Self::MOST) as usize;
+        let count = |c: usize| (i64::from(high[c]) - i64::from(low[c]) + 1).clamp(1, Self::MAX_PER_AXIS) as usize;
         let counts = [count(0), count(1), count(2)];
-        Self { low, counts, per_mm, touched: vec![false; counts.iter().product()] }
+        Self { low, counts, per_mm, marked: vec![false; counts.iter().product()] }
     }
 
     fn cell(p: &Point, per_mm: f64) -> [i32; 3] {
@@ -396,7 +396,7 @@ impl Cells {
         for (c, at) in at.into_iter().enumerate() {
             let k = i64::from(at) - i64::from(self.low[c]);
             // The last cell covers everything beyond it only if the number of cells is at the limit.
-            let k = if self.counts[c] == Self::MOST as usize { k.min(Self::MOST - 1) } else { k };
+            let k = if self.counts[c] == Self::MAX_PER_AXIS as usize { k.min(Self::MAX_PER_AXIS - 1) } else { k };
             if k < 0 || k >= self.counts[c] as i64 {
                 return None;
             }
@@ -405,14 +405,14 @@ impl Cells {
         Some(index)
     }
 
-    fn touch(&mut self, p: &Point) {
+    fn mark(&mut self, p: &Point) {
         if let Some(index) = self.index(p) {
-            self.touched[index] = true;
+            self.marked[index] = true;
         }
     }
 
-    fn is_touched(&self, p: &Point) -> bool {
-        self.index(p).is_some_and(|index| self.touched[index])
+    fn is_marked(&self, p: &Point) -> bool {
+        self.index(p).is_some_and(|index| self.marked[index])
     }
 }
 
@@ -423,7 +423,7 @@ pub(crate) struct Reporter<'a> {
     scaled: Matrix6<f64>,
     variance_mm2: f64,
     subtract_mm: f64,
-    back_mm: f64,
+    contact_offset_mm: f64,
 }
 
 impl<'a> Reporter<'a> {
@@ -434,7 +434,7 @@ impl<'a> Reporter<'a> {
             scaled: to_scaled * verdict.covariance * to_scaled.transpose(),
             variance_mm2: verdict.residual_sigma_mm.powi(2),
             subtract_mm: part.subtract_mm,
-            back_mm: if options.method == Method::Contact { 0.0 } else { options.probe_radius_mm },
+            contact_offset_mm: if options.method == Method::Contact { 0.0 } else { options.probe_radius_mm },
         }
     }
 }
@@ -447,17 +447,17 @@ impl Report for Reporter<'_> {
         normal: Vector::new(0.0, 0.0, 0.0),
         deviation_mm: 0.0,
         uncertainty_mm: 0.0,
-        status: PointStatus::Used,
+        status: PointStatus::Inlier,
         in_fit: true,
     };
 
     #[inline(always)]
-    fn four(&self, correspondences: [&Correspondence; LANES], at: &FourFinal) -> [Deviation; LANES] {
-        let normal = &at.feet.normal;
-        let back = F64x4::splat(self.back_mm);
+    fn report_x4(&self, correspondences: [&Correspondence; LANES], at: &FourFinal) -> [Deviation; LANES] {
+        let normal = &at.projections.normal;
+        let back = F64x4::splat(self.contact_offset_mm);
         let contact =
             [at.centre[0] - normal[0] * back, at.centre[1] - normal[1] * back, at.centre[2] - normal[2] * back];
-        let deviation = at.feet.distance_mm - F64x4::splat(self.subtract_mm);
+        let deviation = at.projections.distance_mm - F64x4::splat(self.subtract_mm);
         let mut variance = F64x4::splat(0.0);
         for i in 0..6 {
             let mut along = F64x4::splat(0.0);
@@ -479,7 +479,7 @@ impl Report for Reporter<'_> {
                 deviation_mm: deviation.0[l],
                 uncertainty_mm: (self.variance_mm2 + variance.0[l].max(0.0)).sqrt(),
                 status: if beyond_outline { PointStatus::OffPart } else { correspondences[l].status() },
-                in_fit: correspondences[l].used,
+                in_fit: correspondences[l].in_fit,
             };
         }
         deviations

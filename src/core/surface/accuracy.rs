@@ -91,13 +91,13 @@ pub struct Estimate {
     /// Errors within two spacings of the border of the sampling.
     pub border: Figures,
     /// Place of the largest error.
-    pub worst: Worst,
+    pub max_error: Worst,
     /// Order p that the estimate uses: the error is proportional to the p-th power of the spacing.
     pub order: f64,
     /// Order as observed, before it is clamped.
     pub observed_order: f64,
     /// Reliability of the estimate.
-    pub trust: Trust,
+    pub reliability: Trust,
     spacing_mm: f64,
     /// Spacing of the coarser of the two samplings, in millimetres.
     coarsest_mm: f64,
@@ -118,7 +118,7 @@ pub struct Figures {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Worst {
     /// Position in the model frame.
-    pub at: Point,
+    pub point: Point,
     /// Signed error, in millimetres.
     pub error_mm: f64,
     /// True if the place lies within two spacings of the border of the sampling.
@@ -142,7 +142,7 @@ impl Estimate {
     /// points are not exact enough for it at any spacing. The result is never coarser than the coarser of the two
     /// samplings.
     pub fn spacing_for(&self, wanted_pv_mm: f64) -> Option<f64> {
-        if self.trust == Trust::Rounding {
+        if self.reliability == Trust::Rounding {
             return (self.inside.pv_mm <= wanted_pv_mm).then_some(self.spacing_mm);
         }
         let ratio = wanted_pv_mm / self.inside.pv_mm.max(f64::MIN_POSITIVE);
@@ -177,16 +177,16 @@ pub fn accuracy(samples: Samples) -> Result<Accuracy, SurfaceError> {
     let is_border = [&fine, &coarse].iter().any(|errors| errors.inside.len() < LEAST_INSIDE);
     if is_border {
         // With few points nearly all places are near the border, so the estimate includes the border.
-        [&mut fine, &mut coarse].into_iter().for_each(Errors::take_the_border_in);
+        [&mut fine, &mut coarse].into_iter().for_each(Errors::merge_border);
     }
     if [&fine, &coarse].iter().any(|errors| errors.inside.len() < LEAST_INSIDE) {
-        return Err(SurfaceError::TooFewPoints { points: count, least });
+        return Err(SurfaceError::TooFewPoints { points: count, min_points: least });
     }
     let spacing_mm = fine.spacing_mm / factor;
     let [flat, curved] = [0, 1].map(|kind| {
         let told = estimate(&fine, &coarse, kind, [factor, coarsest / factor], spacing_mm);
-        let trust = if is_border && told.trust == Trust::Extrapolated { Trust::TooCoarse } else { told.trust };
-        Estimate { trust, ..told }
+        let trust = if is_border && told.reliability == Trust::Extrapolated { Trust::TooCoarse } else { told.reliability };
+        Estimate { reliability: trust, ..told }
     });
     Ok(Accuracy { points: count, spacing_mm, flat, curved })
 }
@@ -200,14 +200,14 @@ struct Errors {
 }
 
 impl Errors {
-    fn take_the_border_in(&mut self) {
+    fn merge_border(&mut self) {
         self.inside.append(&mut self.border);
     }
 }
 
 /// Withheld point with its errors by the flat and by the curved distance.
 struct Measured {
-    at: Point,
+    point: Point,
     errors_mm: [f64; 2],
 }
 
@@ -240,18 +240,18 @@ fn kept_of_points(points: &[Point], projection: Projection) -> Result<([f64; 2],
     let on_plane = matches!(projection, Projection::Auto | Projection::Xy);
     if let Some(order) = recognise_grid(points).filter(|_| on_plane) {
         let kept = OF_GRID.map(|stride| {
-            let nodes = coarse_nodes(order.columns, order.rows, stride).map(|node| order.point_at[node]);
+            let nodes = coarse_nodes(order.columns, order.rows, stride).map(|node| order.point_indices[node]);
             nodes.filter(|&point| point != NO_POINT).collect()
         });
         return Ok((OF_GRID.map(|stride| stride as f64), kept));
     }
     if points.len() < 9 {
-        return Err(SurfaceError::TooFewPoints { points: points.len(), least: 9 });
+        return Err(SurfaceError::TooFewPoints { points: points.len(), min_points: 9 });
     }
     if is_line(points) {
         return Err(SurfaceError::Collinear { points: points.len() });
     }
-    let (_, map) = projection.prepare(points)?;
+    let (_, map) = projection.choose(points)?;
     let order = along_the_plane(points, &map);
     let of = if points.len() < FEW { OF_FEW } else { OF_SCATTERED };
     let every = |one_of: usize| order.iter().copied().skip(one_of.isqrt() / 2).step_by(one_of).collect();
@@ -288,22 +288,22 @@ fn kept_level(points: &[Point], kept: &[u32], projection: Projection) -> Result<
 /// Measures the distances of the withheld points from a coarser sampling.
 fn measure(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Errors {
     let surface = OffsetSurface::new(coarse, 0.0, Side::Normal).expect("a radius of 0 is one");
-    let (flat, curved) = (surface.with_distance(Distance::Triangle), surface.with_distance(Distance::Curved));
+    let (flat, curved) = (surface.with_distance_model(Distance::Triangle), surface.with_distance_model(Distance::Curved));
     // Odd, so that the stride does not divide a common number of columns.
     let stride = (points.len() / MEASURED) | 1;
     let one = |k: usize| {
         let at = points[k];
-        let foot = curved.foot(&at, Place::UNKNOWN);
-        if foot.beyond_mm > 0.0 {
+        let foot = curved.project(&at, Place::UNKNOWN);
+        if foot.beyond_edge_mm > 0.0 {
             return None;
         }
-        let errors_mm = [flat.foot(&at, foot.place).distance_mm, foot.distance_mm];
-        let spacing_mm = curved.spacing_mm(foot.place);
+        let errors_mm = [flat.project(&at, foot.facet).distance_mm, foot.distance_mm];
+        let spacing_mm = curved.spacing_mm(foot.facet);
         let reach = BORDER * spacing_mm;
         let [u, v] = tangents(&foot.normal);
         let around = (0..8).map(|k| std::f64::consts::FRAC_PI_4 * f64::from(k)).map(|a| u * a.cos() + v * a.sin());
-        let inside = around.into_iter().all(|d| curved.foot(&(at + d * reach), foot.place).beyond_mm == 0.0);
-        Some((inside, spacing_mm, Measured { at, errors_mm }))
+        let inside = around.into_iter().all(|d| curved.project(&(at + d * reach), foot.facet).beyond_edge_mm == 0.0);
+        Some((inside, spacing_mm, Measured { point: at, errors_mm }))
     };
     let chosen = (0..points.len()).into_par_iter().step_by(stride);
     let measured: Vec<_> = chosen.filter(|&k| left_out[k] && points[k].x.is_finite()).filter_map(one).collect();
@@ -325,7 +325,7 @@ fn estimate(fine: &Errors, coarse: &Errors, kind: usize, [factor, step]: [f64; 2
         (scale(order), scale(observed(&border_fine, &border_coarse, step).clamp(ORDERS[0], ORDERS[1])));
     let worst = |set: &[Measured], scale: f64, near_border: bool| {
         let largest = set.iter().max_by(|a, b| a.errors_mm[kind].abs().total_cmp(&b.errors_mm[kind].abs()));
-        largest.map(|m| Worst { at: m.at, error_mm: m.errors_mm[kind] * scale, near_border })
+        largest.map(|m| Worst { point: m.point, error_mm: m.errors_mm[kind] * scale, near_border })
     };
     let inside_worst = worst(&fine.inside, inside_scale, false).expect("there are places inside");
     let worst = match worst(&fine.border, border_scale, true) {
@@ -335,10 +335,10 @@ fn estimate(fine: &Errors, coarse: &Errors, kind: usize, [factor, step]: [f64; 2
     Estimate {
         inside: inside_fine.scaled(inside_scale),
         border: border_fine.scaled(border_scale),
-        worst,
+        max_error: worst,
         order,
         observed_order,
-        trust,
+        reliability: trust,
         spacing_mm,
         coarsest_mm: coarse.spacing_mm,
     }
@@ -353,12 +353,12 @@ fn observed(fine: &Figures, coarse: &Figures, step: f64) -> f64 {
 
 fn trust(observed_order: f64, least: f64, rms_mm: f64, spacing_mm: f64) -> Trust {
     /// Upper limit of the tilt that rounding and noise cause; features between the points cause more.
-    const LARGEST_TILT: f64 = 1e-4;
+    const MAX_TILT: f64 = 1e-4;
     /// Limit of the floating-point accuracy on a part of one metre.
     const EXACT_MM: f64 = 1e-11;
     match observed_order {
         _ if rms_mm < EXACT_MM => Trust::Extrapolated,
-        p if p < least && rms_mm < LARGEST_TILT * spacing_mm => Trust::Rounding,
+        p if p < least && rms_mm < MAX_TILT * spacing_mm => Trust::Rounding,
         p if p < least || p > ORDERS[1] + 0.5 => Trust::TooCoarse,
         _ => Trust::Extrapolated,
     }

@@ -57,7 +57,7 @@ pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Tr
         return Err(SurfaceError::Collinear { points: points.len() });
     }
     let triangles = Triangles { corners, neighbours };
-    let lengths = Lengths::of(&triangles, &ordered);
+    let lengths = Lengths::new(&triangles, &ordered);
     if let Some(twins) = twins(&triangles, &lengths, &ordered) {
         let [first, second] = twins.map(|k| along[k as usize].1 as usize);
         let apart_mm = (points[first] - points[second]).norm();
@@ -65,7 +65,7 @@ pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Tr
         return Err(SurfaceError::NearDuplicates { first, second, at: points[first].into(), apart_mm });
     }
     let [low, high] = bounds(ordered.iter().copied());
-    if (high[0] - low[0]).max(high[1] - low[1]) > WIDE * lengths.usual * (points.len() as f64).sqrt()
+    if (high[0] - low[0]).max(high[1] - low[1]) > WIDE * lengths.median_max_edge * (points.len() as f64).sqrt()
         && let Some((index, distance_mm)) = far_off(points)
     {
         return Err(SurfaceError::FarOff { index, at: points[index].into(), distance_mm });
@@ -122,26 +122,26 @@ fn first_duplicate(points: &[Point], places: &[[f64; 2]]) -> SurfaceError {
 
 /// Shortest and longest edge of each triangle, and the median of the longest edges.
 struct Lengths {
-    shortest: Vec<f64>,
-    longest: Vec<f64>,
-    usual: f64,
+    min_edge: Vec<f64>,
+    max_edge: Vec<f64>,
+    median_max_edge: f64,
 }
 
 impl Lengths {
-    fn of(t: &Triangles, places: &[[f64; 2]]) -> Self {
+    fn new(t: &Triangles, places: &[[f64; 2]]) -> Self {
         let of = |corners: &[u32; 3]| {
             let [a, b, c] = squared_lengths(corners, places);
             (a.min(b).min(c).sqrt(), a.max(b).max(c).sqrt())
         };
         let (shortest, longest): (Vec<f64>, Vec<f64>) = t.corners.par_iter().map(of).unzip();
-        Self { usual: median(&longest), shortest, longest }
+        Self { median_max_edge: median(&longest), min_edge: shortest, max_edge: longest }
     }
 }
 
 /// Returns two points so near each other that the surface between them consists of rounding errors.
 fn twins(t: &Triangles, lengths: &Lengths, places: &[[f64; 2]]) -> Option<[u32; 2]> {
-    let least = TWINS * lengths.usual;
-    let facet = lengths.shortest.par_iter().position_first(|shortest| *shortest < least)?;
+    let least = TWINS * lengths.median_max_edge;
+    let facet = lengths.min_edge.par_iter().position_first(|shortest| *shortest < least)?;
     let corners = t.corners[facet];
     let squared = squared_lengths(&corners, places);
     let across = (0..3).min_by(|&a, &b| squared[a].total_cmp(&squared[b]))?;
@@ -189,7 +189,7 @@ fn squared_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
 fn bridges(t: &Triangles, lengths: &Lengths) -> Vec<u32> {
     let suspects: Vec<u32> = (0..t.corners.len() as u32)
         .into_par_iter()
-        .filter(|&f| lengths.longest[f as usize] > BRIDGE * lengths.usual)
+        .filter(|&f| lengths.max_edge[f as usize] > BRIDGE * lengths.median_max_edge)
         .collect();
     if suspects.is_empty() {
         return suspects;
@@ -199,7 +199,7 @@ fn bridges(t: &Triangles, lengths: &Lengths) -> Vec<u32> {
         .into_iter()
         .filter(|&f| {
             let most = t.corners[f as usize].iter().map(|c| usual[c]).fold(0.0, f64::max);
-            lengths.longest[f as usize] > BRIDGE * most.max(lengths.usual)
+            lengths.max_edge[f as usize] > BRIDGE * most.max(lengths.median_max_edge)
         })
         .collect()
 }
@@ -214,7 +214,7 @@ fn usual_around(t: &Triangles, lengths: &Lengths, suspects: &[u32]) -> HashMap<u
     let neighbours = triangles_at(t, suspects.iter().flat_map(|&f| t.corners[f as usize]));
     let around = triangles_at(t, neighbours.values().flatten().flat_map(|&f| t.corners[f as usize]));
     let quartile = |facets: &Vec<u32>| {
-        let mut longest: Vec<f64> = facets.iter().map(|&f| lengths.longest[f as usize]).collect();
+        let mut longest: Vec<f64> = facets.iter().map(|&f| lengths.max_edge[f as usize]).collect();
         longest.sort_unstable_by(f64::total_cmp);
         longest[(longest.len() - 1) / 4]
     };
@@ -310,7 +310,7 @@ mod tests {
     }
 
     fn triangulated(points: &[Point]) -> (Vec<Point>, Triangles) {
-        triangulate(points, &Projection::Xy.prepare(points).unwrap().1).unwrap()
+        triangulate(points, &Projection::Xy.choose(points).unwrap().1).unwrap()
     }
 
     #[test]

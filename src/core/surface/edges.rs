@@ -59,7 +59,7 @@ enum Axis {
 /// Finished part: one vertex, or a hull edge that has the whole part on its left.
 #[derive(Clone, Copy)]
 enum Part {
-    Lone(u32),
+    Vertex(u32),
     Hull(u32),
 }
 
@@ -78,7 +78,7 @@ impl Triangulation {
         let mut edges: Vec<Edge> = vec![[0; 3]; PER_VERTEX * count];
         let (part, unused) = divide(sites, 0..count, &mut edges, 0);
         let Part::Hull(hull) = part else { unreachable!("three points have an edge") };
-        unused.mark(&mut edges);
+        unused.mark_deleted(&mut edges);
         Self { edges, hull }
     }
 
@@ -88,7 +88,7 @@ impl Triangulation {
     /// Faces are numbered in the order of their edges, so that in memory they lie about where their corners do.
     pub(crate) fn faces(&self) -> (Vec<[u32; 3]>, Vec<[u32; 3]>) {
         let number: Vec<AtomicU32> = (0..self.edges.len()).into_par_iter().map(|_| AtomicU32::new(0)).collect();
-        self.along_the_hull(|e| number[(e ^ 1) as usize].store(BORDER, Ordering::Relaxed));
+        self.visit_hull(|e| number[(e ^ 1) as usize].store(BORDER, Ordering::Relaxed));
         let of = |e: u32| number[e as usize].load(Ordering::Relaxed);
         let round = |e: u32| {
             let second = self.left_next(e);
@@ -120,7 +120,7 @@ impl Triangulation {
         self.edges[(e ^ 1) as usize][BEFORE]
     }
 
-    fn along_the_hull(&self, visit: impl Fn(u32)) {
+    fn visit_hull(&self, visit: impl Fn(u32)) {
         let mut e = self.hull;
         loop {
             visit(e);
@@ -137,9 +137,9 @@ impl Triangulation {
 fn divide(sites: SortedSites, range: Range<usize>, edges: &mut [Edge], base: u32) -> (Part, Slots) {
     if range.len() <= ALONE {
         let fresh = base..base + edges.len() as u32;
-        let mut part = Subdivision { sites, edges, base, slots: Slots { freed: Vec::new(), fresh: vec![fresh] } };
+        let mut part = Subdivision { sites, edges, base, free_edges: Slots { freed: Vec::new(), fresh: vec![fresh] } };
         let hull = part.build(range);
-        return (hull, part.slots);
+        return (hull, part.free_edges);
     }
     let (cut, axis) = sites.cut(&range);
     let set_aside = PER_VERTEX * (cut - range.start);
@@ -150,9 +150,9 @@ fn divide(sites: SortedSites, range: Range<usize>, edges: &mut [Edge], base: u32
     );
     slots.freed.extend(more.freed);
     slots.fresh.extend(more.fresh);
-    let mut part = Subdivision { sites, edges, base, slots };
+    let mut part = Subdivision { sites, edges, base, free_edges: slots };
     let hull = part.merge(lower, upper, axis);
-    (hull, part.slots)
+    (hull, part.free_edges)
 }
 
 impl SortedSites<'_> {
@@ -178,7 +178,7 @@ struct Slots {
 
 impl Slots {
     /// Takes an unused pair of numbers that differ in the last bit, and returns the lower one.
-    fn take(&mut self) -> u32 {
+    fn allocate(&mut self) -> u32 {
         if let Some(e) = self.freed.pop() {
             return e;
         }
@@ -193,7 +193,7 @@ impl Slots {
     }
 
     /// Marks the edges whose numbers were never assigned.
-    fn mark(&self, edges: &mut [Edge]) {
+    fn mark_deleted(&self, edges: &mut [Edge]) {
         for range in &self.fresh {
             edges[range.start as usize..range.end as usize].fill([NOWHERE; 3]);
         }
@@ -206,15 +206,15 @@ struct Subdivision<'a> {
     edges: &'a mut [Edge],
     /// Number of the first edge in `edges`.
     base: u32,
-    slots: Slots,
+    free_edges: Slots,
 }
 
 impl Subdivision<'_> {
     fn build(&mut self, range: Range<usize>) -> Part {
         match range.len() {
-            1 => Part::Lone(range.start as u32),
+            1 => Part::Vertex(range.start as u32),
             2 => Part::Hull(self.make(range.start as u32, range.start as u32 + 1)),
-            3 => self.three(range.start as u32),
+            3 => self.join_three(range.start as u32),
             _ => {
                 let (cut, axis) = self.sites.cut(&range);
                 let lower = self.build(range.start..cut);
@@ -225,16 +225,16 @@ impl Subdivision<'_> {
     }
 
     /// Joins three points to a triangle, or to two edges if they lie on one line.
-    fn three(&mut self, first: u32) -> Part {
+    fn join_three(&mut self, first: u32) -> Part {
         let mut v = [first, first + 1, first + 2];
         let orientation = self.orient2d(v[0], v[1], v[2]);
         if orientation == 0.0 {
-            v.sort_by(|&a, &b| self.before(Axis::U, a, b));
+            v.sort_by(|&a, &b| self.compare(Axis::U, a, b));
         } else if orientation < 0.0 {
             v.swap(1, 2);
         }
         let (a, b) = (self.make(v[0], v[1]), self.make(v[1], v[2]));
-        self.put_after(b, a ^ 1);
+        self.insert_after(b, a ^ 1);
         if orientation != 0.0 {
             self.connect(b, a);
         }
@@ -245,14 +245,14 @@ impl Subdivision<'_> {
     fn merge(&mut self, lower: Part, upper: Part, axis: Axis) -> Part {
         let mut base = self.tangent(lower, upper, axis);
         loop {
-            let (right, left) = (self.origin(base), self.dest(base));
+            let (right, left) = (self.origin(base), self.destination(base));
             let mut at_left = self.edge(base ^ 1)[AFTER];
-            let goes_left = self.orient2d(right, left, self.dest(at_left)) < 0.0;
+            let goes_left = self.orient2d(right, left, self.destination(at_left)) < 0.0;
             if goes_left {
                 at_left = self.clear(at_left, AFTER, left, right);
             }
             let mut at_right = self.edge(base)[BEFORE];
-            let goes_right = self.orient2d(right, left, self.dest(at_right)) < 0.0;
+            let goes_right = self.orient2d(right, left, self.destination(at_right)) < 0.0;
             if goes_right {
                 at_right = self.clear(at_right, BEFORE, left, right);
             }
@@ -260,7 +260,7 @@ impl Subdivision<'_> {
                 (false, false) => return Part::Hull(base),
                 (false, true) => self.connect(at_right, base ^ 1),
                 (true, false) => self.connect(base ^ 1, at_left ^ 1),
-                (true, true) if self.in_circle(self.dest(at_left), left, right, self.dest(at_right)) => {
+                (true, true) if self.in_circle(self.destination(at_left), left, right, self.destination(at_right)) => {
                     self.connect(at_right, base ^ 1)
                 }
                 (true, true) => self.connect(base ^ 1, at_left ^ 1),
@@ -273,7 +273,7 @@ impl Subdivision<'_> {
     fn clear(&mut self, mut e: u32, way: usize, left: u32, right: u32) -> u32 {
         loop {
             let next = self.edge(e)[way];
-            if !self.in_circle(left, right, self.dest(e), self.dest(next)) {
+            if !self.in_circle(left, right, self.destination(e), self.destination(next)) {
                 return e;
             }
             self.delete(e);
@@ -286,34 +286,34 @@ impl Subdivision<'_> {
     fn tangent(&mut self, lower: Part, upper: Part, axis: Axis) -> u32 {
         // The search runs clockwise along the lower hull and counter-clockwise along the upper one.
         let mut l = match lower {
-            Part::Lone(_) => None,
-            Part::Hull(e) => Some(self.edge(self.farthest(e, |a, b| self.before(axis, a, b).is_lt()))[BEFORE]),
+            Part::Vertex(_) => None,
+            Part::Hull(e) => Some(self.edge(self.farthest(e, |a, b| self.compare(axis, a, b).is_lt()))[BEFORE]),
         };
         let mut u = match upper {
-            Part::Lone(_) => None,
-            Part::Hull(e) => Some(self.farthest(e, |a, b| self.before(axis, a, b).is_gt())),
+            Part::Vertex(_) => None,
+            Part::Hull(e) => Some(self.farthest(e, |a, b| self.compare(axis, a, b).is_gt())),
         };
         let vertex = |plane: &Self, part: Part, e: Option<u32>| match (part, e) {
-            (Part::Lone(v), _) => v,
+            (Part::Vertex(v), _) => v,
             (_, e) => plane.origin(e.expect("a hull has edges")),
         };
         loop {
             let (at_l, at_u) = (vertex(self, lower, l), vertex(self, upper, u));
             if let Some(e) = l
-                && self.orient2d(at_l, self.dest(e), at_u) > 0.0
+                && self.orient2d(at_l, self.destination(e), at_u) > 0.0
             {
                 l = Some(self.left_next(e));
             } else if let Some(e) = u
-                && self.orient2d(at_u, self.dest(e), at_l) < 0.0
+                && self.orient2d(at_u, self.destination(e), at_l) < 0.0
             {
                 u = Some(self.edge(e ^ 1)[AFTER]);
             } else {
                 let base = self.make(at_u, at_l);
                 if let Some(e) = u {
-                    self.put_after(base, self.edge(e)[BEFORE]);
+                    self.insert_after(base, self.edge(e)[BEFORE]);
                 }
                 if let Some(e) = l {
-                    self.put_after(base ^ 1, e);
+                    self.insert_after(base ^ 1, e);
                 }
                 return base;
             }
@@ -334,7 +334,7 @@ impl Subdivision<'_> {
     }
 
     /// Compares two vertices across a line that separates parts; ties are ordered along the line.
-    fn before(&self, axis: Axis, a: u32, b: u32) -> std::cmp::Ordering {
+    fn compare(&self, axis: Axis, a: u32, b: u32) -> std::cmp::Ordering {
         let (a, b) = (self.sites.places[a as usize], self.sites.places[b as usize]);
         match axis {
             Axis::U => a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])),
@@ -359,7 +359,7 @@ impl Subdivision<'_> {
     }
 
     #[inline(always)]
-    fn dest(&self, e: u32) -> u32 {
+    fn destination(&self, e: u32) -> u32 {
         self.edge(e ^ 1)[ORIGIN]
     }
 
@@ -371,7 +371,7 @@ impl Subdivision<'_> {
 
     /// Makes an edge that is connected to no other.
     fn make(&mut self, from: u32, to: u32) -> u32 {
-        let e = self.slots.take();
+        let e = self.free_edges.allocate();
         *self.edge_mut(e) = [from, e, e];
         *self.edge_mut(e ^ 1) = [to, e ^ 1, e ^ 1];
         e
@@ -379,7 +379,7 @@ impl Subdivision<'_> {
 
     /// Inserts an edge that is alone at its origin directly after another one, counter-clockwise.
     #[inline(always)]
-    fn put_after(&mut self, e: u32, other: u32) {
+    fn insert_after(&mut self, e: u32, other: u32) {
         let next = self.edge(other)[AFTER];
         self.edge_mut(other)[AFTER] = e;
         self.edge_mut(next)[BEFORE] = e;
@@ -389,9 +389,9 @@ impl Subdivision<'_> {
 
     /// Makes an edge from the end of `a` to the origin of `b`, across the face on the left of both.
     fn connect(&mut self, a: u32, b: u32) -> u32 {
-        let e = self.make(self.dest(a), self.origin(b));
-        self.put_after(e, self.left_next(a));
-        self.put_after(e ^ 1, b);
+        let e = self.make(self.destination(a), self.origin(b));
+        self.insert_after(e, self.left_next(a));
+        self.insert_after(e ^ 1, b);
         e
     }
 
@@ -402,7 +402,7 @@ impl Subdivision<'_> {
             self.edge_mut(after)[BEFORE] = before;
             self.edge_mut(e)[ORIGIN] = NOWHERE;
         }
-        self.slots.freed.push(e & !1);
+        self.free_edges.freed.push(e & !1);
     }
 
     #[inline(always)]

@@ -78,12 +78,12 @@ pub(crate) type Corner<T> = ([T; 3], [T; 3]);
 
 /// One facet, or four in parallel lanes, with the corners on the offset surface.
 pub(crate) struct Facet<T> {
-    x: [[T; 3]; 3],
-    n: [[T; 3]; 3],
+    corners: [[T; 3]; 3],
+    normals: [[T; 3]; 3],
     /// Normal of the flat facet, not of unit length, in the sense in which the corners turn. `squared` is its squared
     /// length.
-    pub(crate) turned: [T; 3],
-    pub(crate) squared: T,
+    pub(crate) area_normal: [T; 3],
+    pub(crate) area_normal_squared: T,
     /// +1 on the side of the normals, -1 on the other.
     sign: T,
 }
@@ -92,19 +92,19 @@ impl<T: Real> Facet<T> {
     #[inline(always)]
     pub(crate) fn new([a, b, c]: [Corner<T>; 3], sign: T) -> Self {
         let turned = cross(&minus(&b.0, &a.0), &minus(&c.0, &a.0));
-        Self { x: [a.0, b.0, c.0], n: [a.1, b.1, c.1], turned, squared: dot(&turned, &turned), sign }
+        Self { corners: [a.0, b.0, c.0], normals: [a.1, b.1, c.1], area_normal: turned, area_normal_squared: dot(&turned, &turned), sign }
     }
 
     /// Returns the vector from a corner to a point.
     #[inline(always)]
-    pub(crate) fn seen_from(&self, corner: usize, p: &[T; 3]) -> [T; 3] {
-        minus(p, &self.x[corner])
+    pub(crate) fn vector_from_corner(&self, corner: usize, p: &[T; 3]) -> [T; 3] {
+        minus(p, &self.corners[corner])
     }
 
     /// Returns the edge from one corner to another.
     #[inline(always)]
     pub(crate) fn edge(&self, from: usize, to: usize) -> [T; 3] {
-        minus(&self.x[to], &self.x[from])
+        minus(&self.corners[to], &self.corners[from])
     }
 
     /// Returns the barycentric weights of the projection of a point onto the plane of the flat facet. `w` is the vector
@@ -112,28 +112,28 @@ impl<T: Real> Facet<T> {
     #[inline(always)]
     pub(crate) fn weights(&self, w: &[T; 3]) -> [T; 3] {
         let (e1, e2) = (self.edge(0, 1), self.edge(0, 2));
-        let per_squared = T::splat(1.0) / self.squared;
-        let b1 = dot(&cross(w, &e2), &self.turned) * per_squared;
-        let b2 = dot(&cross(&e1, w), &self.turned) * per_squared;
+        let per_squared = T::splat(1.0) / self.area_normal_squared;
+        let b1 = dot(&cross(w, &e2), &self.area_normal) * per_squared;
+        let b2 = dot(&cross(&e1, w), &self.area_normal) * per_squared;
         [T::splat(1.0) - b1 - b2, b1, b2]
     }
 
     /// Returns the unit normal of the flat facet, towards the probe's side; eq. (1).
     #[inline(always)]
     pub(crate) fn flat_normal(&self) -> [T; 3] {
-        times(&self.turned, self.sign / self.squared.sqrt())
+        times(&self.area_normal, self.sign / self.area_normal_squared.sqrt())
     }
 
     /// Returns the point of the flat facet with these weights.
     #[inline(always)]
-    pub(crate) fn at(&self, b: &[T; 3]) -> [T; 3] {
-        weighted(&self.x, b)
+    pub(crate) fn point(&self, b: &[T; 3]) -> [T; 3] {
+        weighted(&self.corners, b)
     }
 
     /// Returns the unit normal of the curved surface.
     #[inline(always)]
     pub(crate) fn normal(&self, b: &[T; 3]) -> [T; 3] {
-        T::unit(&weighted(&self.n, b))
+        T::unit(&weighted(&self.normals, b))
     }
 
     /// Returns the height of the curved surface over the flat facet, positive on the probe's side.
@@ -144,7 +144,7 @@ impl<T: Real> Facet<T> {
         for (i, j) in [(0, 1), (1, 2), (2, 0)] {
             let edge = self.edge(i, j);
             // Slope of the surface along the edge at its start, and the slope against the edge's direction at its end.
-            let (leaving, arriving) = (zero - dot(&self.n[i], &edge), dot(&self.n[j], &edge));
+            let (leaving, arriving) = (zero - dot(&self.normals[i], &edge), dot(&self.normals[j], &edge));
             along = along + b[i] * b[j] * (b[i] * leaving + b[j] * arriving);
             total = total.plus(leaving, arriving);
         }

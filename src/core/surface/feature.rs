@@ -26,7 +26,7 @@ impl Feature {
     }
 
     /// Returns the same place as seen from the other side of the surface.
-    pub(crate) fn turned_over(&self) -> Self {
+    pub(crate) fn flipped(&self) -> Self {
         Self {
             point: self.point,
             normal: -self.normal,
@@ -39,7 +39,7 @@ impl Feature {
     ///
     /// Equation: a normal curvature k towards the offset's side becomes k / (1 - r k); the directions do not change.
     pub(crate) fn offset(&self, radius_mm: f64, side: Side) -> Option<Self> {
-        let seen = if side == Side::Normal { *self } else { self.turned_over() };
+        let seen = if side == Side::Normal { *self } else { self.flipped() };
         let room = seen.curvatures.map(|k| 1.0 - radius_mm * k);
         (room[0] > 0.0 && room[1] > 0.0).then(|| Self {
             point: seen.point + seen.normal * radius_mm,
@@ -57,12 +57,12 @@ const NEIGHBOURS: u32 = 25;
 /// A second fit excludes the neighbours that contradict the first, so that an outlier spoils only itself and not the
 /// places around it. Points whose neighbours do not form a surface are omitted.
 pub(crate) fn features(points: &[Point], normals: Option<&[Vector]>) -> Vec<Feature> {
-    let tree = Nearest::of(points.iter().copied());
+    let tree = Nearest::new(points.iter().copied());
     (0..points.len())
         .into_par_iter()
         .with_min_len(64)
         .filter_map(|k| {
-            let nearest = tree.to(&points[k], NEIGHBOURS).map(|(n, _)| points[n]);
+            let nearest = tree.nearest(&points[k], NEIGHBOURS).map(|(n, _)| points[n]);
             let around: Vec<Point> = nearest.filter(|p| *p != points[k]).collect();
             feature(points[k], &around, normals.map(|n| n[k]))
         })
@@ -123,7 +123,7 @@ mod tests {
         let f = middle(&features(&points, Some(&vec![Vector::z(); points.len()])));
         assert!((f.curvatures[0] + 1.0 / 25.0).abs() < 1e-9 && (f.curvatures[1] - 1.0 / 40.0).abs() < 1e-9);
         assert!(f.direction.y.abs() > 1.0 - 1e-9);
-        let below = f.turned_over();
+        let below = f.flipped();
         assert!((below.curvatures[0] + 1.0 / 40.0).abs() < 1e-9 && below.direction.x.abs() > 1.0 - 1e-9);
     }
 

@@ -24,39 +24,39 @@ const DOUBT: f64 = 1.4;
 impl OffsetSurface<'_> {
     /// Returns the worst place where the offset surface folds, if there is one. Checks a whole grid, and up to
     /// `LOOKED_AT` facets of a mesh.
-    pub(crate) fn fold(&self) -> Option<SurfaceError> {
+    pub(crate) fn find_fold(&self) -> Option<SurfaceError> {
         if self.radius_mm() == 0.0 {
             return None;
         }
         let patches = self.nominal().patches();
-        self.worst_fold(patches.iter().flat_map(|patch| self.folded(patch).into_iter().map(move |f| (patch, f))))
+        self.worst_fold(patches.iter().flat_map(|patch| self.folded_facets(patch).into_iter().map(move |f| (patch, f))))
     }
 
     /// Returns the worst place where the offset surface folds among the touched places of a mesh.
     /// [`OffsetSurface::fold`] checks a grid as a whole.
-    pub(crate) fn fold_where_touched(&self, touched: impl Iterator<Item = Place>) -> Option<SurfaceError> {
+    pub(crate) fn find_fold_among(&self, touched: impl Iterator<Item = Place>) -> Option<SurfaceError> {
         let patches = self.nominal().patches();
-        let is_mesh = |patch: &Patch| matches!(patch.lattice, Lattice::Mesh(_));
+        let is_mesh = |patch: &Patch| matches!(patch.topology, Lattice::Mesh(_));
         if self.radius_mm() == 0.0 || !patches.iter().any(is_mesh) {
             return None;
         }
         let there = touched.map(|place| (&patches[place.patch() as usize], place.facet()));
         let there: Vec<(&Patch, u32)> = there.filter(|(patch, _)| is_mesh(patch)).collect();
-        let there: Vec<_> = there.into_par_iter().filter(|(p, f)| self.folds(p, p.corners(*f))).collect();
+        let there: Vec<_> = there.into_par_iter().filter(|(p, f)| self.is_folded(p, p.corners(*f))).collect();
         self.worst_fold(there.into_iter())
     }
 
     /// Returns the worst of some folded facets as an error.
     fn worst_fold<'a>(&self, folded: impl Iterator<Item = (&'a Patch, u32)>) -> Option<SurfaceError> {
-        let worst = folded.map(|(p, f)| (self.least_curvature(p, f), p, f));
+        let worst = folded.map(|(p, f)| (self.min_curvature(p, f), p, f));
         let (curvature, patch, facet) = worst.min_by(|a, b| a.0.total_cmp(&b.0))?;
         let at = (*patch.point(patch.corners(facet)[0])).into();
         Some(SurfaceError::OffsetFolds { at, concave_radius_mm: -1.0 / curvature, probe_radius_mm: self.radius_mm() })
     }
 
     /// Returns the folded facets of a patch, among those that are checked.
-    fn folded(&self, patch: &Patch) -> Vec<u32> {
-        match &patch.lattice {
+    fn folded_facets(&self, patch: &Patch) -> Vec<u32> {
+        match &patch.topology {
             Lattice::Grid(grid) => {
                 let (arch, nodes) = (pulp::Arch::new(), patch.nodes());
                 let doubtful = (0..(grid.rows() - 1).div_ceil(STEP))
@@ -67,7 +67,7 @@ impl OffsetSurface<'_> {
                 (0..rows)
                     .into_par_iter()
                     .flat_map_iter(|j| grid.row_of_facets(j))
-                    .filter(|&(facet, corners)| grid.has_facet(facet) && self.folds(patch, corners))
+                    .filter(|&(facet, corners)| grid.has_facet(facet) && self.is_folded(patch, corners))
                     .map(|(facet, _)| facet)
                     .collect()
             }
@@ -75,7 +75,7 @@ impl OffsetSurface<'_> {
                 let stride = (mesh.facet_count() as usize).div_ceil(LOOKED_AT);
                 let looked_at: Vec<u32> = (0..mesh.facet_count()).step_by(stride).collect();
                 patch.fit_normals(&looked_at.iter().flat_map(|&f| mesh.corners(f)).collect::<Vec<_>>());
-                looked_at.into_par_iter().filter(|&f| self.folds(patch, mesh.corners(f))).collect()
+                looked_at.into_par_iter().filter(|&f| self.is_folded(patch, mesh.corners(f))).collect()
             }
         }
     }
@@ -93,7 +93,7 @@ impl OffsetSurface<'_> {
 
     /// Returns true if the offset turns a facet over or flattens it: E + r B is no longer positive definite.
     #[inline]
-    fn folds(&self, patch: &Patch, corners: [u32; 3]) -> bool {
+    fn is_folded(&self, patch: &Patch, corners: [u32; 3]) -> bool {
         let (p, q, t) = (patch.vertex(corners[0]), patch.vertex(corners[1]), patch.vertex(corners[2]));
         let reach = self.radius_mm() * self.side().sign();
         let edges = (q.point - p.point, t.point - p.point);
@@ -102,8 +102,8 @@ impl OffsetSurface<'_> {
 
     /// Returns the smallest normal curvature of a facet in 1/mm, negative where it is concave as seen from the probe's
     /// side. It is the smallest eigenvalue of E^-1 B.
-    fn least_curvature(&self, patch: &Patch, facet: u32) -> f64 {
-        let ([e, f, g], [l, m, k]) = self.forms(patch, patch.corners(facet));
+    fn min_curvature(&self, patch: &Patch, facet: u32) -> f64 {
+        let ([e, f, g], [l, m, k]) = self.fundamental_forms(patch, patch.corners(facet));
         let det = e * g - f * f;
         let mean = 0.5 * (e * k - 2.0 * f * m + g * l) / det;
         let gauss = (l * k - m * m) / det;
@@ -115,7 +115,7 @@ impl OffsetSurface<'_> {
     /// Along an edge e the normal changes by dn = K e. With E_ij = e_i . e_j and B_ij the symmetric part of e_i . dn_j,
     /// K is E^-1 B. The offset has the first form E + 2 r B + O(r^2), which is singular where E + r B is.
     #[inline]
-    fn forms(&self, patch: &Patch, [a, b, c]: [u32; 3]) -> ([f64; 3], [f64; 3]) {
+    fn fundamental_forms(&self, patch: &Patch, [a, b, c]: [u32; 3]) -> ([f64; 3], [f64; 3]) {
         let (a, b, c) = (patch.vertex(a), patch.vertex(b), patch.vertex(c));
         let (e1, e2) = (b.point - a.point, c.point - a.point);
         let sign = self.side().sign();
@@ -146,7 +146,7 @@ impl pulp::NullaryFnOnce for WideRow<'_> {
             let here = four_vertices(&[nodes[k], nodes[a], nodes[b], nodes[c]]);
             let next = four_vertices(&[nodes[a], nodes[b], nodes[c], nodes[c + STEP]]);
             let up = four_vertices(&[above[k], above[a], above[b], above[c]]);
-            doubtful |= self.any_of_four(&here, &next, &up);
+            doubtful |= self.any_folds_x4(&here, &next, &up);
             k += LANES * STEP;
         }
         while k + STEP < nodes.len() {
@@ -163,7 +163,7 @@ impl pulp::NullaryFnOnce for WideRow<'_> {
 impl WideRow<'_> {
     /// Returns true if E + r B is not positive definite for any of four facets; see [`not_positive`].
     #[inline(always)]
-    fn any_of_four(
+    fn any_folds_x4(
         &self,
         here: &(Vector3x4, Vector3x4),
         next: &(Vector3x4, Vector3x4),

@@ -23,8 +23,8 @@ pub(crate) struct FourFeet {
 impl OffsetSurface<'_> {
     /// Returns true if [`OffsetSurface::four_feet`] supports this surface: one patch, and the curved distance at the
     /// foot.
-    pub(crate) fn has_four_feet(&self) -> bool {
-        self.nominal().patches().len() == 1 && self.distance() == Distance::Curved && self.lookup() == Lookup::Foot
+    pub(crate) fn supports_project_x4(&self) -> bool {
+        self.nominal().patches().len() == 1 && self.distance_model() == Distance::Curved && self.lookup() == Lookup::ContainingFacet
     }
 
     /// Finds the feet of four points near the given places, and replaces the places by those of the feet.
@@ -33,34 +33,34 @@ impl OffsetSurface<'_> {
     /// it returns `None` as soon as a point is not on its facet, because a walk over a mesh would fit normals on the
     /// way.
     #[inline(always)]
-    pub(crate) fn four_feet(&self, p: &Vector3x4, places: &mut [Place; LANES]) -> Option<FourFeet> {
+    pub(crate) fn project_x4(&self, p: &Vector3x4, places: &mut [Place; LANES]) -> Option<FourFeet> {
         let patch = &self.nominal().patches()[0];
-        match &patch.lattice {
-            Lattice::Grid(grid) => self.four_feet_on(patch, grid, JUMPS, p, places),
-            Lattice::Mesh(mesh) => self.four_feet_on(patch, mesh, 0, p, places),
+        match &patch.topology {
+            Lattice::Grid(grid) => self.project_x4_onto(patch, grid, JUMPS, p, places),
+            Lattice::Mesh(mesh) => self.project_x4_onto(patch, mesh, 0, p, places),
         }
     }
 
     /// Returns the expected places of the next four points: they follow the last ones as those followed the ones
     /// before. Returns `None` if there is no prediction: on a mesh, or if a last place is unknown.
-    pub(crate) fn four_extrapolated_places(
+    pub(crate) fn extrapolate_x4(
         &self,
         before: &[Place; LANES],
         last: &[Place; LANES],
     ) -> Option<[Place; LANES]> {
-        let Lattice::Grid(grid) = &self.nominal().patches()[0].lattice else { return None };
+        let Lattice::Grid(grid) = &self.nominal().patches()[0].topology else { return None };
         if last.contains(&Place::UNKNOWN) {
             return None;
         }
         Some(std::array::from_fn(|l| {
             let step = if before[l] == Place::UNKNOWN { 0 } else { last[l].facet().wrapping_sub(before[l].facet()) };
             let next = last[l].facet().wrapping_add(step);
-            if grid.has_facet(next) { Place::on_first_patch(next) } else { last[l] }
+            if grid.has_facet(next) { Place::in_first_patch(next) } else { last[l] }
         }))
     }
 
     #[inline(always)]
-    fn four_feet_on<F: Facets>(
+    fn project_x4_onto<F: Facets>(
         &self,
         patch: &Patch,
         facets: &F,
@@ -70,8 +70,8 @@ impl OffsetSurface<'_> {
     ) -> Option<FourFeet> {
         let mut jump = 0;
         loop {
-            let four = self.four_facets(patch, facets, places);
-            let w = four.seen_from(0, p);
+            let four = self.facets_x4(patch, facets, places);
+            let w = four.vector_from_corner(0, p);
             let b = four.weights(&w);
             let least = b[0].min(b[1]).min(b[2]);
             let stays = [least.0[0] >= INSIDE, least.0[1] >= INSIDE, least.0[2] >= INSIDE, least.0[3] >= INSIDE];
@@ -87,18 +87,18 @@ impl OffsetSurface<'_> {
     }
 
     #[inline(always)]
-    fn four_facets<F: Facets>(&self, patch: &Patch, facets: &F, places: &[Place; LANES]) -> Facet<F64x4> {
+    fn facets_x4<F: Facets>(&self, patch: &Patch, facets: &F, places: &[Place; LANES]) -> Facet<F64x4> {
         let (a, b) = (facets.corners(places[0].facet()), facets.corners(places[1].facet()));
         let (c, d) = (facets.corners(places[2].facet()), facets.corners(places[3].facet()));
-        let first = self.four_corners(patch, [a[0], b[0], c[0], d[0]]);
-        let second = self.four_corners(patch, [a[1], b[1], c[1], d[1]]);
-        let third = self.four_corners(patch, [a[2], b[2], c[2], d[2]]);
+        let first = self.corners_x4(patch, [a[0], b[0], c[0], d[0]]);
+        let second = self.corners_x4(patch, [a[1], b[1], c[1], d[1]]);
+        let third = self.corners_x4(patch, [a[2], b[2], c[2], d[2]]);
         Facet::new([first, second, third], F64x4::splat(self.side().sign()))
     }
 
     /// Returns one corner of each of four facets: its point on the offset surface and its normal.
     #[inline(always)]
-    fn four_corners(&self, patch: &Patch, [a, b, c, d]: [u32; LANES]) -> Corner<F64x4> {
+    fn corners_x4(&self, patch: &Patch, [a, b, c, d]: [u32; LANES]) -> Corner<F64x4> {
         let four = four_vertices(&[patch.vertex(a), patch.vertex(b), patch.vertex(c), patch.vertex(d)]);
         corner(four, F64x4::splat(self.side().sign()), F64x4::splat(self.radius_mm()))
     }
@@ -110,7 +110,7 @@ impl OffsetSurface<'_> {
 fn jumped<F: Facets>(facets: &F, places: &mut [Place; LANES], stays: &[bool; LANES], b: &[F64x4; 3]) -> bool {
     for l in (0..LANES).filter(|&l| !stays[l]) {
         match facets.advance(places[l].facet(), &[b[0].0[l], b[1].0[l], b[2].0[l]]) {
-            Some(next) => places[l] = Place::on_first_patch(next),
+            Some(next) => places[l] = Place::in_first_patch(next),
             None => return false,
         }
     }
@@ -133,7 +133,7 @@ mod tests {
             .collect();
         for nominal in [
             Nominal::from_points(cloud.clone(), Projection::Auto).unwrap(),
-            Nominal::scattered(cloud, Projection::Auto).unwrap(),
+            Nominal::from_triangulated_points(cloud, Projection::Auto).unwrap(),
         ] {
             for side in [Side::Normal, Side::Opposite] {
                 let surface = OffsetSurface::new(&nominal, 1.5, side).unwrap();
@@ -144,14 +144,14 @@ mod tests {
                         let (x, y) = (13.0 * (t * 0.613).sin(), 11.0 * (t * 0.377).cos());
                         Point::new(x, y, z(x, y) + side.sign() * (1.5 + 0.01 * t.sin()))
                     });
-                    let feet = points.map(|p| surface.foot(&p, Place::UNKNOWN));
-                    let mut places = feet.map(|f| f.place);
-                    let Some(four) = surface.four_feet(&side_by_side(&points), &mut places) else {
+                    let feet = points.map(|p| surface.project(&p, Place::UNKNOWN));
+                    let mut places = feet.map(|f| f.facet);
+                    let Some(four) = surface.project_x4(&side_by_side(&points), &mut places) else {
                         left += 1;
                         continue;
                     };
                     for (l, foot) in feet.iter().enumerate() {
-                        assert_eq!(places[l], foot.place);
+                        assert_eq!(places[l], foot.facet);
                         // The four-lane code groups a sum differently: the last bit may differ.
                         assert!((four.distance_mm.0[l] - foot.distance_mm).abs() < 1e-14);
                         assert!((0..3).all(|c| (four.normal[c].0[l] - foot.normal[c]).abs() < 1e-14));
@@ -168,18 +168,18 @@ mod tests {
         let nominal = Nominal::from_points(cloud.clone(), Projection::Auto).unwrap();
         let surface = OffsetSurface::new(&nominal, 0.5, Side::Normal).unwrap();
         let at = |x: f64| Point::new(x, 4.3, 0.5);
-        let place = surface.foot(&at(2.6), Place::UNKNOWN).place;
+        let place = surface.project(&at(2.6), Place::UNKNOWN).facet;
         let points = [at(2.6), at(3.6), at(8.1), at(0.2)];
         let mut places = [place; LANES];
-        assert!(surface.four_feet(&side_by_side(&points), &mut places).is_some());
-        assert_eq!(places, points.map(|p| surface.foot(&p, Place::UNKNOWN).place));
+        assert!(surface.project_x4(&side_by_side(&points), &mut places).is_some());
+        assert_eq!(places, points.map(|p| surface.project(&p, Place::UNKNOWN).facet));
         let beyond = [at(2.6), at(9.6), at(2.6), at(2.7)];
-        assert!(surface.four_feet(&side_by_side(&beyond), &mut [place; LANES]).is_none());
+        assert!(surface.project_x4(&side_by_side(&beyond), &mut [place; LANES]).is_none());
 
-        let mesh = Nominal::scattered(cloud, Projection::Auto).unwrap();
+        let mesh = Nominal::from_triangulated_points(cloud, Projection::Auto).unwrap();
         let surface = OffsetSurface::new(&mesh, 0.5, Side::Normal).unwrap();
-        let place = surface.foot(&at(2.6), Place::UNKNOWN).place;
-        assert!(surface.four_feet(&side_by_side(&[at(2.6); LANES]), &mut [place; LANES]).is_some());
-        assert!(surface.four_feet(&side_by_side(&points), &mut [place; LANES]).is_none());
+        let place = surface.project(&at(2.6), Place::UNKNOWN).facet;
+        assert!(surface.project_x4(&side_by_side(&[at(2.6); LANES]), &mut [place; LANES]).is_some());
+        assert!(surface.project_x4(&side_by_side(&points), &mut [place; LANES]).is_none());
     }
 }

@@ -26,11 +26,11 @@ pub(crate) struct GridLattice {
 
 /// Returns the points in grid order, with NaN at a node that has no point.
 pub(crate) fn in_grid_order(points: Vec<Point>, order: &GridOrder) -> Vec<Point> {
-    if order.is_in_order() {
+    if order.is_ordered() {
         return points;
     }
     let hole = Point::new(f64::NAN, f64::NAN, f64::NAN);
-    order.point_at.par_iter().map(|&i| if i == NO_POINT { hole } else { points[i as usize] }).collect()
+    order.point_indices.par_iter().map(|&i| if i == NO_POINT { hole } else { points[i as usize] }).collect()
 }
 
 impl GridLattice {
@@ -47,7 +47,7 @@ impl GridLattice {
     }
 
     /// Builds the triangles over a grid that is known to be regular in x and y and to have no hole.
-    pub(crate) fn whole(found: &GridInOrder) -> Self {
+    pub(crate) fn from_ordered_grid(found: &GridInOrder) -> Self {
         let [low, high] = found.corners;
         let per_mm = |k: usize, n: usize| (n - 1) as f64 / (high[k] - low[k]);
         Self {
@@ -245,7 +245,7 @@ pub(crate) fn grid_nodes(points: &[Point], lattice: &GridLattice) -> Vec<Vertex>
     let blocks: Vec<[Vertex; BLOCK]> = (0..points.len().div_ceil(BLOCK))
         .into_par_iter()
         .with_min_len(64)
-        .map(|block| arch.dispatch(Block { points, lattice, first: block * BLOCK }))
+        .map(|block| arch.dispatch(Block { points, topology: lattice, first: block * BLOCK }))
         .collect();
     let mut nodes = blocks.into_flattened();
     nodes.truncate(points.len());
@@ -257,7 +257,7 @@ const BLOCK: usize = 32;
 
 struct Block<'a> {
     points: &'a [Point],
-    lattice: &'a GridLattice,
+    topology: &'a GridLattice,
     first: usize,
 }
 
@@ -268,15 +268,15 @@ impl pulp::NullaryFnOnce for Block<'_> {
     fn call(self) -> [Vertex; BLOCK] {
         const NONE: Vertex = Vertex { point: Point::new(0.0, 0.0, 0.0), normal: Vector::new(0.0, 0.0, 0.0) };
         let mut nodes = [NONE; BLOCK];
-        let (columns, rows) = (self.lattice.columns(), self.lattice.rows());
+        let (columns, rows) = (self.topology.columns(), self.topology.rows());
         let (mut i, mut j) = (self.first % columns, self.first / columns);
         for (k, four) in nodes.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
             let node = self.first + k * LANES;
             let inner = i >= 2 && i + LANES + 2 <= columns && j >= 2 && j + 2 < rows;
-            if inner && self.lattice.present.is_empty() {
-                self.four_inside(node, four);
+            if inner && self.topology.present.is_empty() {
+                self.fit_inside_x4(node, four);
             } else {
-                self.four_anywhere(node, four);
+                self.fit_anywhere_x4(node, four);
             }
             i += LANES;
             if i >= columns {
@@ -290,8 +290,8 @@ impl pulp::NullaryFnOnce for Block<'_> {
 impl Block<'_> {
     /// Fits four nodes of one row of a grid without holes, none of them within two nodes of its border.
     #[inline(always)]
-    fn four_inside(&self, first: usize, nodes: &mut [Vertex; LANES]) {
-        let (u, v) = (self.central_derivative(first, 1), self.central_derivative(first, self.lattice.columns()));
+    fn fit_inside_x4(&self, first: usize, nodes: &mut [Vertex; LANES]) {
+        let (u, v) = (self.central_derivative(first, 1), self.central_derivative(first, self.topology.columns()));
         let n = cross(&u, &v);
         let normal = F64x4::unit(&n);
         for (l, node) in nodes.iter_mut().enumerate() {
@@ -304,20 +304,20 @@ impl Block<'_> {
     /// row.
     #[inline(always)]
     fn central_derivative(&self, node: usize, stride: usize) -> Vector3x4 {
-        let near = minus(&self.four_points(node + stride), &self.four_points(node - stride));
-        let far = minus(&self.four_points(node + 2 * stride), &self.four_points(node - 2 * stride));
+        let near = minus(&self.points_x4(node + stride), &self.points_x4(node - stride));
+        let far = minus(&self.points_x4(node + 2 * stride), &self.points_x4(node - 2 * stride));
         minus(&times(&near, F64x4::splat(2.0 / 3.0)), &times(&far, F64x4::splat(1.0 / 12.0)))
     }
 
     #[inline(always)]
-    fn four_points(&self, first: usize) -> Vector3x4 {
+    fn points_x4(&self, first: usize) -> Vector3x4 {
         let (four, _) = self.points[first..].split_first_chunk::<LANES>().expect("inside the grid");
         side_by_side(four)
     }
 
     #[inline(never)]
-    fn four_anywhere(&self, first: usize, nodes: &mut [Vertex; LANES]) {
-        let (points, lattice) = (self.points, self.lattice);
+    fn fit_anywhere_x4(&self, first: usize, nodes: &mut [Vertex; LANES]) {
+        let (points, lattice) = (self.points, self.topology);
         let (columns, rows) = (lattice.columns(), lattice.rows());
         for (l, vertex) in nodes.iter_mut().enumerate() {
             let node = (first + l).min(points.len() - 1);

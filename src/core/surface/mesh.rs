@@ -18,8 +18,8 @@ pub(crate) struct MeshLattice {
     /// Facet across the edge opposite to corner k; [`BORDER`] if there is none.
     neighbours: Vec<[u32; 3]>,
     /// One facet at each vertex; at a vertex on the border, the first one counter-clockwise.
-    facet_of: Vec<u32>,
-    starts: Nearest,
+    vertex_facets: Vec<u32>,
+    start_tree: Nearest,
     start_facets: Vec<u32>,
 }
 
@@ -59,10 +59,10 @@ impl MeshLattice {
                     let sum: Vector = corners[*f as usize].iter().map(|&c| points[c as usize].coords).sum();
                     (sum / 3.0).into()
                 };
-                (Nearest::of(start_facets.iter().map(centre)), start_facets)
+                (Nearest::new(start_facets.iter().map(centre)), start_facets)
             },
         );
-        Ok(Self { corners, neighbours, facet_of, starts, start_facets })
+        Ok(Self { corners, neighbours, vertex_facets: facet_of, start_tree: starts, start_facets })
     }
 
     /// Returns true if no triangle has a border edge: the mesh encloses a whole solid.
@@ -76,8 +76,8 @@ impl MeshLattice {
 
     /// Calls `visit` with each facet around a vertex and the index of the vertex in it, counter-clockwise.
     #[inline]
-    pub(crate) fn around(&self, vertex: u32, mut visit: impl FnMut(u32, usize)) {
-        let first = self.facet_of[vertex as usize];
+    pub(crate) fn visit_facets_around(&self, vertex: u32, mut visit: impl FnMut(u32, usize)) {
+        let first = self.vertex_facets[vertex as usize];
         let mut facet = first;
         // A fan is finite, but a mesh from a file may be connected to itself in invalid ways.
         for _ in 0..1024 {
@@ -98,9 +98,9 @@ impl MeshLattice {
 impl MeshLattice {
     /// Calls `visit` with each neighbour of a vertex once, counter-clockwise.
     #[inline]
-    pub(crate) fn neighbours_of(&self, vertex: u32, mut visit: impl FnMut(u32)) {
+    pub(crate) fn visit_neighbours(&self, vertex: u32, mut visit: impl FnMut(u32)) {
         let mut last = None;
-        self.around(vertex, |facet, k| {
+        self.visit_facets_around(vertex, |facet, k| {
             visit(self.corners[facet as usize][(k + 1) % 3]);
             last = Some((facet as usize, k));
         });
@@ -124,7 +124,7 @@ impl MeshLattice {
     pub(crate) fn two_rings<const N: usize>(&self, vertex: u32, ring: &mut [u32; N]) -> Option<[usize; 2]> {
         let place = |facet: u32, of: u32| self.corners[facet as usize].iter().position(|&c| c == of);
         let mut beyond = [BORDER; N];
-        let (begin, mut first) = (self.facet_of[vertex as usize], 0);
+        let (begin, mut first) = (self.vertex_facets[vertex as usize], 0);
         let mut facet = begin;
         while facet != BORDER && first < N {
             let k = place(facet, vertex)?;
@@ -186,7 +186,7 @@ impl Facets for MeshLattice {
     }
 
     fn start(&self, p: &Point) -> u32 {
-        let nearest = self.starts.to(p, 1).next();
+        let nearest = self.start_tree.nearest(p, 1).next();
         nearest.map_or(0, |(k, _)| self.start_facets[k])
     }
 }
@@ -271,7 +271,7 @@ mod tests {
         let mesh = MeshLattice::new(&points, corners).unwrap();
         let met = |vertex| {
             let mut facets = Vec::new();
-            mesh.around(vertex, |f, _| facets.push(f));
+            mesh.visit_facets_around(vertex, |f, _| facets.push(f));
             facets.sort_unstable();
             facets
         };

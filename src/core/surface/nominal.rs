@@ -30,7 +30,7 @@ pub struct Nominal {
     /// Rms distances of the points from their centroid and from their best-fit plane.
     extent_mm: OnceLock<[f64; 2]>,
     /// Some of the points and a facet at each; made when a search for a foot has no start.
-    starts: OnceLock<(Nearest, Vec<Place>)>,
+    start_facets: OnceLock<(Nearest, Vec<Place>)>,
 }
 
 /// Source that a nominal surface was made from.
@@ -66,36 +66,36 @@ impl Nominal {
     /// Returns an error if there are too few points, a coordinate is not finite, two points coincide, the points lie on
     /// one line, one point is far off the others, or no projection is one-to-one.
     pub fn from_points(points: Vec<Point>, projection: Projection) -> Result<Self, SurfaceError> {
-        const LEAST: usize = 9;
-        if points.len() < LEAST {
-            return Err(SurfaceError::TooFewPoints { points: points.len(), least: LEAST });
+        const MIN_POINTS: usize = 9;
+        if points.len() < MIN_POINTS {
+            return Err(SurfaceError::TooFewPoints { points: points.len(), min_points: MIN_POINTS });
         }
         let may_be_grid = matches!(projection, Projection::Auto | Projection::Xy);
         if may_be_grid && let Some(found) = grid_in_order(&points) {
-            return Ok(Self::grid(GridLattice::whole(&found), &points));
+            return Ok(Self::from_grid_topology(GridLattice::from_ordered_grid(&found), &points));
         }
         if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
             return Err(SurfaceError::NotFinite { index });
         }
         if may_be_grid && let Some(order) = recognise_grid(&points) {
             let points = in_grid_order(points, &order);
-            return Ok(Self::grid(GridLattice::new(order.columns, order.rows, &points, true), &points));
+            return Ok(Self::from_grid_topology(GridLattice::new(order.columns, order.rows, &points, true), &points));
         }
-        Self::scattered(points, projection)
+        Self::from_triangulated_points(points, projection)
     }
 
     /// Makes a surface from points by triangulation, even if they form a grid.
     ///
     /// # Errors
     /// Returns the same errors as [`Nominal::from_points`].
-    pub fn scattered(points: Vec<Point>, projection: Projection) -> Result<Self, SurfaceError> {
+    pub fn from_triangulated_points(points: Vec<Point>, projection: Projection) -> Result<Self, SurfaceError> {
         if points.len() > 3 && is_line(&points) {
             return Err(SurfaceError::Collinear { points: points.len() });
         }
-        let (projection, map) = projection.prepare(&points)?;
+        let (projection, map) = projection.choose(&points)?;
         let (points, triangles) = delaunay::triangulate(&points, &map)?;
         let lattice = MeshLattice::from_parts(&points, triangles.corners, triangles.neighbours)?;
-        Ok(Self::of(Patch::mesh(points, lattice), NominalKind::Scattered { projection }))
+        Ok(Self::new(Patch::mesh(points, lattice), NominalKind::Scattered { projection }))
     }
 
     /// Makes a surface from a structured grid of points, one for each pair of parameters (u, v).
@@ -107,7 +107,7 @@ impl Nominal {
     /// Returns an error if the number of points is not `columns * rows`, or if an axis has fewer than 3 nodes.
     pub fn from_parameter_grid(columns: usize, rows: usize, points: Vec<Point>) -> Result<Self, SurfaceError> {
         check_grid(columns, rows, points.len())?;
-        Ok(Self::grid(GridLattice::new(columns, rows, &points, false), &points))
+        Ok(Self::from_grid_topology(GridLattice::new(columns, rows, &points, false), &points))
     }
 
     /// Makes a surface from a regular xy grid of points whose unit normals are known.
@@ -123,7 +123,7 @@ impl Nominal {
         check_grid(columns, rows, points.len().min(normals.len()))?;
         let lattice = GridLattice::new(columns, rows, &points, true);
         let nodes = points.into_par_iter().zip(normals).map(|(point, normal)| Vertex { point, normal }).collect();
-        Ok(Self::of(Patch::grid(nodes, lattice), NominalKind::Grid { columns, rows }))
+        Ok(Self::new(Patch::grid(nodes, lattice), NominalKind::Grid { columns, rows }))
     }
 
     /// Makes a surface from a mesh. The normals are on the side from which the triangles turn counter-clockwise.
@@ -136,7 +136,7 @@ impl Nominal {
             return Err(SurfaceError::NotFinite { index });
         }
         let lattice = MeshLattice::new(&points, triangles)?;
-        Ok(Self::of(Patch::mesh(points, lattice), NominalKind::Mesh))
+        Ok(Self::new(Patch::mesh(points, lattice), NominalKind::Mesh))
     }
 
     /// Joins several surfaces into one of several patches. A point belongs to the patch that its foot lies on.
@@ -155,7 +155,7 @@ impl Nominal {
             outline: None,
             features: OnceLock::new(),
             extent_mm: OnceLock::new(),
-            starts: OnceLock::new(),
+            start_facets: OnceLock::new(),
         })
     }
 
@@ -164,19 +164,19 @@ impl Nominal {
         Self { outline: Some(outline), ..self }
     }
 
-    fn grid(lattice: GridLattice, points: &[Point]) -> Self {
+    fn from_grid_topology(lattice: GridLattice, points: &[Point]) -> Self {
         let kind = NominalKind::Grid { columns: lattice.columns(), rows: lattice.rows() };
-        Self::of(Patch::grid(grid_nodes(points, &lattice), lattice), kind)
+        Self::new(Patch::grid(grid_nodes(points, &lattice), lattice), kind)
     }
 
-    fn of(patch: Patch, kind: NominalKind) -> Self {
+    fn new(patch: Patch, kind: NominalKind) -> Self {
         Self {
             patches: vec![patch],
             kind,
             outline: None,
             features: OnceLock::new(),
             extent_mm: OnceLock::new(),
-            starts: OnceLock::new(),
+            start_facets: OnceLock::new(),
         }
     }
 
@@ -243,7 +243,7 @@ impl Nominal {
     }
 
     /// Returns the steepest slope against the xy plane among some places spread over the surface, in radians.
-    pub fn steepest_rad(&self) -> f64 {
+    pub fn max_slope_rad(&self) -> f64 {
         let normals = self.sampled_vertices(SAMPLE).into_iter().map(|(_, n)| n.z.clamp(-1.0, 1.0).acos());
         normals.fold(0.0, f64::max)
     }
@@ -283,10 +283,10 @@ impl Nominal {
     /// Returns the estimated error of fitted normals, in radians; 0 for a grid and for given normals.
     ///
     /// The estimate is the rms change of the normal when the fit asks for twice as many neighbours.
-    pub(crate) fn normal_error(&self) -> f64 {
+    pub(crate) fn normal_error_rad(&self) -> f64 {
         let (mut sum, mut count) = (0.0, 0);
         for patch in self.patches.iter().filter(|p| p.has_scattered_normals()) {
-            let Lattice::Mesh(mesh) = &patch.lattice else { continue };
+            let Lattice::Mesh(mesh) = &patch.topology else { continue };
             for vertex in patch.sample(256) {
                 let wider = normals::fit_to_ring(patch.mesh_points(), mesh, vertex, 2 * normals::NEIGHBOURS);
                 sum += (wider.normal - patch.normal(vertex)).norm_squared();
@@ -298,38 +298,38 @@ impl Nominal {
 
     /// Returns the standard deviation of the noise of the points along the normal, about a smooth surface, in
     /// millimetres; 0 if the points show no noise.
-    pub(crate) fn scatter_mm(&self) -> f64 {
+    pub(crate) fn noise_sigma_mm(&self) -> f64 {
         roughness::scatter_mm(&self.patches)
     }
 
     /// Returns facets at the points of the surface that are nearest to a place, by distance in space and not along a
     /// projection.
-    pub(crate) fn places_near(&self, p: &Point) -> impl Iterator<Item = Place> {
+    pub(crate) fn facets_near(&self, p: &Point) -> impl Iterator<Item = Place> {
         /// Number of points in the search tree, and number of places returned.
-        const KEPT: usize = 20_000;
-        const TOLD: u32 = 3;
-        let (nearest, places) = self.starts.get_or_init(|| {
-            let share = (KEPT / self.patches.len()).max(1);
+        const TREE_POINTS: usize = 20_000;
+        const RETURNED: u32 = 3;
+        let (nearest, places) = self.start_facets.get_or_init(|| {
+            let share = (TREE_POINTS / self.patches.len()).max(1);
             let of_patch = |(number, patch): (usize, &Patch)| {
-                let place = move |vertex| (*patch.point(vertex), Place::on(number as u32, patch.facet_at(vertex)));
+                let place = move |vertex| (*patch.point(vertex), Place::new(number as u32, patch.facet_at(vertex)));
                 patch.sample(share).map(place).collect::<Vec<_>>()
             };
             let (points, places): (Vec<Point>, Vec<Place>) = self.patches.iter().enumerate().flat_map(of_patch).unzip();
-            (Nearest::of(points.into_iter()), places)
+            (Nearest::new(points.into_iter()), places)
         });
-        nearest.to(p, TOLD).map(|(k, _)| places[k])
+        nearest.nearest(p, RETURNED).map(|(k, _)| places[k])
     }
 
     /// Returns the surface made of every second node of its grid; `None` if it is not a single grid or would have too
     /// few nodes.
-    pub(crate) fn every_second(&self) -> Option<Self> {
+    pub(crate) fn coarsened(&self) -> Option<Self> {
         let [patch] = &self.patches[..] else { return None };
-        let Lattice::Grid(grid) = &patch.lattice else { return None };
+        let Lattice::Grid(grid) = &patch.topology else { return None };
         let [columns, rows] = [grid.columns(), grid.rows()].map(|nodes| nodes.div_ceil(2));
         let node = |k: usize| *patch.point((2 * (k / columns) * grid.columns() + 2 * (k % columns)) as u32);
         let points: Vec<Point> = (0..columns * rows).map(node).collect();
         check_grid(columns, rows, points.len()).ok()?;
-        Some(Self::grid(GridLattice::new(columns, rows, &points, grid.is_regular()), &points))
+        Some(Self::from_grid_topology(GridLattice::new(columns, rows, &points, grid.is_regular()), &points))
     }
 
     /// Returns the curvature features at some places spread over the surface.

@@ -67,7 +67,7 @@ pub(crate) fn fit(at: Point, mean: Vector, neighbours: impl Iterator<Item = Poin
 /// depend on the other three vertices.
 #[inline(always)]
 pub(crate) fn four_normals(points: &[Point], mesh: &MeshLattice, vertices: &[u32; LANES]) -> [Vector; LANES] {
-    let mut rings = Rings { local: [[F64x4::splat(0.0); 3]; MOST], most: 0 };
+    let mut rings = Rings { local: [[F64x4::splat(0.0); 3]; MOST], max_count: 0 };
     let mut last = (None, [Vector::zeros(); 3]);
     let frames: [[Vector; 3]; LANES] = std::array::from_fn(|l| {
         if last.0 == Some(vertices[l]) {
@@ -92,7 +92,7 @@ pub(crate) fn four_normals(points: &[Point], mesh: &MeshLattice, vertices: &[u32
 /// padded with zeros.
 struct Rings {
     local: [Vector3x4; MOST],
-    most: usize,
+    max_count: usize,
 }
 
 impl Rings {
@@ -115,13 +115,13 @@ impl Rings {
         for c in self.local[..count].iter_mut().flatten() {
             c.0[lane] *= per_mean;
         }
-        self.most = self.most.max(count);
+        self.max_count = self.max_count.max(count);
         [mean, tu, tv]
     }
 
     /// Copies the previous lane into a lane.
     fn repeat(&mut self, lane: usize) {
-        for c in self.local[..self.most].iter_mut().flatten() {
+        for c in self.local[..self.max_count].iter_mut().flatten() {
             c.0[lane] = c.0[lane - 1];
         }
     }
@@ -134,7 +134,7 @@ impl Rings {
         let one = F64x4::splat(1.0);
         let mut moments = [F64x4::splat(0.0); MOMENTS];
         let mut right = [F64x4::splat(0.0); TERMS.len()];
-        for [u, v, w] in &self.local[..self.most] {
+        for [u, v, w] in &self.local[..self.max_count] {
             let weight = one / (one + *u * *u + *v * *v);
             let powers = monomials::<MOMENTS>([weight * *u * *u, weight * *u * *v, weight * *v * *v], *u, *v);
             for (sum, power) in moments.iter_mut().zip(powers) {
@@ -337,7 +337,7 @@ fn neighbours(mesh: &MeshLattice, vertex: u32, wanted: usize, ring: &mut [u32; M
 /// Adds the neighbours of one vertex that are not in the ring yet; returns the new number.
 #[inline(always)]
 fn add_around(mesh: &MeshLattice, of: u32, vertex: u32, ring: &mut [u32; MOST], mut count: usize) -> usize {
-    mesh.neighbours_of(of, |candidate| {
+    mesh.visit_neighbours(of, |candidate| {
         if candidate != vertex && count < MOST && !ring[..count].contains(&candidate) {
             ring[count] = candidate;
             count += 1;
@@ -349,7 +349,7 @@ fn add_around(mesh: &MeshLattice, of: u32, vertex: u32, ring: &mut [u32; MOST], 
 /// Returns the unit mean of the normals of the facets around a vertex, weighted by area; z if there is none.
 fn mean_facet_normal(points: &[Point], mesh: &MeshLattice, vertex: u32) -> Vector {
     let mut sum = Vector::zeros();
-    mesh.around(vertex, |facet, _| {
+    mesh.visit_facets_around(vertex, |facet, _| {
         let [a, b, c] = mesh.corners(facet).map(|i| points[i as usize]);
         sum += (b - a).cross(&(c - a));
     });
@@ -416,7 +416,7 @@ mod tests {
     #[test]
     fn the_rings_are_those_of_going_round_every_neighbour() {
         let points: Vec<Point> = around(Point::origin(), |x, y| 0.1 * x * y, 600);
-        let map = crate::surface::projection::Projection::Xy.prepare(&points).unwrap().1;
+        let map = crate::surface::projection::Projection::Xy.choose(&points).unwrap().1;
         let (points, t) = crate::surface::delaunay::triangulate(&points, &map).unwrap();
         let mesh = MeshLattice::from_parts(&points, t.corners, t.neighbours).unwrap();
         let mut inside = 0;
@@ -444,7 +444,7 @@ mod tests {
     fn four_normals_are_those_of_one_at_a_time() {
         let z = |x: f64, y: f64| 0.3 * x - 0.02 * x * y + 0.01 * y * y * y;
         let points: Vec<Point> = around(Point::origin(), z, 400);
-        let map = crate::surface::projection::Projection::Xy.prepare(&points).unwrap().1;
+        let map = crate::surface::projection::Projection::Xy.choose(&points).unwrap().1;
         let (points, t) = crate::surface::delaunay::triangulate(&points, &map).unwrap();
         let mesh = MeshLattice::from_parts(&points, t.corners, t.neighbours).unwrap();
         for v in 0..points.len() as u32 {

@@ -26,9 +26,9 @@ pub enum Distance {
 pub(crate) enum Lookup {
     /// The facet that holds the foot of the point's perpendicular.
     #[default]
-    Foot,
+    ContainingFacet,
     /// The facet that the point lies above or below along z, as in section 2.1 of the paper.
-    Projection,
+    AlongZ,
 }
 
 /// Offset of a nominal surface: a view that holds no points of its own.
@@ -38,7 +38,7 @@ pub struct OffsetSurface<'a> {
     /// Distance from the nominal surface along the outward normal, in millimetres.
     radius_mm: f64,
     side: Side,
-    distance: Distance,
+    distance_model: Distance,
     lookup: Lookup,
 }
 
@@ -54,12 +54,12 @@ impl Place {
     pub const UNKNOWN: Self = Self { patch: 0, facet: u32::MAX };
 
     /// Returns the place of a facet of a patch.
-    pub(crate) fn on(patch: u32, facet: u32) -> Self {
+    pub(crate) fn new(patch: u32, facet: u32) -> Self {
         Self { patch, facet }
     }
 
     /// Returns the place of a facet of a surface with a single patch.
-    pub(crate) fn on_first_patch(facet: u32) -> Self {
+    pub(crate) fn in_first_patch(facet: u32) -> Self {
         Self { patch: 0, facet }
     }
 
@@ -76,21 +76,21 @@ impl Place {
 #[derive(Clone, Copy, Debug)]
 pub struct Foot {
     /// Facet that holds the foot.
-    pub place: Place,
+    pub facet: Place,
     /// Signed distance of the point from the offset surface, in millimetres; positive on the probe's side.
     pub distance_mm: f64,
     /// Unit normal at the foot, towards the probe's side.
     pub normal: Vector,
     /// Distance of the foot beyond the edge of the surface, in millimetres; 0 on the part.
-    pub beyond_mm: f64,
+    pub beyond_edge_mm: f64,
     /// The same distance, in steps of the nominal sampling.
-    pub beyond_steps: f64,
+    pub beyond_edge_steps: f64,
 }
 
 impl Foot {
     /// Orders feet by their distance beyond an edge, then by the absolute distance of the point.
     fn by_nearness(&self, other: &Self) -> std::cmp::Ordering {
-        self.beyond_mm.total_cmp(&other.beyond_mm).then(self.distance_mm.abs().total_cmp(&other.distance_mm.abs()))
+        self.beyond_edge_mm.total_cmp(&other.beyond_edge_mm).then(self.distance_mm.abs().total_cmp(&other.distance_mm.abs()))
     }
 }
 
@@ -116,12 +116,12 @@ impl<'a> OffsetSurface<'a> {
         if !(radius_mm >= 0.0 && radius_mm.is_finite()) {
             return Err(SurfaceError::ProbeRadius { radius_mm });
         }
-        Ok(Self { nominal, radius_mm, side, distance: Distance::default(), lookup: Lookup::default() })
+        Ok(Self { nominal, radius_mm, side, distance_model: Distance::default(), lookup: Lookup::default() })
     }
 
     /// Sets how the surface runs between the corners.
-    pub fn with_distance(self, distance: Distance) -> Self {
-        Self { distance, ..self }
+    pub fn with_distance_model(self, distance: Distance) -> Self {
+        Self { distance_model: distance, ..self }
     }
 
     /// Sets the rule that assigns a point to a facet.
@@ -139,8 +139,8 @@ impl<'a> OffsetSurface<'a> {
         self.radius_mm
     }
 
-    pub(crate) fn distance(&self) -> Distance {
-        self.distance
+    pub(crate) fn distance_model(&self) -> Distance {
+        self.distance_model
     }
 
     pub(crate) fn lookup(&self) -> Lookup {
@@ -165,10 +165,10 @@ impl<'a> OffsetSurface<'a> {
     /// Beyond the edge the surface is continued: by its own facet for half a step of the sampling, then by the tangent
     /// plane at the nearest point of the edge.
     #[inline]
-    pub fn foot(&self, p: &Point, start: Place) -> Foot {
+    pub fn project(&self, p: &Point, start: Place) -> Foot {
         match self.nominal.patches() {
-            [only] => self.foot_on(only, 0, p, start),
-            patches => self.nearest_foot(patches, p, start),
+            [only] => self.project_onto_patch(only, 0, p, start),
+            patches => self.nearest_projection(patches, p, start),
         }
     }
 
@@ -177,18 +177,18 @@ impl<'a> OffsetSurface<'a> {
     ///
     /// The offsets of patches that only touch leave a gap over a convex seam. If a foot is slightly beyond two patches
     /// at about the same height, it lies in that gap, and therefore on the part.
-    fn nearest_foot(&self, patches: &[Patch], p: &Point, start: Place) -> Foot {
+    fn nearest_projection(&self, patches: &[Patch], p: &Point, start: Place) -> Foot {
         let feet: Vec<Foot> =
-            patches.iter().enumerate().map(|(k, patch)| self.foot_on(patch, k as u32, p, start)).collect();
+            patches.iter().enumerate().map(|(k, patch)| self.project_onto_patch(patch, k as u32, p, start)).collect();
         let best = feet.iter().copied().min_by(Foot::by_nearness).expect("a nominal surface has at least one patch");
         let is_at_seam = |other: &Foot| {
             let apart_mm = (other.distance_mm - best.distance_mm).abs();
-            other.place.patch != best.place.patch
-                && other.beyond_steps <= EDGE_REACH
-                && apart_mm <= EDGE_REACH * self.spacing_mm(best.place)
+            other.facet.patch != best.facet.patch
+                && other.beyond_edge_steps <= EDGE_REACH
+                && apart_mm <= EDGE_REACH * self.spacing_mm(best.facet)
         };
-        if best.beyond_steps > 0.0 && best.beyond_steps <= EDGE_REACH && feet.iter().any(is_at_seam) {
-            return Foot { beyond_mm: 0.0, beyond_steps: 0.0, ..best };
+        if best.beyond_edge_steps > 0.0 && best.beyond_edge_steps <= EDGE_REACH && feet.iter().any(is_at_seam) {
+            return Foot { beyond_edge_mm: 0.0, beyond_edge_steps: 0.0, ..best };
         }
         best
     }
@@ -199,20 +199,20 @@ impl<'a> OffsetSurface<'a> {
     /// A search walks downhill. In a gutter that starts from the wrong wall, it ends at a foot on the other side, where
     /// no neighbour is nearer.
     #[cold]
-    pub(crate) fn foot_from_anywhere(&self, p: &Point) -> Foot {
+    pub(crate) fn project_without_start(&self, p: &Point) -> Foot {
         let found = self
             .nominal
-            .places_near(p)
-            .map(|start| self.foot_on(&self.nominal.patches()[start.patch as usize], start.patch, p, start));
-        found.min_by(Foot::by_nearness).unwrap_or_else(|| self.foot(p, Place::UNKNOWN))
+            .facets_near(p)
+            .map(|start| self.project_onto_patch(&self.nominal.patches()[start.patch as usize], start.patch, p, start));
+        found.min_by(Foot::by_nearness).unwrap_or_else(|| self.project(p, Place::UNKNOWN))
     }
 
     #[inline]
-    fn foot_on(&self, patch: &Patch, number: u32, p: &Point, start: Place) -> Foot {
+    fn project_onto_patch(&self, patch: &Patch, number: u32, p: &Point, start: Place) -> Foot {
         let start = if start.patch == number { start.facet } else { u32::MAX };
-        match &patch.lattice {
-            Lattice::Grid(grid) => self.search(patch, grid, number, p, start),
-            Lattice::Mesh(mesh) => self.search(patch, mesh, number, p, start),
+        match &patch.topology {
+            Lattice::Grid(grid) => self.search_projection(patch, grid, number, p, start),
+            Lattice::Mesh(mesh) => self.search_projection(patch, mesh, number, p, start),
         }
     }
 
@@ -243,13 +243,13 @@ impl<'a> OffsetSurface<'a> {
     }
 
     /// Finds a facet of the first patch near the foot of a point, without fitting its normals.
-    pub(super) fn place_near<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: Place) -> Place {
+    pub(super) fn facet_near<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: Place) -> Place {
         Place { patch: 0, facet: self.approach(patch, facets, p, start.facet) }
     }
 
     /// Walks from facet to facet until one holds the foot, then measures the distance there.
     #[inline]
-    fn search<F: Facets>(&self, patch: &Patch, facets: &F, number: u32, p: &Point, start: u32) -> Foot {
+    fn search_projection<F: Facets>(&self, patch: &Patch, facets: &F, number: u32, p: &Point, start: u32) -> Foot {
         let mut facet = self.approach(patch, facets, p, start);
         let mut before = u32::MAX;
         for _ in 0..MOST_STEPS {
@@ -268,12 +268,12 @@ impl<'a> OffsetSurface<'a> {
                     // At the border this holds only along the common edge: a foot beyond a border edge is not inside.
                     let is_beyond = |k: usize| weights[k] < INSIDE && facets.ends_at(facet, k);
                     let inside = inside || next.is_some() && !(0..3).any(is_beyond);
-                    return self.foot_in(&here, p, weights, inside, Place { patch: number, facet });
+                    return self.project_in_facet(&here, p, weights, inside, Place { patch: number, facet });
                 }
             }
         }
         let here = self.facet(patch, facets.corners(facet));
-        self.foot_in(&here, p, self.weights(&here, p), true, Place { patch: number, facet })
+        self.project_in_facet(&here, p, self.weights(&here, p), true, Place { patch: number, facet })
     }
 
     /// Returns a facet with its corners on the offset surface.
@@ -287,39 +287,39 @@ impl<'a> OffsetSurface<'a> {
     /// Returns the barycentric weights of the foot on the plane of the flat facet.
     #[inline(always)]
     fn weights(&self, facet: &Facet<f64>, p: &Point) -> [f64; 3] {
-        let mut w = facet.seen_from(0, &p.coords.into());
-        if self.lookup == Lookup::Projection {
-            w[2] -= dot(&w, &facet.turned) / facet.turned[2];
+        let mut w = facet.vector_from_corner(0, &p.coords.into());
+        if self.lookup == Lookup::AlongZ {
+            w[2] -= dot(&w, &facet.area_normal) / facet.area_normal[2];
         }
         facet.weights(&w)
     }
 
     #[inline(always)]
-    fn foot_in(&self, facet: &Facet<f64>, p: &Point, weights: [f64; 3], inside: bool, place: Place) -> Foot {
-        let w = facet.seen_from(0, &p.coords.into());
+    fn project_in_facet(&self, facet: &Facet<f64>, p: &Point, weights: [f64; 3], inside: bool, place: Place) -> Foot {
+        let w = facet.vector_from_corner(0, &p.coords.into());
         let (mut beyond_mm, mut beyond_steps) = (0.0, 0.0);
         if !inside {
             let clamped = clamped(facet, &p.coords.into(), &weights);
-            let beyond = minus(&facet.at(&clamped), &facet.at(&weights));
+            let beyond = minus(&facet.point(&clamped), &facet.point(&weights));
             beyond_mm = dot(&beyond, &beyond).sqrt();
-            beyond_steps = beyond_mm / facet.squared.sqrt().sqrt();
+            beyond_steps = beyond_mm / facet.area_normal_squared.sqrt().sqrt();
             if beyond_steps > EDGE_REACH {
-                let (distance_mm, normal) = self.over_tangent_plane(facet, p, &clamped);
-                return Foot { place, distance_mm, normal, beyond_mm, beyond_steps };
+                let (distance_mm, normal) = self.tangent_plane_distance(facet, p, &clamped);
+                return Foot { facet: place, distance_mm, normal, beyond_edge_mm: beyond_mm, beyond_edge_steps: beyond_steps };
             }
         }
-        let (distance_mm, normal) = match self.distance {
+        let (distance_mm, normal) = match self.distance_model {
             Distance::Triangle => facet.flat_distance(&w),
             Distance::Curved => facet.curved_distance(&w, &weights),
         };
-        Foot { place, distance_mm, normal: normal.into(), beyond_mm, beyond_steps }
+        Foot { facet: place, distance_mm, normal: normal.into(), beyond_edge_mm: beyond_mm, beyond_edge_steps: beyond_steps }
     }
 
     /// Returns the distance from the tangent plane at a place of the edge, and the normal of that plane.
     #[cold]
-    fn over_tangent_plane(&self, facet: &Facet<f64>, p: &Point, at: &[f64; 3]) -> (f64, Vector) {
-        let (on_flat, flat) = (Vector::from(facet.at(at)), Vector::from(facet.flat_normal()));
-        let (anchor, normal) = match self.distance {
+    fn tangent_plane_distance(&self, facet: &Facet<f64>, p: &Point, at: &[f64; 3]) -> (f64, Vector) {
+        let (on_flat, flat) = (Vector::from(facet.point(at)), Vector::from(facet.flat_normal()));
+        let (anchor, normal) = match self.distance_model {
             Distance::Triangle => (on_flat, flat),
             Distance::Curved => (on_flat + flat * facet.height(at), facet.normal(at).into()),
         };
@@ -332,7 +332,7 @@ fn clamped(facet: &Facet<f64>, p: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
     let k = (0..3).min_by(|&i, &j| b[i].total_cmp(&b[j])).expect("three weights");
     let (i, j) = ((k + 1) % 3, (k + 2) % 3);
     let edge = facet.edge(i, j);
-    let t = (dot(&facet.seen_from(i, p), &edge) / dot(&edge, &edge)).clamp(0.0, 1.0);
+    let t = (dot(&facet.vector_from_corner(i, p), &edge) / dot(&edge, &edge)).clamp(0.0, 1.0);
     let mut clamped = [0.0; 3];
     (clamped[i], clamped[j]) = (1.0 - t, t);
     clamped

@@ -19,7 +19,7 @@ use super::simd::LANES;
 /// Smooth piece of surface that one lattice of triangles covers.
 #[derive(Debug)]
 pub(crate) struct Patch {
-    pub(crate) lattice: Lattice,
+    pub(crate) topology: Lattice,
     vertices: Vertices,
 }
 
@@ -35,18 +35,18 @@ pub(crate) enum Lattice {
 #[derive(Debug)]
 enum Vertices {
     Ready(Vec<Vertex>),
-    WhenTouched(Vec<Point>, Vec<NormalCell>),
+    Lazy(Vec<Point>, Vec<NormalCell>),
 }
 
 impl Patch {
     /// Makes a patch from a grid and its nodes, whose normals are all known.
     pub(crate) fn grid(nodes: Vec<Vertex>, lattice: GridLattice) -> Self {
-        Self { lattice: Lattice::Grid(lattice), vertices: Vertices::Ready(nodes) }
+        Self { topology: Lattice::Grid(lattice), vertices: Vertices::Ready(nodes) }
     }
 
     /// Returns the number of triangles of a mesh that has no border; `None` for other patches.
     pub(crate) fn closed_triangles(&self) -> Option<usize> {
-        match &self.lattice {
+        match &self.topology {
             Lattice::Mesh(mesh) if mesh.is_closed() => Some(mesh.facet_count() as usize),
             _ => None,
         }
@@ -55,14 +55,14 @@ impl Patch {
     /// Makes a patch from a mesh whose normals are fitted when a triangle is first touched.
     pub(crate) fn mesh(points: Vec<Point>, lattice: MeshLattice) -> Self {
         let cells = points.par_iter().map(|_| NormalCell::unknown()).collect();
-        Self { lattice: Lattice::Mesh(lattice), vertices: Vertices::WhenTouched(points, cells) }
+        Self { topology: Lattice::Mesh(lattice), vertices: Vertices::Lazy(points, cells) }
     }
 
     /// Returns the number of vertices, holes of a grid included.
     pub(crate) fn len(&self) -> usize {
         match &self.vertices {
             Vertices::Ready(nodes) => nodes.len(),
-            Vertices::WhenTouched(points, _) => points.len(),
+            Vertices::Lazy(points, _) => points.len(),
         }
     }
 
@@ -71,7 +71,7 @@ impl Patch {
     pub(crate) fn point(&self, vertex: u32) -> &Point {
         match &self.vertices {
             Vertices::Ready(nodes) => &nodes[vertex as usize].point,
-            Vertices::WhenTouched(points, _) => &points[vertex as usize],
+            Vertices::Lazy(points, _) => &points[vertex as usize],
         }
     }
 
@@ -86,7 +86,7 @@ impl Patch {
     pub(crate) fn vertex(&self, vertex: u32) -> Vertex {
         match &self.vertices {
             Vertices::Ready(nodes) => nodes[vertex as usize],
-            Vertices::WhenTouched(points, cells) => {
+            Vertices::Lazy(points, cells) => {
                 let cell = &cells[vertex as usize];
                 let normal = cell.get().unwrap_or_else(|| cell.set(self.fitted_normal(vertex)));
                 Vertex { point: points[vertex as usize], normal }
@@ -97,7 +97,7 @@ impl Patch {
     /// Returns about `count` vertices, spread over the patch, without holes.
     pub(crate) fn sample(&self, count: usize) -> impl Iterator<Item = u32> {
         let n = self.len();
-        let (columns, step_i, step_j) = match &self.lattice {
+        let (columns, step_i, step_j) = match &self.topology {
             Lattice::Grid(grid) => {
                 let step = ((n as f64 / count as f64).sqrt() as usize).clamp(1, grid.columns().min(grid.rows()) / 3);
                 (grid.columns(), step, step)
@@ -112,7 +112,7 @@ impl Patch {
 
     /// Returns a facet at a vertex, or near a vertex that has no facet.
     pub(crate) fn facet_at(&self, vertex: u32) -> u32 {
-        match &self.lattice {
+        match &self.topology {
             Lattice::Grid(grid) => grid.facet_near(vertex),
             Lattice::Mesh(mesh) => mesh.start(self.point(vertex)),
         }
@@ -120,14 +120,14 @@ impl Patch {
 
     /// Returns true if the normals are fitted to scattered neighbours, and not given or exact.
     pub(crate) fn has_scattered_normals(&self) -> bool {
-        matches!(self.vertices, Vertices::WhenTouched(..))
+        matches!(self.vertices, Vertices::Lazy(..))
     }
 
     /// Returns the nodes of a grid, whose normals are all known; returns an empty slice for a mesh.
     pub(crate) fn nodes(&self) -> &[Vertex] {
         match &self.vertices {
             Vertices::Ready(nodes) => nodes,
-            Vertices::WhenTouched(..) => &[],
+            Vertices::Lazy(..) => &[],
         }
     }
 
@@ -135,13 +135,13 @@ impl Patch {
     pub(crate) fn mesh_points(&self) -> &[Point] {
         match &self.vertices {
             Vertices::Ready(_) => &[],
-            Vertices::WhenTouched(points, _) => points,
+            Vertices::Lazy(points, _) => points,
         }
     }
 
     #[cold]
     fn fitted_normal(&self, vertex: u32) -> Vector {
-        match &self.lattice {
+        match &self.topology {
             Lattice::Mesh(mesh) => pulp::Arch::new().dispatch(Four { patch: self, mesh, vertices: [vertex; LANES] })[0],
             Lattice::Grid(_) => unreachable!("a grid has its normals ready"),
         }
@@ -152,7 +152,7 @@ impl Patch {
     pub(crate) fn fit_normals(&self, vertices: &[u32]) {
         /// Number of vertices per task.
         const CHUNK: usize = 256;
-        let (Vertices::WhenTouched(_, cells), Lattice::Mesh(mesh)) = (&self.vertices, &self.lattice) else { return };
+        let (Vertices::Lazy(_, cells), Lattice::Mesh(mesh)) = (&self.vertices, &self.topology) else { return };
         let arch = pulp::Arch::new();
         vertices.par_chunks(CHUNK).for_each(|chunk| {
             let unknown: Vec<u32> = chunk.iter().copied().filter(|&v| cells[v as usize].get().is_none()).collect();
@@ -168,7 +168,7 @@ impl Patch {
 
     /// Returns the corners of a facet that exists.
     pub(crate) fn corners(&self, facet: u32) -> [u32; 3] {
-        match &self.lattice {
+        match &self.topology {
             Lattice::Grid(grid) => grid.corners(facet),
             Lattice::Mesh(mesh) => mesh.corners(facet),
         }

@@ -19,7 +19,7 @@ const NEAR_STEPS: f64 = 24.0;
 
 impl OffsetSurface<'_> {
     /// Returns true if normals are fitted where the surface is touched, so that it is best to touch little of it.
-    pub(crate) fn fits_normals(&self) -> bool {
+    pub(crate) fn has_lazy_normals(&self) -> bool {
         self.nominal().patches().iter().any(|patch| patch.has_scattered_normals())
     }
 
@@ -27,14 +27,14 @@ impl OffsetSurface<'_> {
     /// for each point. Returns an empty list if the normals are ready already, or if there are several patches.
     pub(crate) fn prefetch(&self, points: &[Point]) -> Vec<Place> {
         let [patch] = self.nominal().patches() else { return Vec::new() };
-        let Lattice::Mesh(mesh) = &patch.lattice else { return Vec::new() };
+        let Lattice::Mesh(mesh) = &patch.topology else { return Vec::new() };
         let walk = |chunk: &[Point]| -> Vec<Place> {
             let mut last = (Place::UNKNOWN, Point::origin(), 0.0);
             let mut found = Vec::with_capacity(chunk.len());
             for p in chunk {
                 let (place, from, reach_mm) = last;
                 let near = place != Place::UNKNOWN && (p - from).norm_squared() < reach_mm * reach_mm;
-                let place = self.place_near(patch, mesh, p, if near { place } else { Place::UNKNOWN });
+                let place = self.facet_near(patch, mesh, p, if near { place } else { Place::UNKNOWN });
                 last = (place, *p, NEAR_STEPS * self.spacing_mm(place));
                 found.push(place);
             }

@@ -42,7 +42,7 @@ impl Projection {
     ///
     /// # Errors
     /// Returns an error if the requested projection folds the surface, or if with `Auto` every projection does.
-    pub(crate) fn prepare(self, points: &[Point]) -> Result<(Self, Map), SurfaceError> {
+    pub(crate) fn choose(self, points: &[Point]) -> Result<(Self, Map), SurfaceError> {
         let candidates: &[Self] = match self {
             Self::Auto => &[Self::Xy, Self::BestFit, Self::Spherical],
             Self::Xy => &[Self::Xy],
@@ -51,7 +51,7 @@ impl Projection {
         };
         let mut shares = Vec::new();
         for &candidate in candidates {
-            let Some(map) = candidate.map(points) else { continue };
+            let Some(map) = candidate.projector(points) else { continue };
             let folded = map.folded_share(points);
             if folded <= FOLDED_SHARE {
                 return Ok((candidate, map));
@@ -61,7 +61,7 @@ impl Projection {
         Err(SurfaceError::NoProjection { tried: describe(&shares) })
     }
 
-    fn map(self, points: &[Point]) -> Option<Map> {
+    fn projector(self, points: &[Point]) -> Option<Map> {
         match self {
             Self::Auto | Self::Xy => {
                 Some(Map::Plane { origin: Point::origin(), axes: [Vector::x(), Vector::y(), Vector::z()] })
@@ -226,7 +226,7 @@ mod tests {
 
     #[test]
     fn auto_takes_the_simplest_that_is_one_to_one() {
-        let chosen = |points: &[Point]| Projection::Auto.prepare(points).unwrap().0;
+        let chosen = |points: &[Point]| Projection::Auto.choose(points).unwrap().0;
         assert_eq!(chosen(&cap(60.0, 4000)), Projection::Xy);
         assert_eq!(chosen(&cap(120.0, 4000)), Projection::Spherical);
         let upright: Vec<_> = cap(50.0, 4000).iter().map(|p| Point::new(p.z, p.x, p.y)).collect();
@@ -237,14 +237,14 @@ mod tests {
     fn a_fold_is_an_error_with_its_share() {
         let two_sheets: Vec<_> =
             cap(60.0, 2000).into_iter().flat_map(|p| [p, Point::new(p.x + 0.01, p.y, p.z - 30.0)]).collect();
-        assert!(matches!(Projection::Xy.prepare(&two_sheets), Err(SurfaceError::NoProjection { .. })));
-        assert!(matches!(Projection::Xy.prepare(&cap(120.0, 4000)), Err(SurfaceError::NoProjection { .. })));
+        assert!(matches!(Projection::Xy.choose(&two_sheets), Err(SurfaceError::NoProjection { .. })));
+        assert!(matches!(Projection::Xy.choose(&cap(120.0, 4000)), Err(SurfaceError::NoProjection { .. })));
     }
 
     #[test]
     fn the_stereographic_map_keeps_longitudes_and_knows_the_sphere() {
         let points = cap(120.0, 3000);
-        let (_, map) = Projection::Spherical.prepare(&points).unwrap();
+        let (_, map) = Projection::Spherical.choose(&points).unwrap();
         let Map::Sphere { centre, radius_mm, axes } = &map else { panic!("{map:?}") };
         assert!((centre - Point::new(5.0, -3.0, 40.0)).norm() < 1e-9 && (radius_mm - 20.0).abs() < 1e-9);
         assert!(axes[2].z > 0.999);

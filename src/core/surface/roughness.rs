@@ -42,7 +42,7 @@ fn left_at(patch: &Patch, vertex: u32) -> Option<[f64; 2]> {
 /// Returns a point and its neighbours in coordinates along two tangents and the normal, the nearest first.
 fn around(patch: &Patch, vertex: u32) -> Vec<[f64; 3]> {
     let wanted = 2 * NEIGHBOURS + 3;
-    let others: Vec<u32> = match &patch.lattice {
+    let others: Vec<u32> = match &patch.topology {
         Lattice::Mesh(mesh) => ring_around(mesh, vertex, wanted),
         Lattice::Grid(grid) => grid.block_around(vertex, 3),
     };
@@ -108,10 +108,10 @@ mod tests {
     fn what_was_planted_is_found_on_grids_and_on_scattered_points() {
         for jitter_mm in [0.0, 0.5] {
             for scatter_mm in [1e-3, 1e-2] {
-                let found_mm = nominal(jitter_mm, scatter_mm).scatter_mm();
+                let found_mm = nominal(jitter_mm, scatter_mm).noise_sigma_mm();
                 assert!((found_mm / scatter_mm - 1.0).abs() < 0.2, "{jitter_mm}: {found_mm} of {scatter_mm}");
             }
-            let smooth_mm = nominal(jitter_mm, 0.0).scatter_mm();
+            let smooth_mm = nominal(jitter_mm, 0.0).noise_sigma_mm();
             assert!(smooth_mm < 5e-5, "{jitter_mm}: {smooth_mm}");
         }
     }

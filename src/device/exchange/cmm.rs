@@ -490,7 +490,7 @@ impl Judge {
             let placed = self.place(k, &seen, &nominal, stations)?;
             notes.extend(switched_off(&file.name, &result));
             notes.push(placed.summary());
-            points.extend(result.points.iter().map(|p| placed.cmm_from_station.point(p)));
+            points.extend(result.points.iter().map(|p| placed.cmm_from_station.transform_point(p)));
             files.extend([(file.name.clone(), sha), (reference_file.name.clone(), hex(&Sha256::digest(&bytes)))]);
             if let Some(first) = results.first().filter(|first| first.coordinates != result.coordinates) {
                 let words = |c: Option<Coordinates>| format!("{c:?}").to_lowercase();

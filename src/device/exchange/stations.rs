@@ -65,7 +65,7 @@ pub fn place_station(
     let (from, to) = matching.points(seen, nominal);
     let fit = fit_rigid(&from, &to).map_err(|source| ExchangeError::Fit { station: station.to_owned(), source })?;
     let names: Vec<String> = matching.pairs.iter().map(|&(_, n)| nominal.name(n)).collect();
-    let (worst, off_mm) = fit.worst();
+    let (worst, off_mm) = fit.max_residual();
     if off_mm > limit_mm {
         let (suspect, diagnosis) = diagnose(&from, &to, &names, limit_mm);
         let point = suspect.unwrap_or(worst);
@@ -144,7 +144,7 @@ fn match_subset(seen: &References, nominal: &References, limit_mm: f64) -> Resul
     let fits = (0..1u32 << want).filter(|mask| mask.count_ones() as usize == have).filter_map(|mask| {
         let matching = Matching { pairs: chosen(mask) };
         let (from, to) = matching.points(seen, nominal);
-        fit_rigid(&from, &to).ok().filter(|fit| fit.worst().1 <= limit_mm).map(|_| matching)
+        fit_rigid(&from, &to).ok().filter(|fit| fit.max_residual().1 <= limit_mm).map(|_| matching)
     });
     let mut fits: Vec<Matching> = fits.take(2).collect();
     match fits.len() {
@@ -156,7 +156,7 @@ fn match_subset(seen: &References, nominal: &References, limit_mm: f64) -> Resul
 
 /// Returns the index of the reference point to name, if there is one, and the probable cause of the misfit in words.
 fn diagnose(from: &[Point], to: &[Point], names: &[String], limit_mm: f64) -> (Option<usize>, String) {
-    let fits = |fit: Option<RigidFit>| fit.is_some_and(|fit| fit.worst().1 <= limit_mm);
+    let fits = |fit: Option<RigidFit>| fit.is_some_and(|fit| fit.max_residual().1 <= limit_mm);
     for a in 0..from.len() {
         for b in a + 1..from.len() {
             let mut exchanged = from.to_vec();
@@ -186,7 +186,7 @@ fn without(points: &[Point], index: usize) -> Vec<Point> {
 /// Returns the distance in mm of a point from its nominal position when only the other points are fitted.
 fn off_without(from: &[Point], to: &[Point], index: usize) -> Option<f64> {
     let fit = fit_rigid(&without(from, index), &without(to, index)).ok()?;
-    Some((to[index] - fit.pose.point(&from[index])).norm())
+    Some((to[index] - fit.pose.transform_point(&from[index])).norm())
 }
 
 #[cfg(test)]
@@ -216,7 +216,7 @@ mod tests {
     fn seen(order: &[usize], named: bool) -> References {
         let point = |&k: &usize| Reference {
             name: named.then(|| AT[k].0.into()),
-            at: truth().inverse().point(&Point::from(AT[k].1)),
+            at: truth().inverse().transform_point(&Point::from(AT[k].1)),
         };
         References { path: PathBuf::from("ref_3.yaml"), points: order.iter().map(point).collect() }
     }

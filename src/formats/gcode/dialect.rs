@@ -485,13 +485,13 @@ impl Dialect {
             return Err(DialectError::ArcsFine { dialect: dialect(), found_um, decimals, least_um });
         }
         let options = ArcOptions {
-            within_mm,
-            per_mm: 10f64.powi(i32::from(decimals)),
-            radius_error_mm: 1e-3 * words.radius_error_um,
-            largest_mm: self.numbers.largest_mm,
-            helix: words.third_axis,
+            tolerance_mm: within_mm,
+            steps_per_mm: 10f64.powi(i32::from(decimals)),
+            max_radius_error_mm: 1e-3 * words.radius_error_um,
+            max_coordinate_mm: self.numbers.largest_mm,
+            allows_helix: words.third_axis,
             // An arc must not need more blocks than the lines that it replaces.
-            least_lines: if words.centre == CentreWords::BlockBefore { 3 } else { 2 },
+            min_lines: if words.centre == CentreWords::BlockBefore { 3 } else { 2 },
         };
         Ok((words, options))
     }
@@ -860,7 +860,7 @@ pub(super) mod tests {
             dialect.post(&Exactness { arcs_within_mm: Some(1e-3 * um), ..exactness }).map(|post| post.arcs.unwrap().1)
         };
         let [linuxcnc, heidenhain] = ["linuxcnc", "heidenhain"].map(shipped);
-        assert_eq!(within(&linuxcnc, 0.1).unwrap().per_mm, 1e6);
+        assert_eq!(within(&linuxcnc, 0.1).unwrap().steps_per_mm, 1e6);
         assert!(within(&linuxcnc, 0.001).is_ok() && within(&heidenhain, 0.09).is_ok());
         assert!(matches!(within(&linuxcnc, 0.0008), Err(DialectError::ArcsFine { decimals: 6, .. })));
         assert!(matches!(within(&heidenhain, 0.08), Err(DialectError::ArcsFine { decimals: 4, .. })));

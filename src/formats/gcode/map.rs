@@ -190,14 +190,14 @@ fn node(row: &str, valid: bool) -> Option<Point> {
 /// Returns the grid of the nodes, and the index of the point at each node of the grid.
 fn grid(points: &[Point]) -> Option<(Grid, Vec<usize>)> {
     let order = recognise_grid(points)?;
-    if order.point_at.contains(&NO_POINT) {
+    if order.point_indices.contains(&NO_POINT) {
         return None;
     }
-    let at = |node: usize| points[order.point_at[node] as usize];
+    let at = |node: usize| points[order.point_indices[node] as usize];
     let (first, last) = (at(0), at(order.columns * order.rows - 1));
     let spacing_mm = [(last.x - first.x) / (order.columns - 1) as f64, (last.y - first.y) / (order.rows - 1) as f64];
     let grid = Grid { columns: order.columns, rows: order.rows, first_mm: [first.x, first.y], spacing_mm };
-    Some((grid, (0..grid.len()).map(|k| order.point_at[k] as usize).collect()))
+    Some((grid, (0..grid.len()).map(|k| order.point_indices[k] as usize).collect()))
 }
 
 /// Gives each node with an unknown value the value of the nearest known node, by steps along rows and columns.

@@ -215,13 +215,13 @@ impl<'a> Lines<'a> {
         match one {
             Move::RapidZ(z) => self.block(true, [None, None, Some(*z)], None, None)?,
             Move::RapidXy([x, y]) => self.block(true, [Some(*x), Some(*y), None], None, None)?,
-            Move::Feed { at, feed_mm_min } => {
+            Move::Feed { to: at, feed_mm_min } => {
                 self.block(false, [Some(at.x), Some(at.y), Some(at.z)], None, Some(*feed_mm_min))?;
             }
             Move::RapidTilted { to_mm: [x, y], tilt_rad } => {
                 self.block(true, [Some(*x), Some(*y), None], Some(*tilt_rad), None)?;
             }
-            Move::FeedTilted { at, tilt_rad, feed_mm_min, centre_mm } => {
+            Move::FeedTilted { to: at, tilt_rad, feed_mm_min, centre_mm } => {
                 let feed = self.feed_of(*feed_mm_min, *centre_mm);
                 self.block(false, [Some(at.x), Some(at.y), Some(at.z)], Some(*tilt_rad), Some(feed))?;
             }
@@ -592,9 +592,9 @@ fn header_words(h: &ProgramHeader, s: &Summary, arcs: Option<&ArcSummary>, lines
     say(format_args!("feed: {} mm/min", short(s.feed_mm_min)));
     say(format_args!("spark-out: the program is run {} times more", h.spark_out_passes));
     for (k, axis) in ['X', 'Y', 'Z'].into_iter().enumerate() {
-        say(format_args!("limits: {axis} {} to {} mm", short(s.least_mm[k]), short(s.most_mm[k])));
+        say(format_args!("limits: {axis} {} to {} mm", short(s.min_mm[k]), short(s.max_mm[k])));
     }
-    say(format_args!("length: {} mm at feed, {:.1} minutes", short(s.length_mm.round()), s.seconds / 60.0));
+    say(format_args!("length: {} mm at feed, {:.1} minutes", short(s.length_mm.round()), s.duration_s / 60.0));
     say(format_args!("points: {}", s.points));
     if let Some(of) = arcs {
         let (arcs, left, off_um) = (of.arcs, of.lines, 1e3 * of.deviation_mm);
@@ -607,10 +607,10 @@ fn header_words(h: &ProgramHeader, s: &Summary, arcs: Option<&ArcSummary>, lines
 
 /// Returns the header's text about the tilt of the wheel and about the resulting meaning of X, Y and Z.
 fn tilt_in_words(rotary: &Rotary, h: &ProgramHeader, s: &Summary) -> [String; 2] {
-    let about = if rotary.about == TurnAxis::X { "x" } else { "y" };
+    let about = if rotary.axis == TurnAxis::X { "x" } else { "y" };
     let sense = if rotary.reversed { "left-handed" } else { "right-handed" };
-    let reached = s.turned.map_or(String::new(), |turned| {
-        let [a, b] = [turned.least_rad, turned.most_rad].map(|peak| rotary.on_scale_rad(peak.value).to_degrees());
+    let reached = s.head_rotation.map_or(String::new(), |turned| {
+        let [a, b] = [turned.min_tilt_rad, turned.max_tilt_rad].map(|peak| rotary.on_scale_rad(peak.value).to_degrees());
         format!(", {:.4} to {:.4} degrees", a.min(b), a.max(b))
     });
     let of = match rotary.pivot_mm {
@@ -646,7 +646,7 @@ mod tests {
 
     /// Tracks along x, forward and back, one after the other.
     fn tracks(count: usize) -> Vec<std::vec::IntoIter<Move>> {
-        let feed = |x: f64, y: f64| Move::Feed { at: Point::new(x, y, 0.1 * y), feed_mm_min: 600.0 };
+        let feed = |x: f64, y: f64| Move::Feed { to: Point::new(x, y, 0.1 * y), feed_mm_min: 600.0 };
         let track = |k: usize| {
             let (y, turn) = (k as f64, if k.is_multiple_of(2) { 1.0 } else { -1.0 });
             let (over, up) = (Move::RapidXy([-turn, y]), Move::RapidZ(5.0));
@@ -696,17 +696,17 @@ mod tests {
         let summary = Summary {
             moves: 5 * tracks.len() as u64,
             points,
-            least_mm: [0.0; 3],
-            most_mm: [0.0; 3],
+            min_mm: [0.0; 3],
+            max_mm: [0.0; 3],
             length_mm: 0.0,
             rapid_mm: 0.0,
-            seconds: 0.0,
+            duration_s: 0.0,
             speed_mm_s: [Peak::default(); 3],
             acceleration_mm_s2: Peak::default(),
             jerk_mm_s3: Peak::default(),
             feed_mm_min: 600.0,
             run_up_mm: 0.0,
-            turned: None,
+            head_rotation: None,
         };
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("part.ngc");
@@ -792,7 +792,7 @@ mod tests {
             let (plane, centre_mm) = (Plane::ZX, [0.0, 0.0]);
             Block::Arc(Arc { plane, clockwise, to, centre_mm, feed_mm_min: 600.0, deviation_mm: 0.0 })
         };
-        let feed = |x: f64, y: f64, z: f64| Move::Feed { at: Point::new(x, y, z), feed_mm_min: 600.0 };
+        let feed = |x: f64, y: f64, z: f64| Move::Feed { to: Point::new(x, y, z), feed_mm_min: 600.0 };
         let straight = [Move::RapidXy([0.0, 0.0]), Move::RapidZ(3.0), feed(0.0, 0.0, 2.0)].map(Block::Straight);
         let (there, back) = (arc(false, Point::new(2.0, y_mm, 0.0)), arc(true, Point::new(0.0, y_mm, 2.0)));
         let over = [feed(3.0, y_mm, 0.0), feed(2.0, y_mm, 0.0)].map(Block::Straight);
@@ -866,7 +866,7 @@ mod tests {
 
     #[test]
     fn a_move_that_says_nothing_new_is_no_empty_block_and_numbers_begin_anew() {
-        let feed = |x: f64| Move::Feed { at: Point::new(x, 0.0, 0.0), feed_mm_min: 600.0 };
+        let feed = |x: f64| Move::Feed { to: Point::new(x, 0.0, 0.0), feed_mm_min: 600.0 };
         let still = vec![vec![Move::RapidZ(5.0), Move::RapidXy([0.0; 2]), feed(1.0), feed(1.0), feed(2.0)].into_iter()];
         let mut dialect = shipped("sinumerik");
         dialect.blocks = Some(Blocks { last: 50, ..dialect.blocks.clone().unwrap() });
@@ -883,7 +883,7 @@ mod tests {
             vec![
                 moves
                     .into_iter()
-                    .chain([Move::Feed { at, feed_mm_min }, Move::RapidZ(5.0)])
+                    .chain([Move::Feed { to, feed_mm_min }, Move::RapidZ(5.0)])
                     .collect::<Vec<_>>()
                     .into_iter(),
             ]
@@ -912,7 +912,7 @@ mod tests {
     #[test]
     fn what_is_no_number_is_told_by_its_place_in_the_whole() {
         let mut many = tracks(1000);
-        let broken = Move::Feed { at: Point::new(0.0, f64::NAN, 0.0), feed_mm_min: 600.0 };
+        let broken = Move::Feed { to: Point::new(0.0, f64::NAN, 0.0), feed_mm_min: 600.0 };
         many[700] = vec![Move::RapidZ(5.0), broken].into_iter();
         for points in [2000, u64::MAX, AT_ONCE * 1000 / 7] {
             let error = write(&many, points).unwrap_err();

@@ -37,7 +37,7 @@ pub struct Extent {
 
 impl Extent {
     /// Returns the extent of some places.
-    pub fn of(places_mm: impl Iterator<Item = [f64; 2]>) -> Self {
+    pub fn from_places(places_mm: impl Iterator<Item = [f64; 2]>) -> Self {
         let [low, high] = bounds(places_mm);
         let of = |sign: f64| std::array::from_fn(|k| 0.5 * (high[k] + sign * low[k]));
         Self { middle_mm: of(1.0), half_mm: of(-1.0) }
@@ -49,7 +49,7 @@ impl Extent {
     }
 
     /// Returns the position of a contact in the extent, from -1 to 1 along x and along y.
-    fn share(&self, contact: &Contact) -> [f64; 2] {
+    fn relative_position(&self, contact: &Contact) -> [f64; 2] {
         [0, 1].map(|k| (contact.point[k] - self.middle_mm[k]) / self.half_mm[k].max(f64::MIN_POSITIVE))
     }
 }
@@ -76,7 +76,7 @@ pub(super) fn slides(contacts: &[Contact], extent: &Extent) -> Vec<Column<&'stat
 }
 
 pub(super) fn of_slide(contact: &Contact, extent: &Extent, k: usize) -> f64 {
-    let t = extent.share(contact)[k / 2];
+    let t = extent.relative_position(contact)[k / 2];
     contact.normal.z * if k.is_multiple_of(2) { 1.5 * t * t - 0.5 } else { 2.5 * t * t * t - 1.5 * t }
 }
 
@@ -107,7 +107,7 @@ pub(super) fn candidates(
     term: WheelTerm,
     extent: &Extent,
 ) -> Vec<Column<ParameterKind>> {
-    let along_y = || contacts.iter().map(|c| 0.5 * (1.0 + extent.share(c)[1])).collect();
+    let along_y = || contacts.iter().map(|c| 0.5 * (1.0 + extent.relative_position(c)[1])).collect();
     let of = |kind: ParameterKind| match kind {
         ParameterKind::Wear => progress.map_or_else(along_y, <[f64]>::to_vec),
         _ => contacts.iter().map(|c| kind.effect(c, term)).collect(),
@@ -130,11 +130,11 @@ pub(super) fn rms(values: &[f64]) -> f64 {
 
 impl Basis {
     /// Builds the basis by Gram-Schmidt, applied twice; columns that add nothing are left out.
-    pub(super) fn of<'a>(columns: impl Iterator<Item = &'a Vec<f64>>) -> Self {
+    pub(super) fn new<'a>(columns: impl Iterator<Item = &'a Vec<f64>>) -> Self {
         let mut basis = Self { columns: Vec::new() };
         for column in columns {
             let size = dot(column, column).sqrt();
-            let mut own = basis.without(column);
+            let mut own = basis.orthogonal_part(column);
             let left = dot(&own, &own).sqrt();
             if left > NOTHING_OWN * size {
                 own.iter_mut().for_each(|v| *v /= left);
@@ -145,7 +145,7 @@ impl Basis {
     }
 
     /// Returns the part of a column that is orthogonal to the basis.
-    pub(super) fn without(&self, column: &[f64]) -> Vec<f64> {
+    pub(super) fn orthogonal_part(&self, column: &[f64]) -> Vec<f64> {
         let mut own = column.to_vec();
         for _ in 0..2 {
             for unit in &self.columns {

@@ -92,7 +92,7 @@ pub struct ParameterOptions {
     pub free_motions: [bool; 6],
     /// Standard uncertainty of the position of the part on its datum, in millimetres, and of its rotation, in
     /// radians; `None` if it is not stated, and then the datum separates no parameter.
-    pub datum: Option<[f64; 2]>,
+    pub locked_sigmas: Option<[f64; 2]>,
     /// Effect of an error of the wheel's radius.
     pub wheel_term: WheelTerm,
     /// Tolerance of each parameter to compensate, in its unit, in the order of [`ParameterKind::ALL`]: the expanded
@@ -106,7 +106,7 @@ impl ParameterOptions {
         Self {
             wheel_radius_mm,
             free_motions: [true; 6],
-            datum: None,
+            locked_sigmas: None,
             wheel_term: WheelTerm::default(),
             tolerances: [None; ParameterKind::COUNT],
         }
@@ -114,9 +114,9 @@ impl ParameterOptions {
 
     /// Returns true if only a datum separates the parameter from a motion, and the uncertainty of this datum is not
     /// stated.
-    fn is_untold(&self, k: usize) -> bool {
+    fn lacks_locked_sigma(&self, k: usize) -> bool {
         let held = |motion: usize| !self.free_motions[motion];
-        ParameterKind::ALL[k].motion().is_some_and(held) && self.datum.is_none()
+        ParameterKind::ALL[k].motion().is_some_and(held) && self.locked_sigmas.is_none()
     }
 }
 
@@ -180,16 +180,16 @@ pub struct Parameter {
     /// Share of its effect that nothing else in the fit explains, from 0 to 1.
     pub own_share: f64,
     /// Names of the effects that it is not separable from, for people; empty if it is separable.
-    pub alike: Vec<String>,
+    pub inseparable_from: Vec<String>,
     /// True if it should be corrected as a parameter: it is separable and beyond its expanded uncertainty.
-    pub offered: bool,
+    pub is_offered: bool,
     /// Value to compensate; 0 if it is not offered, or has no tolerance.
-    pub taken: f64,
+    pub compensated: f64,
     /// True if `taken` exceeds the tolerance, so that a person must decide.
-    pub beyond: bool,
+    pub exceeds_tolerance: bool,
     /// Reduction of the root mean square by its correction, together with the others that are offered, in
     /// millimetres; 0 if it is not offered.
-    pub removes_rms_mm: f64,
+    pub rms_reduction_mm: f64,
     /// Result and advice, for people.
     pub message: String,
 }
@@ -198,16 +198,16 @@ pub struct Parameter {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Parameters {
     /// Parameters in the order of [`ParameterKind::ALL`].
-    pub found: Vec<Parameter>,
+    pub estimates: Vec<Parameter>,
     /// Root mean square of the deviations without the part that the free motions explain, in millimetres.
     pub rms_mm: f64,
     /// Root mean square of `rest_mm`, in millimetres: as `rms_mm`, but also without the offered parameters.
-    pub rest_rms_mm: f64,
+    pub residual_rms_mm: f64,
     /// Residual at every point after correction of the offered parameters and a new registration, in millimetres:
     /// form and noise.
-    pub rest_mm: Vec<f64>,
+    pub residuals_mm: Vec<f64>,
     /// Part of the deviations that parameters and slides explain together, however it divides between them.
-    pub smooth: Smooth,
+    pub explained: Smooth,
 }
 
 /// Error that prevents the separation of parameters.
@@ -253,37 +253,37 @@ pub fn parameters(
     options: &ParameterOptions,
 ) -> Result<Parameters, ParameterError> {
     check(contacts, progress, options)?;
-    let extent = Extent::of(contacts.iter().map(|c| [c.point.x, c.point.y]));
+    let extent = Extent::from_places(contacts.iter().map(|c| [c.point.x, c.point.y]));
     let columns = Columns {
         motions: motions(contacts, options.free_motions),
         slides: slides(contacts, &extent),
         candidates: candidates(contacts, progress, options.wheel_term, &extent),
     };
     let deviations: Vec<f64> = contacts.iter().map(|c| c.deviation_mm).collect();
-    let unseen = Basis::of(columns.motions.iter().map(|m| &m.values));
-    let rms_mm = rms(&unseen.without(&deviations));
-    let (told, own_shares) = columns.told();
+    let unseen = Basis::new(columns.motions.iter().map(|m| &m.values));
+    let rms_mm = rms(&unseen.orthogonal_part(&deviations));
+    let (told, own_shares) = columns.separability();
     let fitted = columns.fitted(contacts, &told, rms_mm, options)?;
-    let alike = |k: usize| if told[k] && !options.is_untold(k) { Vec::new() } else { columns.alike(k, options) };
+    let alike = |k: usize| if told[k] && !options.lacks_locked_sigma(k) { Vec::new() } else { columns.inseparable_from(k, options) };
     let alike = (0..ParameterKind::COUNT).map(alike).collect();
     let mut found = fitted.parameters(alike, &own_shares, options);
     let left = |but: Option<usize>| {
         let mut rest = deviations.clone();
-        for (k, parameter) in found.iter().enumerate().filter(|(k, p)| p.offered && Some(*k) != but) {
+        for (k, parameter) in found.iter().enumerate().filter(|(k, p)| p.is_offered && Some(*k) != but) {
             rest.iter_mut().zip(&columns.candidates[k].values).for_each(|(r, c)| *r -= parameter.value * c);
         }
-        unseen.without(&rest)
+        unseen.orthogonal_part(&rest)
     };
     let rest_mm = left(None);
     let rest_rms_mm = rms(&rest_mm);
     let removes: Vec<f64> =
-        (0..found.len()).map(|k| if found[k].offered { rms(&left(Some(k))) - rest_rms_mm } else { 0.0 }).collect();
+        (0..found.len()).map(|k| if found[k].is_offered { rms(&left(Some(k))) - rest_rms_mm } else { 0.0 }).collect();
     for (parameter, removes_rms_mm) in found.iter_mut().zip(removes) {
-        parameter.removes_rms_mm = removes_rms_mm;
+        parameter.rms_reduction_mm = removes_rms_mm;
         parameter.message = words::message(parameter, rest_rms_mm, options);
     }
-    let smooth = Smooth::of(contacts, &extent, options, &fitted);
-    Ok(Parameters { found, rms_mm, rest_rms_mm, rest_mm, smooth })
+    let smooth = Smooth::new(contacts, &extent, options, &fitted);
+    Ok(Parameters { estimates: found, rms_mm, residual_rms_mm: rest_rms_mm, residuals_mm: rest_mm, explained: smooth })
 }
 
 fn check(contacts: &[Contact], progress: Option<&[f64]>, options: &ParameterOptions) -> Result<(), ParameterError> {
@@ -295,7 +295,7 @@ fn check(contacts: &[Contact], progress: Option<&[f64]>, options: &ParameterOpti
     if let Some(value) = options.tolerances.into_iter().flatten().find(|t| !(*t > 0.0 && t.is_finite())) {
         return Err(ParameterError::Stated { what: "a tolerance of a parameter", value, limit: "above 0" });
     }
-    if let Some(value) = options.datum.into_iter().flatten().find(|u| !(*u >= 0.0 && u.is_finite())) {
+    if let Some(value) = options.locked_sigmas.into_iter().flatten().find(|u| !(*u >= 0.0 && u.is_finite())) {
         return Err(ParameterError::Stated { what: "an uncertainty of the datum", value, limit: "at least 0" });
     }
     if let Some(progress) = progress.filter(|p| p.len() != points) {
@@ -343,15 +343,15 @@ impl Columns {
 
     /// Returns which candidates are separable from motions, slides and each other (of two with the same effect, the
     /// first is), and the share of each that is independent of motions, slides and the other separable candidates.
-    fn told(&self) -> (Vec<bool>, Vec<f64>) {
+    fn separability(&self) -> (Vec<bool>, Vec<f64>) {
         let mut told: Vec<bool> = Vec::new();
         for k in 0..self.candidates.len() {
             let before = (0..k).filter(|&j| told[j]).map(|j| &self.candidates[j].values);
-            told.push(own_share(&self.candidates[k].values, &Basis::of(self.nuisance().chain(before))) > LEAST_OWN);
+            told.push(own_share(&self.candidates[k].values, &Basis::new(self.nuisance().chain(before))) > LEAST_OWN);
         }
         let share = |k: usize| {
             let others = (0..told.len()).filter(|&j| j != k && told[j]).map(|j| &self.candidates[j].values);
-            own_share(&self.candidates[k].values, &Basis::of(self.nuisance().chain(others)))
+            own_share(&self.candidates[k].values, &Basis::new(self.nuisance().chain(others)))
         };
         let shares: Vec<f64> = (0..told.len()).map(share).collect();
         // A candidate that is no longer separable once later ones are included is dropped in their favour.
@@ -369,13 +369,13 @@ impl Columns {
         let slides = self.slides.len();
         let all: Vec<&Vec<f64>> =
             self.slides.iter().map(|c| &c.values).chain(self.candidates.iter().map(|c| &c.values)).collect();
-        let unseen = Basis::of(self.motions.iter().map(|m| &m.values));
-        let mut basis = Basis::of(self.motions.iter().map(|m| &m.values));
+        let unseen = Basis::new(self.motions.iter().map(|m| &m.values));
+        let mut basis = Basis::new(self.motions.iter().map(|m| &m.values));
         let mut chosen = Vec::new();
         for k in (0..all.len()).filter(|&k| k < slides || told[k - slides]) {
             if own_share(all[k], &basis) > LEAST_OWN {
                 chosen.push(k);
-                basis = Basis::of(basis.columns.iter().chain([all[k]]));
+                basis = Basis::new(basis.columns.iter().chain([all[k]]));
             }
         }
         let (mut values, mut covariance) = (DVector::zeros(all.len()), DMatrix::zeros(all.len(), all.len()));
@@ -393,7 +393,7 @@ impl Columns {
         // setting.
         for (k, kind) in ParameterKind::ALL.into_iter().enumerate().filter(|(k, _)| told[*k]) {
             let held = kind.motion().filter(|&motion| !options.free_motions[motion]);
-            if let Some((motion, [shift, turn])) = held.zip(options.datum) {
+            if let Some((motion, [shift, turn])) = held.zip(options.locked_sigmas) {
                 covariance[(slides + k, slides + k)] += if motion < 3 { shift * shift } else { turn * turn };
             }
         }
@@ -418,7 +418,7 @@ impl Columns {
             Some(c) => chosen[c][r] / sizes[c],
         });
         let places: Vec<[f64; 2]> = contacts.iter().map(|c| [c.point.x, c.point.y]).collect();
-        let size_mm = Extent::of(places.iter().copied()).size_mm();
+        let size_mm = Extent::from_places(places.iter().copied()).size_mm();
         let deviations_mm = contacts.iter().map(|c| c.deviation_mm).collect();
         let observed = Observed { fixed_effects: effects, ..Observed::without_effects(places, deviations_mm) };
         let mut found = EffectEstimates::estimate(&observed, &Prior::for_size(size_mm))?;
@@ -431,13 +431,13 @@ impl Columns {
     }
 
     /// Returns the names of the effects that a candidate is not separable from.
-    fn alike(&self, k: usize, options: &ParameterOptions) -> Vec<String> {
+    fn inseparable_from(&self, k: usize, options: &ParameterOptions) -> Vec<String> {
         let before = self.candidates.iter().enumerate().filter(|(j, _)| *j != k).map(|(_, c)| (c.kind, &c.values));
         let others = self.motions.iter().chain(&self.slides).map(|c| (c.kind.to_owned(), &c.values));
         let others: Vec<_> = others.chain(before.map(|(kind, of)| (words::name(kind).to_owned(), of))).collect();
         let of = &self.candidates[k];
         match of.kind.motion() {
-            _ if options.is_untold(k) => vec![words::NO_DATUM.to_owned()],
+            _ if options.lacks_locked_sigma(k) => vec![words::NO_DATUM.to_owned()],
             Some(motion) if options.free_motions[motion] => vec![columns::MOTIONS[motion].to_owned()],
             _ => words::alike(&of.values, &others),
         }
@@ -456,23 +456,23 @@ impl Fitted {
                 value,
                 sigma,
                 own_share: own_shares[k],
-                offered: is_told && value.abs() > EXPANDED * sigma,
-                alike,
-                taken: 0.0,
-                beyond: false,
-                removes_rms_mm: 0.0,
+                is_offered: is_told && value.abs() > EXPANDED * sigma,
+                inseparable_from: alike,
+                compensated: 0.0,
+                exceeds_tolerance: false,
+                rms_reduction_mm: 0.0,
                 message: String::new(),
             }
         };
         let mut found: Vec<Parameter> = alike.into_iter().enumerate().map(parameter).collect();
         let wanted = |k: &usize| {
             let tolerance_2 = options.tolerances[*k].map(|tolerance| (tolerance / EXPANDED).powi(2));
-            tolerance_2.filter(|_| found[*k].offered && found[*k].kind != ParameterKind::Wear).map(|t2| (*k, t2))
+            tolerance_2.filter(|_| found[*k].is_offered && found[*k].kind != ParameterKind::Wear).map(|t2| (*k, t2))
         };
         let chosen: Vec<(usize, f64)> = (0..found.len()).filter_map(|k| wanted(&k)).collect();
         for ((k, _), taken) in chosen.iter().zip(self.expected(&chosen).iter()) {
-            found[*k].taken = *taken;
-            found[*k].beyond = options.tolerances[*k].is_some_and(|tolerance| taken.abs() > tolerance);
+            found[*k].compensated = *taken;
+            found[*k].exceeds_tolerance = options.tolerances[*k].is_some_and(|tolerance| taken.abs() > tolerance);
         }
         found
     }
@@ -492,7 +492,7 @@ impl Fitted {
     ///
     /// Equation: T (T + S)^-1 b, as the mean over strengths from a small share up to all of the rms, each weighted by
     /// its likelihood of b (empirical Bayes, Morris 1983).
-    fn believed(&self, options: &ParameterOptions) -> DVector<f64> {
+    fn joint_expectation(&self, options: &ParameterOptions) -> DVector<f64> {
         let chosen: Vec<usize> = (0..self.values.len()).filter(|&k| self.covariance[(k, k)] > 0.0).collect();
         let told = DVector::from_fn(chosen.len(), |k, _| self.values[chosen[k]]);
         let stated = |k: usize| k.checked_sub(self.slides).and_then(|k| options.tolerances[k]);
@@ -526,7 +526,7 @@ impl Fitted {
 }
 
 fn own_share(column: &[f64], others: &Basis) -> f64 {
-    let own = others.without(column);
+    let own = others.orthogonal_part(column);
     let size = dot(column, column);
     // On a level surface the effect of the wheel's radius is only rounding.
     if size > NOTHING * column.len() as f64 { (dot(&own, &own) / size).sqrt() } else { 0.0 }
@@ -554,7 +554,7 @@ mod tests {
         let mut options = ParameterOptions::new(12.5);
         options.tolerances[0] = Some(2e-3);
         let believed = |values_um: [f64; 2]| {
-            let of = fitted(values_um).believed(&options);
+            let of = fitted(values_um).joint_expectation(&options);
             assert_eq!(of[2], 0.0, "what was not fitted");
             [1e3 * of[0], 1e3 * of[1]]
         };

@@ -22,17 +22,17 @@ pub struct Smooth {
 }
 
 impl Smooth {
-    pub(super) fn of(contacts: &[Contact], extent: &Extent, options: &ParameterOptions, fitted: &Fitted) -> Self {
-        let believed = fitted.believed(options);
+    pub(super) fn new(contacts: &[Contact], extent: &Extent, options: &ParameterOptions, fitted: &Fitted) -> Self {
+        let believed = fitted.joint_expectation(options);
         let (slides, parameters) = believed.as_slice().split_at(fitted.slides);
         let none = Motion([0.0; 6]);
         let (slides, parameters) = (slides.to_vec(), parameters.to_vec());
         let whole = Self { extent: *extent, term: options.wheel_term, slides, parameters, motion: none };
-        let motion = Motion::of(contacts, options.free_motions, |c| whole.with_motion(c));
+        let motion = Motion::fit(contacts, options.free_motions, |c| whole.deviation_with_motion_mm(c));
         Self { motion, ..whole }
     }
 
-    fn with_motion(&self, contact: &Contact) -> f64 {
+    fn deviation_with_motion_mm(&self, contact: &Contact) -> f64 {
         let slides = self.slides.iter().enumerate().map(|(k, value)| value * of_slide(contact, &self.extent, k));
         let parameters = ParameterKind::ALL.into_iter().zip(&self.parameters);
         slides.sum::<f64>() + parameters.map(|(kind, value)| value * kind.effect(contact, self.term)).sum::<f64>()
@@ -41,7 +41,7 @@ impl Smooth {
     /// Returns the part of the deviation at a contact that parameters and slides explain, after shrinkage and without
     /// the motion of the part that it contains, in millimetres.
     pub fn at(&self, contact: &Contact) -> f64 {
-        self.with_motion(contact) - self.motion.at(contact)
+        self.deviation_with_motion_mm(contact) - self.motion.at(contact)
     }
 }
 
@@ -58,7 +58,7 @@ pub fn smooth_of(
 ) -> Vec<f64> {
     let on_part = |c: &Contact| Contact { deviation_mm: grid.interpolate(values_mm, [c.point.x, c.point.y]), ..*c };
     let told = parameters(&contacts.iter().map(on_part).collect::<Vec<_>>(), None, options);
-    told.map_or_else(|_| vec![0.0; nodes.len()], |told| nodes.iter().map(|node| told.smooth.at(node)).collect())
+    told.map_or_else(|_| vec![0.0; nodes.len()], |told| nodes.iter().map(|node| told.explained.at(node)).collect())
 }
 
 /// Motion of the part that registration fits to a change of the surface.
@@ -66,7 +66,7 @@ pub fn smooth_of(
 struct Motion([f64; 6]);
 
 impl Motion {
-    fn of(contacts: &[Contact], free: [bool; 6], of: impl Fn(&Contact) -> f64) -> Self {
+    fn fit(contacts: &[Contact], free: [bool; 6], of: impl Fn(&Contact) -> f64) -> Self {
         let row = |c: &Contact| Vector6::from_fn(|k, _| if free[k] { of_motion(c, k) } else { 0.0 });
         let gram: Matrix6<f64> = contacts.iter().map(|c| row(c) * row(c).transpose()).sum();
         let towards: Vector6<f64> = contacts.iter().map(|c| row(c) * of(c)).sum();
@@ -114,7 +114,7 @@ impl Set {
     ///
     /// Shapes: `contacts` where the part was measured, `nodes` the places of the surface under the nodes of the
     /// correction. Units: millimetres, radians.
-    pub fn of(
+    pub fn from_values(
         values: [f64; ParameterKind::COUNT],
         since_cycle: u16,
         [contacts, nodes]: [&[Contact]; 2],
@@ -127,7 +127,7 @@ impl Set {
             let each = ParameterKind::ALL.into_iter().zip(values).filter(|(kind, _)| Some(*kind) != but);
             -each.map(|(kind, value)| value * kind.effect(c, options.wheel_term)).sum::<f64>()
         };
-        let motion = Motion::of(contacts, options.free_motions, |c| of(c, None));
+        let motion = Motion::fit(contacts, options.free_motions, |c| of(c, None));
         let displaced_mm: Vec<f64> = nodes.iter().map(|node| of(node, None)).collect();
         let setting_mm = nodes.iter().map(|node| of(node, Some(ParameterKind::WheelRadius))).collect();
         let seen_mm = nodes.iter().zip(&displaced_mm).map(|(node, of)| of - motion.at(node)).collect();
@@ -140,7 +140,7 @@ impl Set {
     }
 
     /// Returns true if every number is finite and each vector has one value per node.
-    pub fn is_sound(&self, nodes: usize) -> bool {
+    pub fn is_valid(&self, nodes: usize) -> bool {
         let each = [&self.displaced_mm, &self.setting_mm, &self.seen_mm];
         self.values.iter().all(|v| v.is_finite())
             && each.iter().all(|of| of.len() == nodes && of.iter().all(|v| v.is_finite()))
@@ -149,7 +149,7 @@ impl Set {
 
 impl Contact {
     /// Returns the places of a surface under the nodes of a grid; outside the known surface, the nearest known place.
-    pub fn under(surface: &Field, grid: &Grid) -> Vec<Self> {
+    pub fn under_nodes(surface: &Field, grid: &Grid) -> Vec<Self> {
         let at = |k: usize| {
             let [x, y] = grid.place_mm(k);
             let Jet { value, slope: [p, q], .. } = surface.at([x, y]);

@@ -35,12 +35,12 @@ impl ParameterKind {
     }
 
     /// Returns the number of these units in one unit of the parameter's value (radian or millimetre).
-    pub fn units(self) -> f64 {
+    pub fn display_units_per_unit(self) -> f64 {
         if self.is_angle() { 1e6 } else { 1e3 }
     }
 
     /// Returns the recipe key by which the parameter is compensated; `None` if it never is.
-    pub fn key(self) -> Option<&'static str> {
+    pub fn recipe_key(self) -> Option<&'static str> {
         match self {
             Self::WheelRadius => Some("wheel_radius_um"),
             Self::SettingX => Some("wheel_x_um"),
@@ -81,18 +81,18 @@ pub(super) fn alike(target: &[f64], others: &[(String, &Vec<f64>)]) -> Vec<Strin
 }
 
 pub(super) fn message(parameter: &Parameter, rest_rms_mm: f64, options: &ParameterOptions) -> String {
-    let Parameter { kind, value, sigma, taken, .. } = *parameter;
-    let (name, unit, units) = (name(kind), kind.unit(), kind.units());
-    if !parameter.alike.is_empty() {
-        let alike = parameter.alike.join(" and ");
+    let Parameter { kind, value, sigma, compensated: taken, .. } = *parameter;
+    let (name, unit, units) = (name(kind), kind.unit(), kind.display_units_per_unit());
+    if !parameter.inseparable_from.is_empty() {
+        let alike = parameter.inseparable_from.join(" and ");
         return format!("{name}: cannot be separated from {alike}; the map corrects it");
     }
     let found = format!("{:.2} \u{b1} {:.2} {unit}", units * value, EXPANDED * units * sigma);
-    if !parameter.offered {
+    if !parameter.is_offered {
         return format!("{name}: off by {found}, which is not significant; the map corrects it");
     }
-    let with_um = 1e3 * (rest_rms_mm + parameter.removes_rms_mm);
-    let gain = format!("{:.2} of {with_um:.2} um rms", 1e3 * parameter.removes_rms_mm);
+    let with_um = 1e3 * (rest_rms_mm + parameter.rms_reduction_mm);
+    let gain = format!("{:.2} of {with_um:.2} um rms", 1e3 * parameter.rms_reduction_mm);
     let stated = match kind {
         ParameterKind::WheelRadius => {
             let (true_mm, stated_mm) = (options.wheel_radius_mm + value, options.wheel_radius_mm);
@@ -101,7 +101,7 @@ pub(super) fn message(parameter: &Parameter, rest_rms_mm: f64, options: &Paramet
         _ => String::new(),
     };
     let off = format!("{name}: {stated}off by {found}, which explains {gain}");
-    let key = kind.key().map(|key| format!("compensation.parameters.{key}"));
+    let key = kind.recipe_key().map(|key| format!("compensation.parameters.{key}"));
     match (key, taken) {
         (Some(key), 0.0) => {
             format!("{off}; the map corrects it; to compensate the parameter itself, set {key} to its tolerance")

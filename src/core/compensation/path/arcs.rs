@@ -43,17 +43,17 @@ impl Plane {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ArcOptions {
     /// Maximum deviation of an arc from the path of the wheel's centre, in millimetres.
-    pub within_mm: f64,
+    pub tolerance_mm: f64,
     /// Number of steps of the last written digit in a millimetre.
-    pub per_mm: f64,
+    pub steps_per_mm: f64,
     /// Maximum difference between the radius at the end and at the start, in millimetres.
-    pub radius_error_mm: f64,
+    pub max_radius_error_mm: f64,
     /// Maximum coordinate of a centre, and maximum offset of a centre from the start along an axis, in millimetres.
-    pub largest_mm: f64,
+    pub max_coordinate_mm: f64,
     /// True if the third axis may move during an arc.
-    pub helix: bool,
+    pub allows_helix: bool,
     /// Minimum number of lines that an arc must replace.
-    pub least_lines: usize,
+    pub min_lines: usize,
 }
 
 /// Arc at a feed, from the end of the previous move.
@@ -169,7 +169,7 @@ impl Iterator for Sampled<'_> {
 #[derive(Clone, Copy, Debug)]
 struct Sample {
     middle: Point,
-    at: Point,
+    point: Point,
     feed_mm_min: f64,
 }
 
@@ -196,8 +196,8 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> Arcs<S> {
     fn fill(&mut self) {
         while self.window.len() < WINDOW && self.after.is_none() {
             match self.source.next() {
-                Some((Move::Feed { at, feed_mm_min }, Some(middle))) => {
-                    self.window.push_back(Sample { middle, at, feed_mm_min });
+                Some((Move::Feed { to: at, feed_mm_min }, Some(middle))) => {
+                    self.window.push_back(Sample { middle, point: at, feed_mm_min });
                 }
                 Some((other, _)) => self.after = Some(other),
                 None => break,
@@ -208,7 +208,7 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> Arcs<S> {
     /// Returns the longest arc from the current point and the number of points that it replaces, or `None` and the
     /// number of points that stay lines. The search doubles the number of points, then bisects.
     fn longest(&mut self) -> (usize, Option<Arc>) {
-        let least = self.options.least_lines.max(2);
+        let least = self.options.min_lines.max(2);
         let from = self.from;
         let window = self.window.make_contiguous();
         let feed = window[0].feed_mm_min;
@@ -218,20 +218,20 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> Arcs<S> {
         }
         let fit = |count: usize| fit(from, &window[..count], &self.options);
         let mut found = match fit(least) {
-            Fit::Not => return (1, None),
+            Fit::Neither => return (1, None),
             found => (least, found),
         };
         let mut beyond = most + 1;
         while 2 * found.0 < beyond {
             match fit(2 * found.0) {
-                Fit::Not => beyond = 2 * found.0,
+                Fit::Neither => beyond = 2 * found.0,
                 better => found = (2 * found.0, better),
             }
         }
         while beyond - found.0 > 1 {
             let count = usize::midpoint(found.0, beyond);
             match fit(count) {
-                Fit::Not => beyond = count,
+                Fit::Neither => beyond = count,
                 better => found = (count, better),
             }
         }
@@ -249,7 +249,7 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> Iterator for Arcs<S> {
         self.fill();
         if self.window.is_empty() {
             let one = self.after.take()?;
-            if let Move::Feed { at, .. } = one {
+            if let Move::Feed { to: at, .. } = one {
                 self.from = at;
             }
             return Some(Block::Straight(one));
@@ -265,9 +265,9 @@ impl<S: Iterator<Item = (Move, Option<Point>)>> Iterator for Arcs<S> {
             }
         }
         self.lines -= 1;
-        let Sample { at, feed_mm_min, .. } = self.window.pop_front()?;
+        let Sample { point: at, feed_mm_min, .. } = self.window.pop_front()?;
         self.from = at;
-        Some(Block::Straight(Move::Feed { at, feed_mm_min }))
+        Some(Block::Straight(Move::Feed { to: at, feed_mm_min }))
     }
 }
 
@@ -278,19 +278,19 @@ enum Fit {
     /// A straight line within the tolerance.
     Straight,
     /// Neither an arc nor a line within the tolerance.
-    Not,
+    Neither,
 }
 
 /// Fits an arc from a point through the samples. The last sample is its end.
 fn fit(from: Point, samples: &[Sample], options: &ArcOptions) -> Fit {
-    let Some(frame) = Chord::of(from, samples, options) else { return Fit::Not };
-    let Some([low, high]) = frame.bends(samples, options.within_mm) else { return Fit::Not };
+    let Some(frame) = Chord::of(from, samples, options) else { return Fit::Neither };
+    let Some([low, high]) = frame.bends(samples, options.tolerance_mm) else { return Fit::Neither };
     if low <= 0.0 && 0.0 <= high {
-        return if frame.is_level(samples, options.within_mm) { Fit::Straight } else { Fit::Not };
+        return if frame.is_level(samples, options.tolerance_mm) { Fit::Straight } else { Fit::Neither };
     }
     match frame.arc(from, samples, 0.5 * (low + high), options) {
-        Some(arc) if arc.deviation_mm <= options.within_mm => Fit::Arc(arc),
-        _ => Fit::Not,
+        Some(arc) if arc.deviation_mm <= options.tolerance_mm => Fit::Arc(arc),
+        _ => Fit::Neither,
     }
 }
 
@@ -306,10 +306,10 @@ struct Chord {
 
 impl Chord {
     fn of(from: Point, samples: &[Sample], options: &ArcOptions) -> Option<Self> {
-        let last = samples.last()?.at;
+        let last = samples.last()?.point;
         let ends = [from, last].map(|p| p.map(|v| written(v, options)));
         // Choose the plane in which the points turn most: half-way they are farthest from their chord.
-        let turn: Vector = (samples[(samples.len() - 1) / 2].at - ends[0]).cross(&(ends[1] - ends[0]));
+        let turn: Vector = (samples[(samples.len() - 1) / 2].point - ends[0]).cross(&(ends[1] - ends[0]));
         let plane = [Plane::XY, Plane::ZX, Plane::YZ].into_iter().max_by(|p, q| {
             let share = |plane: &Plane| turn[plane.0[2]].abs();
             share(p).total_cmp(&share(q))
@@ -317,8 +317,8 @@ impl Chord {
         let [a, b, c] = plane.0;
         let by = ends[1] - ends[0];
         let length = by[a].hypot(by[b]);
-        let moves_along = if options.helix { STEEPEST * length } else { 0.0 };
-        if by[c].abs() > moves_along || length < 2.0 / options.per_mm {
+        let moves_along = if options.allows_helix { STEEPEST * length } else { 0.0 };
+        if by[c].abs() > moves_along || length < 2.0 / options.steps_per_mm {
             return None;
         }
         let middle = [a, b].map(|k| 0.5 * (ends[0][k] + ends[1][k]));
@@ -344,7 +344,7 @@ impl Chord {
     fn bends(&self, samples: &[Sample], within_mm: f64) -> Option<[f64; 2]> {
         let widest = WIDEST / self.half;
         let [mut low, mut high] = [-widest, widest];
-        for p in samples.iter().flat_map(|s| [&s.middle, &s.at]) {
+        for p in samples.iter().flat_map(|s| [&s.middle, &s.point]) {
             let [u, v] = self.beside(p);
             let w = u * u + v * v - self.half * self.half;
             if w.abs() < f64::EPSILON {
@@ -365,8 +365,8 @@ impl Chord {
         let c = self.plane.0[2];
         let [first, last] = [self.ends[0][c], self.ends[1][c]];
         samples.iter().all(|sample| {
-            let share = 0.5 * (1.0 + self.beside(&sample.at)[0] / self.half);
-            (sample.at[c] - first - share * (last - first)).abs() <= within_mm
+            let share = 0.5 * (1.0 + self.beside(&sample.point)[0] / self.half);
+            (sample.point[c] - first - share * (last - first)).abs() <= within_mm
         })
     }
 
@@ -379,14 +379,14 @@ impl Chord {
         let circle = Circle::of(self, centre_mm);
         let [a, b, _] = self.plane.0;
         let from_start = [centre_mm[0] - self.ends[0][a], centre_mm[1] - self.ends[0][b]];
-        let too_far = centre_mm.iter().chain(&from_start).any(|v| v.abs() > options.largest_mm);
-        if too_far || circle.radius_error().abs() > options.radius_error_mm {
+        let too_far = centre_mm.iter().chain(&from_start).any(|v| v.abs() > options.max_coordinate_mm);
+        if too_far || circle.radius_error().abs() > options.max_radius_error_mm {
             return None;
         }
         let mut last = circle.off(&from)?;
         let [mut most, mut between] = [size(last), 0.0f64];
         for sample in samples {
-            let (half_way, now) = (circle.off(&sample.middle)?, circle.off(&sample.at)?);
+            let (half_way, now) = (circle.off(&sample.middle)?, circle.off(&sample.point)?);
             most = most.max(size(half_way)).max(size(now));
             // The deviation curves a quarter as much between a point and the middle as between two points.
             let bend = [0, 1].map(|k| half_way[k] - 0.5 * (last[k] + now[k]));
@@ -395,7 +395,7 @@ impl Chord {
         }
         // Controls differ in where along the arc they put the difference between the radii.
         let deviation_mm = most + between + circle.radius_error().abs();
-        let Sample { at: to, feed_mm_min, .. } = *samples.last()?;
+        let Sample { point: to, feed_mm_min, .. } = *samples.last()?;
         Some(Arc { plane: self.plane, clockwise: bend < 0.0, to, centre_mm, feed_mm_min, deviation_mm })
     }
 }
@@ -454,7 +454,7 @@ fn size([x, y]: [f64; 2]) -> f64 {
 
 /// Returns a coordinate rounded as it is written.
 fn written(value_mm: f64, options: &ArcOptions) -> f64 {
-    (value_mm * options.per_mm).round() / options.per_mm
+    (value_mm * options.steps_per_mm).round() / options.steps_per_mm
 }
 
 /// Calls `tell` for every block with the angle between its start direction and the end direction of the previous
@@ -463,7 +463,7 @@ fn corners(blocks: impl Iterator<Item = Block>, mut tell: impl FnMut(&Block, f64
     let (mut from, mut heading): (Option<Point>, Option<Vector>) = (None, None);
     for block in blocks {
         let (to, directions) = match (&block, from) {
-            (Block::Straight(Move::Feed { at, .. }), from) => (Some(*at), from.map(|from| [at - from; 2])),
+            (Block::Straight(Move::Feed { to: at, .. }), from) => (Some(*at), from.map(|from| [at - from; 2])),
             (Block::Arc(arc), Some(from)) => (Some(arc.to), Some(arc.directions(from))),
             _ => (None, None),
         };
@@ -497,12 +497,12 @@ mod tests {
     use super::*;
 
     const OPTIONS: ArcOptions = ArcOptions {
-        within_mm: 1e-4,
-        per_mm: 1e6,
-        radius_error_mm: 2e-3,
-        largest_mm: 1e6,
-        helix: true,
-        least_lines: 2,
+        tolerance_mm: 1e-4,
+        steps_per_mm: 1e6,
+        max_radius_error_mm: 2e-3,
+        max_coordinate_mm: 1e6,
+        allows_helix: true,
+        min_lines: 2,
     };
 
     /// Returns a track along a curve over a parameter from 0 to 1, in equal steps.
@@ -516,9 +516,9 @@ mod tests {
         feed: impl Fn(usize) -> f64,
     ) -> impl Iterator<Item = (Move, Option<Point>)> {
         let of = |k: f64| k / steps as f64;
-        let began = Move::Feed { at: curve(0.0), feed_mm_min: feed(0) };
+        let began = Move::Feed { to: curve(0.0), feed_mm_min: feed(0) };
         let along: Vec<_> = (1..=steps)
-            .map(|k| (Move::Feed { at: curve(of(k as f64)), feed_mm_min: feed(k) }, Some(curve(of(k as f64 - 0.5)))))
+            .map(|k| (Move::Feed { to: curve(of(k as f64)), feed_mm_min: feed(k) }, Some(curve(of(k as f64 - 0.5)))))
             .collect();
         let ends = [(Move::RapidZ(10.0), None)];
         [(Move::RapidZ(9.0), None), (began, None)].into_iter().chain(along).chain(ends)
@@ -548,7 +548,7 @@ mod tests {
             // With a sagitta of 0.8 mm the radius is 25 times less certain than the middle of the arc.
             assert!((arc.centre_mm[0] + 5.0).abs() < 0.01 && (arc.centre_mm[1] - 3.0).abs() < 0.01, "{arc:?}");
             assert!(arc.deviation_mm < 1e-4);
-            let flat = ArcOptions { helix: false, ..OPTIONS };
+            let flat = ArcOptions { allows_helix: false, ..OPTIONS };
             let flat = arcs_of(&Arcs::new(track(quarter(y_mm), 300), &flat).collect::<Vec<_>>()).len();
             assert_eq!(flat, usize::from(y_mm == 0.0));
         }
@@ -622,13 +622,13 @@ mod tests {
         let below = PathOptions { from_below: true, ..ball(8.0) };
         for (options, per_mm) in [(ball(8.0), 1e6), (ball(8.0), 1e4), (spiral, 1e6), (below, 1e6)] {
             let path = path(quadric(0.01, -0.006), PathOptions { chord_error_mm: 2e-4, ..options }).unwrap();
-            let within = ArcOptions { within_mm: 2e-4, per_mm, ..OPTIONS };
+            let within = ArcOptions { tolerance_mm: 2e-4, steps_per_mm: per_mm, ..OPTIONS };
             let written = |p: Point| p.map(|v| (v * per_mm).round() / per_mm);
             for (k, blocks) in path.arcs_by_track(&within).into_iter().enumerate().step_by(2) {
                 let span = path.tracks.spans[k];
                 let (first, last) = span.with_leads(path.options());
                 let centre = |t: f64| {
-                    let p = path.stand(&span, t).at;
+                    let p = path.stand(&span, t).programmed_point;
                     Point::new(p.x, p.y, path.upright(p.z))
                 };
                 let (mut from, mut t) = (Point::origin(), first);
@@ -652,7 +652,7 @@ mod tests {
                             );
                         }
                         from = written(arc.to);
-                    } else if let Block::Straight(Move::Feed { at, .. }) = block {
+                    } else if let Block::Straight(Move::Feed { to: at, .. }) = block {
                         from = written(at);
                     }
                 }
@@ -670,7 +670,7 @@ mod tests {
             let blocks: Vec<Block> = path.arcs_by_track(&OPTIONS).into_iter().flatten().collect();
             assert_eq!(summary.moves, blocks.len() as u64);
             assert_eq!(summary.arcs, arcs_of(&blocks).len() as u64);
-            assert!(summary.deviation_mm <= OPTIONS.within_mm && summary.deviation_mm > 0.3 * OPTIONS.within_mm);
+            assert!(summary.deviation_mm <= OPTIONS.tolerance_mm && summary.deviation_mm > 0.3 * OPTIONS.tolerance_mm);
             let at_feed = summary.arcs + summary.lines;
             assert!(3 * at_feed < plain.points, "{at_feed} for {} {pattern:?}", plain.points);
             assert!(summary.corner_rad[0] < summary.corner_rad[1], "{:?}", summary.corner_rad);

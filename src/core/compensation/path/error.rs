@@ -47,7 +47,7 @@ pub enum PathError {
         "{refused}; tilted by {angle_deg}°, right-handed about the axis that {letter} turns about, this wheel \
          reaches everywhere: write [grinding.tilt] with angle_deg = {angle_deg:?}"
     )]
-    Upright { refused: Box<PathError>, letter: char, angle_deg: f64 },
+    NeedsTilt { refused: Box<PathError>, letter: char, angle_deg: f64 },
     #[error(
         "grinding.tilt requires a rotary axis, and the grinder has none; remove it, or describe the axis: \
          [grinder.rotary] in the cell file"
@@ -76,7 +76,7 @@ pub enum PathError {
         "the path reaches {axis} {found_mm:.3} mm, outside the travel of {least_mm} to {most_mm} mm; move the part \
          or its work offset, or shorten the overrun"
     )]
-    Travel { axis: char, found_mm: f64, least_mm: f64, most_mm: f64 },
+    Travel { axis: char, found_mm: f64, min_mm: f64, max_mm: f64 },
     #[error(
         "the path moves {axis} at {found_mm_s:.2} mm/s at x {x_mm:.3}, y {y_mm:.3} mm; the limit of the machine is \
          {limit_mm_s} mm/s; lower the feed to {feed_mm_min:.0} mm/min"

@@ -17,13 +17,13 @@ pub struct Jet {
     /// Slopes along x and y.
     pub slope: [f64; 2],
     /// Second derivatives: by x twice, by x and y, by y twice.
-    pub bend: [f64; 3],
+    pub second_derivatives: [f64; 3],
 }
 
 /// Smooth height over a regular grid.
 #[derive(Clone, Debug)]
 pub struct Field {
-    on: Grid,
+    grid: Grid,
     per_mm: [f64; 2],
     /// Value, slope along x, slope along y, and twist (mixed derivative) at every node. The unit of length along x and
     /// y is one cell.
@@ -61,7 +61,7 @@ impl Field {
     }
 
     fn of(on: Grid, nodes: Vec<[f64; 4]>) -> Self {
-        Self { on, per_mm: on.spacing_mm.map(|h| 1.0 / h), nodes }
+        Self { grid: on, per_mm: on.spacing_mm.map(|h| 1.0 / h), nodes }
     }
 
     /// Returns the field with `by` subtracted from every height.
@@ -86,23 +86,23 @@ impl Field {
     /// Returns the value and its derivatives at a place.
     #[inline]
     pub fn at(&self, [x, y]: [f64; 2]) -> Jet {
-        let (i, u, over_u) = cell((x - self.on.first_mm[0]) * self.per_mm[0], self.on.columns);
-        let (j, v, over_v) = cell((y - self.on.first_mm[1]) * self.per_mm[1], self.on.rows);
+        let (i, u, over_u) = cell((x - self.grid.first_mm[0]) * self.per_mm[0], self.grid.columns);
+        let (j, v, over_v) = cell((y - self.grid.first_mm[1]) * self.per_mm[1], self.grid.rows);
         let mut jet = self.within(i, j, u, v);
         if over_u != 0.0 || over_v != 0.0 {
             continued(&mut jet, [over_u, over_v]);
         }
         let [a, b] = self.per_mm;
         jet.slope = [jet.slope[0] * a, jet.slope[1] * b];
-        jet.bend = [jet.bend[0] * a * a, jet.bend[1] * a * b, jet.bend[2] * b * b];
+        jet.second_derivatives = [jet.second_derivatives[0] * a * a, jet.second_derivatives[1] * a * b, jet.second_derivatives[2] * b * b];
         jet
     }
 
     /// Evaluates the bicubic of a cell at (u, v) in [0, 1]. The unit of length is one cell.
     #[inline]
     fn within(&self, i: usize, j: usize, u: f64, v: f64) -> Jet {
-        let below = j * self.on.columns + i;
-        let above = below + self.on.columns;
+        let below = j * self.grid.columns + i;
+        let above = below + self.grid.columns;
         let (low, high) = (&self.nodes[below..below + 2], &self.nodes[above..above + 2]);
         let across = Basis::at(u);
         // Along u on both rows: the height (a), and its slope across the rows (b).
@@ -118,7 +118,7 @@ impl Field {
         let [value, by_v, by_vv] = up.curve(a0[0], b0[0], a1[0], b1[0]);
         let [by_u, by_uv, _] = up.curve(a0[1], b0[1], a1[1], b1[1]);
         let by_uu = up.value[0] * a0[2] + up.value[1] * b0[2] + up.value[2] * a1[2] + up.value[3] * b1[2];
-        Jet { value, slope: [by_u, by_v], bend: [by_uu, by_uv, by_vv] }
+        Jet { value, slope: [by_u, by_v], second_derivatives: [by_uu, by_uv, by_vv] }
     }
 }
 
@@ -134,14 +134,14 @@ fn cell(at: f64, nodes: usize) -> (usize, f64, f64) {
 /// Continues a jet at the border along its tangents, by (du, dv) cells beyond the border.
 #[cold]
 fn continued(jet: &mut Jet, [du, dv]: [f64; 2]) {
-    let ([su, sv], twist) = (jet.slope, jet.bend[1]);
+    let ([su, sv], twist) = (jet.slope, jet.second_derivatives[1]);
     jet.value += su * du + sv * dv + twist * du * dv;
     jet.slope = [su + twist * dv, sv + twist * du];
     if du != 0.0 {
-        jet.bend[0] = 0.0;
+        jet.second_derivatives[0] = 0.0;
     }
     if dv != 0.0 {
-        jet.bend[2] = 0.0;
+        jet.second_derivatives[2] = 0.0;
     }
 }
 
@@ -150,7 +150,7 @@ fn continued(jet: &mut Jet, [du, dv]: [f64; 2]) {
 struct Basis {
     value: [f64; 4],
     slope: [f64; 4],
-    bend: [f64; 4],
+    second_derivatives: [f64; 4],
 }
 
 impl Basis {
@@ -162,7 +162,7 @@ impl Basis {
         Self {
             value: [1.0 - far, t * s * s, far, -t2 * s],
             slope: [-rise, s * (1.0 - 3.0 * t), rise, t * (3.0 * t - 2.0)],
-            bend: [12.0 * t - 6.0, 6.0 * t - 4.0, 6.0 - 12.0 * t, 6.0 * t - 2.0],
+            second_derivatives: [12.0 * t - 6.0, 6.0 * t - 4.0, 6.0 - 12.0 * t, 6.0 * t - 2.0],
         }
     }
 
@@ -170,7 +170,7 @@ impl Basis {
     #[inline]
     fn curve(&self, z0: f64, m0: f64, z1: f64, m1: f64) -> [f64; 3] {
         let sum = |w: &[f64; 4]| w[0] * z0 + w[1] * m0 + w[2] * z1 + w[3] * m1;
-        [sum(&self.value), sum(&self.slope), sum(&self.bend)]
+        [sum(&self.value), sum(&self.slope), sum(&self.second_derivatives)]
     }
 }
 
@@ -280,7 +280,7 @@ mod tests {
             (east.slope[1] - west.slope[1]) / (2.0 * h),
             (north.slope[1] - south.slope[1]) / (2.0 * h),
         ];
-        for (given, found) in jet.slope.into_iter().zip(slope).chain(jet.bend.into_iter().zip(bend)) {
+        for (given, found) in jet.slope.into_iter().zip(slope).chain(jet.second_derivatives.into_iter().zip(bend)) {
             assert!((given - found).abs() < 1e-6, "{place:?}: {given} against {found}");
         }
     }
@@ -318,7 +318,7 @@ mod tests {
         }
         let ([x, y], e) = ([0.25, 5.0], 1e-9);
         for k in 0..3 {
-            let (left, right) = (field.at([x - e, y - e]).bend[k], field.at([x + e, y + e]).bend[k]);
+            let (left, right) = (field.at([x - e, y - e]).second_derivatives[k], field.at([x + e, y + e]).second_derivatives[k]);
             assert!((left - right).abs() < 1e-9, "{left} {right}");
         }
         // Away from the border the error is of fourth order in the spacing. At the border the wave has a slope and the

@@ -31,7 +31,7 @@ pub(super) fn track_mm(wanted: &Wanted, outline: &Aperture, options: &PathOption
     let narrowest = distances.into_iter().reduce(narrower).unwrap_or(Err(PathError::Empty))?;
     match options.spacing {
         TrackSpacing::Distance(mm) => Ok(mm),
-        TrackSpacing::Scallop { widest_mm, .. } => Ok(narrowest.min(widest_mm)),
+        TrackSpacing::Scallop { max_track_mm: widest_mm, .. } => Ok(narrowest.min(widest_mm)),
     }
 }
 
@@ -76,7 +76,7 @@ pub(super) fn on_grid(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
 fn fit_at(bend: &Bend, place: [f64; 2], outline: &Aperture, options: &PathOptions) -> Result<f64, PathError> {
     let [x_mm, y_mm] = place;
     let normal = &bend.contact.normal;
-    let finite = (bend.curvature.iter().sum::<f64>() + bend.contact.point.z).is_finite();
+    let finite = (bend.second_form_per_mm.iter().sum::<f64>() + bend.contact.point.z).is_finite();
     if !finite {
         return Err(PathError::NotAHeight { x_mm, y_mm });
     }
@@ -90,20 +90,20 @@ fn fit_at(bend: &Bend, place: [f64; 2], outline: &Aperture, options: &PathOption
         return Err(PathError::CannotTouch { x_mm, y_mm });
     }
     let curved = wheel_in(bend, &wheel);
-    let [a, b, c] = std::array::from_fn(|k| curved[k] - MARGIN * bend.curvature[k]);
+    let [a, b, c] = std::array::from_fn(|k| curved[k] - MARGIN * bend.second_form_per_mm[k]);
     // The gap opens in every direction if trace and determinant of this form are both positive.
     if !(a + c > 0.0 && a * c - b * b > 0.0) {
         return Err(hollow(bend, &curved, place));
     }
-    let TrackSpacing::Scallop { height_mm: height, .. } = options.spacing else { return Ok(f64::INFINITY) };
+    let TrackSpacing::Scallop { max_height_mm: height, .. } = options.spacing else { return Ok(f64::INFINITY) };
     let groove = groove(bend, from_middle(outline, place), &wheel, options.pattern);
-    Ok((8.0 * height / groove.bend).sqrt() / groove.stretch)
+    Ok((8.0 * height / groove.curvature_per_mm).sqrt() / groove.stretch)
 }
 
 /// Returns the wheel's curvature in the directions of a bend, in 1/mm: along, mixed, across.
 pub(super) fn wheel_in(bend: &Bend, wheel: &Wheel) -> [f64; 3] {
     let ([around, across], direction) = wheel.curvatures(&bend.contact.normal);
-    let [c, s] = [0, 1].map(|k| direction.dot(&bend.along[k]));
+    let [c, s] = [0, 1].map(|k| direction.dot(&bend.tangents[k]));
     [around * c * c + across * s * s, (around - across) * s * c, around * s * s + across * c * c]
 }
 
@@ -113,10 +113,10 @@ fn hollow(bend: &Bend, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> PathError {
         let (s, c) = angle.sin_cos();
         q[0] * c * c + 2.0 * q[1] * s * c + q[2] * s * s
     };
-    let gap = |angle: f64| in_direction(wheel, angle) - MARGIN * in_direction(&bend.curvature, angle);
+    let gap = |angle: f64| in_direction(wheel, angle) - MARGIN * in_direction(&bend.second_form_per_mm, angle);
     let angles = (0..180).map(|d| f64::from(d).to_radians());
     let worst = angles.min_by(|a, b| gap(*a).total_cmp(&gap(*b))).unwrap_or(0.0);
-    let hollow_mm = 1.0 / in_direction(&bend.curvature, worst);
+    let hollow_mm = 1.0 / in_direction(&bend.second_form_per_mm, worst);
     PathError::Hollow {
         x_mm,
         y_mm,
@@ -265,7 +265,7 @@ pub(super) mod tests {
 
     #[test]
     fn the_scallop_height_sets_the_distance_of_tracks() {
-        let spacing = TrackSpacing::Scallop { height_mm: 1e-4, widest_mm: 5.0 };
+        let spacing = TrackSpacing::Scallop { max_height_mm: 1e-4, max_track_mm: 5.0 };
         let flat = path(quadric(0.0, 0.0), PathOptions { spacing, ..ball(10.0) }).unwrap();
         // h = s^2 / (8 R). Tracks are equally spaced between the borders, so they are a little closer.
         let most = (8.0f64 * 10.0 * 1e-4).sqrt();

@@ -26,7 +26,7 @@ const LEAST_UPRIGHT: f64 = 0.1;
 /// [`PathError::Empty`] if the points cover no area or give no surface.
 pub fn height_of(nominal: &Nominal) -> Result<(Field, Aperture), PathError> {
     let [low, high] = bounds(nominal.points().map(|p| [p.x, p.y]));
-    let outline = nominal.outline().cloned().unwrap_or(Aperture::between([low, high]));
+    let outline = nominal.outline().cloned().unwrap_or(Aperture::from_corners([low, high]));
     let field = match regular(nominal)? {
         Some(field) => field,
         None => sampled(nominal, [low, high])?,
@@ -126,8 +126,8 @@ fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<Field, PathE
 fn height_at(surface: &OffsetSurface, [x, y]: [f64; 2], start_mm: f64, place: &mut Place) -> Result<Node, PathError> {
     let mut z = start_mm;
     for _ in 0..STEPS {
-        let foot = surface.foot(&Point::new(x, y, z), *place);
-        *place = foot.place;
+        let foot = surface.project(&Point::new(x, y, z), *place);
+        *place = foot.facet;
         let n = foot.normal;
         if n.z < LEAST_UPRIGHT {
             return Err(PathError::NotAHeight { x_mm: x, y_mm: y });
@@ -135,7 +135,7 @@ fn height_at(surface: &OffsetSurface, [x, y]: [f64; 2], start_mm: f64, place: &m
         let step = foot.distance_mm / n.z;
         z -= step;
         if step.abs() < 1e-10 {
-            if foot.beyond_mm > 0.0 && foot.beyond_steps > 1.0 {
+            if foot.beyond_edge_mm > 0.0 && foot.beyond_edge_steps > 1.0 {
                 return Ok((f64::NAN, [0.0; 2]));
             }
             return Ok((z, [-n.x / n.z, -n.y / n.z]));
@@ -186,7 +186,7 @@ mod tests {
             .map(|k| [(f64::from(k) * 0.618_034).fract() * 20.0 - 10.0, (f64::from(k) + 0.5) / 200.0 - 7.5])
             .map(|[x, y]| Point::new(x, y, z(x, y).0))
             .collect();
-        let nominal = Nominal::scattered(points, Projection::Xy).unwrap();
+        let nominal = Nominal::from_triangulated_points(points, Projection::Xy).unwrap();
         let (field, _) = height_of(&nominal).unwrap();
         for [x, y] in [[0.3, 0.1], [-5.1, 2.7], [7.1, -5.8]] {
             assert!((field.at([x, y]).value - z(x, y).0).abs() < 2e-6, "{}", field.at([x, y]).value - z(x, y).0);

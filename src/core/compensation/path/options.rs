@@ -27,9 +27,9 @@ pub enum TrackSpacing {
     /// across the track.
     Scallop {
         /// Maximum height of the scallops, in millimetres.
-        height_mm: f64,
+        max_height_mm: f64,
         /// Upper limit of the distance, in millimetres.
-        widest_mm: f64,
+        max_track_mm: f64,
     },
 }
 
@@ -55,7 +55,7 @@ pub struct PathOptions {
     /// Rotary axis of the machine's head, if it has one.
     pub rotary: Option<Rotary>,
     /// Tilt of the wheel about this axis. With `None` the axis does not move, and programs do not contain it.
-    pub lean: Option<Lean>,
+    pub tilt: Option<Lean>,
     /// True if the wheel comes from -z. The surface and the wheel (spindle, heights) are then given as seen from
     /// there, mirrored in z. The moves of the path are in the model frame.
     pub from_below: bool,
@@ -69,7 +69,7 @@ pub struct PathOptions {
     /// millimetres.
     pub chord_error_mm: f64,
     /// Maximum distance between two successive points, over x and y, in millimetres.
-    pub longest_step_mm: f64,
+    pub max_step_mm: f64,
     /// Length by which tracks continue beyond the edge of the part, on the tangent of the surface, in millimetres.
     pub overrun_mm: f64,
     /// Length of the lead-in and of the lead-out beyond the overrun, over x and y, in millimetres. In the leads the
@@ -91,13 +91,13 @@ impl PathOptions {
         Self {
             wheel,
             rotary: None,
-            lean: None,
+            tilt: None,
             from_below: false,
             pattern: Pattern::Raster,
             one_way: false,
             spacing: TrackSpacing::Distance(track_mm),
             chord_error_mm: 1e-4,
-            longest_step_mm: 1.0,
+            max_step_mm: 1.0,
             overrun_mm: 2.0,
             lead_mm: 2.0,
             lead_radius_mm: 5.0,
@@ -111,7 +111,7 @@ impl PathOptions {
     pub(super) fn check(&self) -> Result<(), PathError> {
         let (spacing, height) = match self.spacing {
             TrackSpacing::Distance(mm) => (mm, 1.0),
-            TrackSpacing::Scallop { height_mm, widest_mm } => (widest_mm, height_mm),
+            TrackSpacing::Scallop { max_height_mm: height_mm, max_track_mm: widest_mm } => (widest_mm, height_mm),
         };
         let (radius, tube) = match self.wheel {
             Wheel::Sphere { radius_mm } => (radius_mm, radius_mm),
@@ -123,7 +123,7 @@ impl PathOptions {
             ("wheel radius (mm)", radius),
             ("radius of the rim's curve (mm)", tube),
             ("chord error (mm)", self.chord_error_mm),
-            ("longest step (mm)", self.longest_step_mm),
+            ("longest step (mm)", self.max_step_mm),
             ("lead radius (mm)", self.lead_radius_mm),
             ("feed (mm/min)", self.feed_mm_min),
             ("acceleration on a spiral (mm/s2)", self.spiral_acceleration_mm_s2.unwrap_or(1.0)),
@@ -146,7 +146,7 @@ impl PathOptions {
     /// Rejects a tilt that is not possible: no rotary axis, a wheel from below, an angle that is not finite, or a
     /// following tilt that keeps the pole of a ball on the surface.
     fn check_lean(&self) -> Result<(), PathError> {
-        let Some(lean) = self.lean else { return Ok(()) };
+        let Some(lean) = self.tilt else { return Ok(()) };
         if self.rotary.is_none() {
             return Err(PathError::NoRotary);
         }

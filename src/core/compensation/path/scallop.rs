@@ -50,7 +50,7 @@ impl Scallops {
         let height = |place: &[f64; 2]| {
             let bend = wanted.bend(*place);
             let wheel = wheel_at(&bend.contact);
-            let Groove { bend, stretch } = groove(&bend, from_middle(outline, *place), &wheel, pattern);
+            let Groove { curvature_per_mm: bend, stretch } = groove(&bend, from_middle(outline, *place), &wheel, pattern);
             let height = (track_mm * stretch).powi(2) * bend / 8.0;
             if height.is_finite() { height } else { 0.0 }
         };
@@ -94,7 +94,7 @@ impl ToolPath {
 /// Groove that the wheel leaves at a place.
 pub(super) struct Groove {
     /// Curvature of the groove relative to the surface, across the track, in 1/mm; 0 if there is no groove.
-    pub(super) bend: f64,
+    pub(super) curvature_per_mm: f64,
     /// Ratio of the distance between two tracks along the surface, across the track, to their distance over x and y.
     pub(super) stretch: f64,
 }
@@ -119,15 +119,15 @@ pub(super) fn groove(bend: &Bend, [x, y]: [f64; 2], wheel: &Wheel, pattern: Patt
     let across = n.cross(&track);
     let stretch = on_surface(-north, east).dot(&across).abs();
     let wheel = wheel_in(bend, wheel);
-    let gap: [f64; 3] = std::array::from_fn(|k| wheel[k] - bend.curvature[k]);
-    let [c, s] = [0, 1].map(|k| track.dot(&bend.along[k]));
+    let gap: [f64; 3] = std::array::from_fn(|k| wheel[k] - bend.second_form_per_mm[k]);
+    let [c, s] = [0, 1].map(|k| track.dot(&bend.tangents[k]));
     let [along, mixed, over] = [
         gap[0] * c * c + 2.0 * gap[1] * s * c + gap[2] * s * s,
         (gap[2] - gap[0]) * s * c + gap[1] * (c * c - s * s),
         gap[0] * s * s - 2.0 * gap[1] * s * c + gap[2] * c * c,
     ];
     let swept = over - if mixed == 0.0 { 0.0 } else { mixed * mixed / along };
-    Groove { bend: if swept > 0.0 { swept } else { 0.0 }, stretch }
+    Groove { curvature_per_mm: if swept > 0.0 { swept } else { 0.0 }, stretch }
 }
 
 #[cfg(test)]

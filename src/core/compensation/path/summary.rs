@@ -55,7 +55,7 @@ pub struct Peak {
     /// Extreme value.
     pub value: f64,
     /// Place in x and y.
-    pub at_mm: [f64; 2],
+    pub place_mm: [f64; 2],
     /// Feed at this place.
     pub feed_mm_min: f64,
 }
@@ -66,11 +66,11 @@ pub struct Turned {
     /// Rotary axis of the head.
     pub rotary: Rotary,
     /// Smallest tilt.
-    pub least_rad: Peak,
+    pub min_tilt_rad: Peak,
     /// Largest tilt.
-    pub most_rad: Peak,
+    pub max_tilt_rad: Peak,
     /// Largest angular speed at feed.
-    pub rate_rad_s: Peak,
+    pub max_rate_rad_s: Peak,
 }
 
 /// Summary of a whole path.
@@ -81,15 +81,15 @@ pub struct Summary {
     /// Number of points at feed.
     pub points: u64,
     /// Smallest x, y, z.
-    pub least_mm: [f64; 3],
+    pub min_mm: [f64; 3],
     /// Largest x, y, z.
-    pub most_mm: [f64; 3],
+    pub max_mm: [f64; 3],
     /// Length of the path of the wheel's centre at feed.
     pub length_mm: f64,
     /// Length of the rapid moves along z. Rapid moves in x and y do not count.
     pub rapid_mm: f64,
     /// Time of the moves at feed, in s, without time for acceleration.
-    pub seconds: f64,
+    pub duration_s: f64,
     /// Largest speed of each axis, in mm/s.
     pub speed_mm_s: [Peak; 3],
     /// Largest acceleration across the path, in mm/s²: v^2 times the curvature.
@@ -103,7 +103,7 @@ pub struct Summary {
     /// Distance from standstill to the part: overrun plus lead.
     pub run_up_mm: f64,
     /// Rotation of the head; `None` if the wheel is not tilted.
-    pub turned: Option<Turned>,
+    pub head_rotation: Option<Turned>,
 }
 
 impl ToolPath {
@@ -116,17 +116,17 @@ impl ToolPath {
         let empty = Summary {
             moves: 0,
             points: 0,
-            least_mm: [f64::INFINITY; 3],
-            most_mm: [f64::NEG_INFINITY; 3],
+            min_mm: [f64::INFINITY; 3],
+            max_mm: [f64::NEG_INFINITY; 3],
             length_mm: 0.0,
             rapid_mm: 0.0,
-            seconds: 0.0,
+            duration_s: 0.0,
             speed_mm_s: [Peak::default(); 3],
             acceleration_mm_s2: Peak::default(),
             jerk_mm_s3: Peak::default(),
             feed_mm_min: options.feed_mm_min,
             run_up_mm: options.overrun_mm + options.lead_mm,
-            turned: options.leaning().map(Turned::not_yet),
+            head_rotation: options.leaning().map(Turned::not_yet),
         };
         let tracks: Vec<Summary> = (0..self.tracks())
             .into_par_iter()
@@ -157,21 +157,21 @@ impl Summary {
                 Move::RapidZ(z) => {
                     let from = last.take().map_or(height, |p| p.z);
                     self.rapid_mm += (z - from).abs();
-                    (self.least_mm[2], self.most_mm[2]) = (self.least_mm[2].min(z), self.most_mm[2].max(z));
+                    (self.min_mm[2], self.max_mm[2]) = (self.min_mm[2].min(z), self.max_mm[2].max(z));
                     height = z;
                 }
                 Move::RapidXy(_) => {}
                 Move::RapidTilted { to_mm, tilt_rad } => {
                     tilted = Some(tilt_rad);
-                    self.turned.iter_mut().for_each(|turned| turned.to(tilt_rad, to_mm));
+                    self.head_rotation.iter_mut().for_each(|turned| turned.to(tilt_rad, to_mm));
                 }
-                Move::FeedTilted { at, tilt_rad, feed_mm_min, centre_mm } => {
+                Move::FeedTilted { to: at, tilt_rad, feed_mm_min, centre_mm } => {
                     let seconds = 60.0 * centre_mm / feed_mm_min;
                     let by_rad = tilted.replace(tilt_rad).map_or(0.0, |from| tilt_rad - from);
-                    self.turned.iter_mut().for_each(|turned| turned.by(by_rad, tilt_rad, seconds, &at, feed_mm_min));
+                    self.head_rotation.iter_mut().for_each(|turned| turned.by(by_rad, tilt_rad, seconds, &at, feed_mm_min));
                     self.feed(&mut last, &mut before, &moves, (at, feed_mm_min, Some(centre_mm)));
                 }
-                Move::Feed { at, feed_mm_min } => self.feed(&mut last, &mut before, &moves, (at, feed_mm_min, None)),
+                Move::Feed { to: at, feed_mm_min } => self.feed(&mut last, &mut before, &moves, (at, feed_mm_min, None)),
             }
         }
     }
@@ -188,12 +188,12 @@ impl Summary {
     ) {
         self.points += 1;
         for k in 0..3 {
-            (self.least_mm[k], self.most_mm[k]) = (self.least_mm[k].min(at[k]), self.most_mm[k].max(at[k]));
+            (self.min_mm[k], self.max_mm[k]) = (self.min_mm[k].min(at[k]), self.max_mm[k].max(at[k]));
         }
         if let Some(from) = *last {
             let chord_mm = centre_mm.unwrap_or_else(|| (at - from).norm());
-            self.step(&(at - from), chord_mm, &at, feed_mm_min, moves.bend);
-            let now = moves.on_span.then_some(Bend { bend: moves.bend, chord_mm });
+            self.step(&(at - from), chord_mm, &at, feed_mm_min, moves.curvature_per_mm);
+            let now = moves.on_span.then_some(Bend { curvature_per_mm: moves.curvature_per_mm, chord_mm });
             if let Some((before, now)) = before.zip(now) {
                 self.bends_anew(before, now, from, feed_mm_min);
             }
@@ -206,9 +206,9 @@ impl Summary {
     fn step(&mut self, by: &Vector, length: f64, at: &Point, feed_mm_min: f64, bend: f64) {
         let speed = feed_mm_min / 60.0;
         self.length_mm += length;
-        self.seconds += length / speed;
+        self.duration_s += length / speed;
         let share = if length > 0.0 { speed / length } else { 0.0 };
-        let peak = |value: f64| Peak { value, at_mm: [at.x, at.y], feed_mm_min };
+        let peak = |value: f64| Peak { value, place_mm: [at.x, at.y], feed_mm_min };
         for k in 0..3 {
             if by[k].abs() * share > self.speed_mm_s[k].value {
                 self.speed_mm_s[k] = peak(by[k].abs() * share);
@@ -223,10 +223,10 @@ impl Summary {
     #[inline]
     fn bends_anew(&mut self, before: Bend, now: Bend, at: Point, feed_mm_min: f64) {
         let speed = feed_mm_min / 60.0;
-        let changes = (now.bend - before.bend) / (0.5 * (now.chord_mm + before.chord_mm)).max(f64::MIN_POSITIVE);
-        let value = speed.powi(3) * changes.hypot(now.bend.max(before.bend).powi(2));
+        let changes = (now.curvature_per_mm - before.curvature_per_mm) / (0.5 * (now.chord_mm + before.chord_mm)).max(f64::MIN_POSITIVE);
+        let value = speed.powi(3) * changes.hypot(now.curvature_per_mm.max(before.curvature_per_mm).powi(2));
         if value > self.jerk_mm_s3.value {
-            self.jerk_mm_s3 = Peak { value, at_mm: [at.x, at.y], feed_mm_min };
+            self.jerk_mm_s3 = Peak { value, place_mm: [at.x, at.y], feed_mm_min };
         }
     }
 
@@ -235,15 +235,15 @@ impl Summary {
         Self {
             moves: self.moves + other.moves,
             points: self.points + other.points,
-            least_mm: std::array::from_fn(|k| self.least_mm[k].min(other.least_mm[k])),
-            most_mm: std::array::from_fn(|k| self.most_mm[k].max(other.most_mm[k])),
+            min_mm: std::array::from_fn(|k| self.min_mm[k].min(other.min_mm[k])),
+            max_mm: std::array::from_fn(|k| self.max_mm[k].max(other.max_mm[k])),
             length_mm: self.length_mm + other.length_mm,
             rapid_mm: self.rapid_mm + other.rapid_mm,
-            seconds: self.seconds + other.seconds,
+            duration_s: self.duration_s + other.duration_s,
             speed_mm_s: std::array::from_fn(|k| larger(self.speed_mm_s[k], other.speed_mm_s[k])),
             acceleration_mm_s2: larger(self.acceleration_mm_s2, other.acceleration_mm_s2),
             jerk_mm_s3: larger(self.jerk_mm_s3, other.jerk_mm_s3),
-            turned: self.turned.zip(other.turned).map(|(a, b)| a.and(b)),
+            head_rotation: self.head_rotation.zip(other.head_rotation).map(|(a, b)| a.and(b)),
             ..self
         }
     }
@@ -257,9 +257,9 @@ impl Summary {
     pub fn check(&self, limits: &Limits) -> Result<(), PathError> {
         if let Some([least, most]) = limits.travel_mm {
             for (k, axis) in ['X', 'Y', 'Z'].into_iter().enumerate() {
-                for found_mm in [self.least_mm[k], self.most_mm[k]] {
+                for found_mm in [self.min_mm[k], self.max_mm[k]] {
                     if !(least[k]..=most[k]).contains(&found_mm) {
-                        return Err(PathError::Travel { axis, found_mm, least_mm: least[k], most_mm: most[k] });
+                        return Err(PathError::Travel { axis, found_mm, min_mm: least[k], max_mm: most[k] });
                     }
                 }
             }
@@ -268,19 +268,19 @@ impl Summary {
             for (axis, peak) in ['X', 'Y', 'Z'].into_iter().zip(self.speed_mm_s) {
                 // Tolerate rounding errors.
                 if peak.value > limit_mm_s * (1.0 + 1e-9) {
-                    let ([x_mm, y_mm], found_mm_s) = (peak.at_mm, peak.value);
+                    let ([x_mm, y_mm], found_mm_s) = (peak.place_mm, peak.value);
                     let feed_mm_min = (peak.feed_mm_min * limit_mm_s / found_mm_s).floor();
                     return Err(PathError::Speed { axis, found_mm_s, x_mm, y_mm, limit_mm_s, feed_mm_min });
                 }
             }
         }
-        self.turned.map_or(Ok(()), |turned| turned.check())?;
-        let Peak { value: found_mm_s2, at_mm: [x_mm, y_mm], feed_mm_min } = self.acceleration_mm_s2;
+        self.head_rotation.map_or(Ok(()), |turned| turned.check())?;
+        let Peak { value: found_mm_s2, place_mm: [x_mm, y_mm], feed_mm_min } = self.acceleration_mm_s2;
         if let Some(limit_mm_s2) = limits.acceleration_mm_s2.filter(|limit| found_mm_s2 > *limit) {
             let feed_mm_min = (feed_mm_min * (limit_mm_s2 / found_mm_s2).sqrt()).floor();
             return Err(PathError::Acceleration { x_mm, y_mm, found_mm_s2, limit_mm_s2, feed_mm_min });
         }
-        let Peak { value: found_mm_s3, at_mm: [x_mm, y_mm], feed_mm_min } = self.jerk_mm_s3;
+        let Peak { value: found_mm_s3, place_mm: [x_mm, y_mm], feed_mm_min } = self.jerk_mm_s3;
         if let Some(limit_mm_s3) = limits.jerk_mm_s3.filter(|limit| found_mm_s3 > *limit) {
             let feed_mm_min = (feed_mm_min * (limit_mm_s3 / found_mm_s3).cbrt()).floor();
             return Err(PathError::Jerk { x_mm, y_mm, found_mm_s3, limit_mm_s3, feed_mm_min });
@@ -297,16 +297,16 @@ impl Summary {
 impl Turned {
     fn not_yet(rotary: &Rotary) -> Self {
         let [least, most] = [f64::INFINITY, f64::NEG_INFINITY].map(|value| Peak { value, ..Peak::default() });
-        Self { rotary: *rotary, least_rad: least, most_rad: most, rate_rad_s: Peak::default() }
+        Self { rotary: *rotary, min_tilt_rad: least, max_tilt_rad: most, max_rate_rad_s: Peak::default() }
     }
 
     fn to(&mut self, tilt_rad: f64, at_mm: [f64; 2]) {
-        let here = Peak { value: tilt_rad, at_mm, feed_mm_min: 0.0 };
-        if tilt_rad < self.least_rad.value {
-            self.least_rad = here;
+        let here = Peak { value: tilt_rad, place_mm: at_mm, feed_mm_min: 0.0 };
+        if tilt_rad < self.min_tilt_rad.value {
+            self.min_tilt_rad = here;
         }
-        if tilt_rad > self.most_rad.value {
-            self.most_rad = here;
+        if tilt_rad > self.max_tilt_rad.value {
+            self.max_tilt_rad = here;
         }
     }
 
@@ -314,8 +314,8 @@ impl Turned {
         let at_mm = [at.x, at.y];
         self.to(tilt_rad, at_mm);
         let value = if by_rad == 0.0 { 0.0 } else { by_rad.abs() / seconds.max(f64::MIN_POSITIVE) };
-        if value > self.rate_rad_s.value {
-            self.rate_rad_s = Peak { value, at_mm, feed_mm_min };
+        if value > self.max_rate_rad_s.value {
+            self.max_rate_rad_s = Peak { value, place_mm: at_mm, feed_mm_min };
         }
     }
 
@@ -323,9 +323,9 @@ impl Turned {
         let larger = |a: Peak, b: Peak| if b.value > a.value { b } else { a };
         let less = |a: Peak, b: Peak| if b.value < a.value { b } else { a };
         Self {
-            least_rad: less(self.least_rad, other.least_rad),
-            most_rad: larger(self.most_rad, other.most_rad),
-            rate_rad_s: larger(self.rate_rad_s, other.rate_rad_s),
+            min_tilt_rad: less(self.min_tilt_rad, other.min_tilt_rad),
+            max_tilt_rad: larger(self.max_tilt_rad, other.max_tilt_rad),
+            max_rate_rad_s: larger(self.max_rate_rad_s, other.max_rate_rad_s),
             ..self
         }
     }
@@ -333,7 +333,7 @@ impl Turned {
     fn check(&self) -> Result<(), PathError> {
         let Rotary { letter, range_rad, rate_rad_s, .. } = self.rotary;
         let [min_deg, max_deg] = range_rad.map(f64::to_degrees);
-        for Peak { value, at_mm: [x_mm, y_mm], .. } in [self.least_rad, self.most_rad] {
+        for Peak { value, place_mm: [x_mm, y_mm], .. } in [self.min_tilt_rad, self.max_tilt_rad] {
             let found_deg = self.rotary.on_scale_rad(value).to_degrees();
             // Tolerate rounding errors.
             let by_deg = (min_deg - found_deg).max(found_deg - max_deg);
@@ -341,7 +341,7 @@ impl Turned {
                 return Err(PathError::Tilt { letter, found_deg, x_mm, y_mm, min_deg, max_deg, by_deg });
             }
         }
-        let Peak { value, at_mm: [x_mm, y_mm], feed_mm_min } = self.rate_rad_s;
+        let Peak { value, place_mm: [x_mm, y_mm], feed_mm_min } = self.max_rate_rad_s;
         if value > rate_rad_s * (1.0 + 1e-9) {
             let [found_deg_min, limit_deg_min] = [value, rate_rad_s].map(|rate| 60.0 * rate.to_degrees());
             // A slower spiral has its own feed at this place.
@@ -355,7 +355,7 @@ impl Turned {
 /// Curvature of a path along a chord, in 1/mm, and length of the chord.
 #[derive(Clone, Copy)]
 struct Bend {
-    bend: f64,
+    curvature_per_mm: f64,
     chord_mm: f64,
 }
 
@@ -441,7 +441,7 @@ mod tests {
         assert_eq!(path.moves().count() as u64, summary.moves);
         let mut last: Option<Point> = None;
         for one in path.moves() {
-            if let (Move::Feed { at, .. }, Some(from)) = (one, last) {
+            if let (Move::Feed { to: at, .. }, Some(from)) = (one, last) {
                 let middle = nalgebra::center(&from, &at);
                 // The centre of a ball in contact is 10 mm from the surface; in a lead it is further away.
                 let nearest = |p: &Point| {
@@ -458,7 +458,7 @@ mod tests {
                 let on_part = PART.contains(middle.x, middle.y);
                 assert!(off > -1.1e-4 && (!on_part || off < 1.1e-4), "{off} at {middle}");
             }
-            last = if let Move::Feed { at, .. } = one { Some(at) } else { None };
+            last = if let Move::Feed { to: at, .. } = one { Some(at) } else { None };
         }
     }
 }

@@ -33,7 +33,7 @@ pub struct Rotary {
     /// Letter of the axis in programs.
     pub letter: char,
     /// Axis of rotation, right-handed.
-    pub about: TurnAxis,
+    pub axis: TurnAxis,
     /// True if the scale of the axis counts in the opposite direction.
     pub reversed: bool,
     /// Minimum and maximum angle on the scale of the axis.
@@ -69,19 +69,19 @@ pub(super) struct Stand {
     pub(super) centre: Point,
     pub(super) tilt_rad: f64,
     /// Programmed point, and tilt rounded to the increment of the axis.
-    pub(super) at: Point,
-    pub(super) written_rad: f64,
+    pub(super) programmed_point: Point,
+    pub(super) programmed_tilt_rad: f64,
 }
 
 /// Deviation of a straight step from the path, in millimetres.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Sag {
     /// Distance between the middle of the path's step and the position to which the control moves the wheel.
-    pub(super) sag: f64,
+    pub(super) sag_mm: f64,
     /// Distance that the wheel's centre moves.
-    pub(super) chord: f64,
+    pub(super) chord_mm: f64,
     /// Distance of the slides from the straight line between the ends of the step, at its middle.
-    pub(super) bent: f64,
+    pub(super) slide_sag_mm: f64,
 }
 
 impl Rotary {
@@ -89,7 +89,7 @@ impl Rotary {
     #[inline]
     pub fn turned(&self, v: &Vector, angle_rad: f64) -> Vector {
         let (s, c) = angle_rad.sin_cos();
-        match self.about {
+        match self.axis {
             TurnAxis::X => Vector::new(v.x, v.y * c - v.z * s, v.y * s + v.z * c),
             TurnAxis::Y => Vector::new(v.x * c + v.z * s, v.y, v.z * c - v.x * s),
         }
@@ -109,7 +109,7 @@ impl Rotary {
     /// Returns the rotation that brings z onto a normal, seen along the axis, in rad.
     #[inline]
     fn along(&self, normal: &Vector) -> f64 {
-        match self.about {
+        match self.axis {
             TurnAxis::X => (-normal.y).atan2(normal.z),
             TurnAxis::Y => normal.x.atan2(normal.z),
         }
@@ -125,9 +125,9 @@ impl Rotary {
         let [a, b] = self.range_rad.map(|angle| self.on_scale_rad(angle));
         // The height is a sine of the angle: this number of samples finds its maximum to a millionth of the distance
         // to the pivot.
-        const LOOKS: u32 = 2000;
-        let at = |k: u32| a + (b - a) * f64::from(k) / f64::from(LOOKS);
-        (0..=LOOKS).map(|k| self.shift_mm(at(k)).z).fold(f64::NEG_INFINITY, f64::max)
+        const SAMPLES: u32 = 2000;
+        let at = |k: u32| a + (b - a) * f64::from(k) / f64::from(SAMPLES);
+        (0..=SAMPLES).map(|k| self.shift_mm(at(k)).z).fold(f64::NEG_INFINITY, f64::max)
     }
 }
 
@@ -135,7 +135,7 @@ impl PathOptions {
     /// Returns the tilt of the head at a contact, in rad, right-handed; 0 for a wheel without tilt.
     #[inline]
     pub fn tilt_rad(&self, contact: &Contact) -> f64 {
-        match (self.lean, &self.rotary) {
+        match (self.tilt, &self.rotary) {
             (Some(Lean::Constant { angle_rad }), _) => angle_rad,
             (Some(Lean::Following { lead_rad }), Some(rotary)) => rotary.along(&contact.normal) + lead_rad,
             _ => 0.0,
@@ -145,7 +145,7 @@ impl PathOptions {
     /// Returns the wheel in its orientation at a contact.
     #[inline]
     pub fn wheel_at(&self, contact: &Contact) -> Wheel {
-        if self.lean.is_none() { self.wheel } else { self.wheel_turned(self.tilt_rad(contact)) }
+        if self.tilt.is_none() { self.wheel } else { self.wheel_turned(self.tilt_rad(contact)) }
     }
 
     /// Returns the direction of the head's axis at a contact: z rotated by the tilt.
@@ -167,7 +167,7 @@ impl PathOptions {
     /// Returns the rotary axis if the wheel is tilted by it.
     #[inline]
     pub fn leaning(&self) -> Option<&Rotary> {
-        self.lean.and(self.rotary.as_ref())
+        self.tilt.and(self.rotary.as_ref())
     }
 
     /// Returns position and tilt of the wheel at a contact, lifted off by `lifted_mm` along the normal, or `None` if a
@@ -180,13 +180,13 @@ impl PathOptions {
         };
         let Some(rotary) = self.leaning() else {
             let centre = centre(self.wheel)?;
-            return Some(Stand { centre, tilt_rad: 0.0, at: centre, written_rad: 0.0 });
+            return Some(Stand { centre, tilt_rad: 0.0, programmed_point: centre, programmed_tilt_rad: 0.0 });
         };
         let tilt_rad = self.tilt_rad(contact);
         // `at` belongs to the rounded angle, so the rounding of the angle causes no error of the surface.
         let written_rad = rotary.rounded(tilt_rad);
         let at = centre(self.wheel_turned(written_rad))? + rotary.shift_mm(written_rad);
-        Some(Stand { centre: centre(self.wheel_turned(tilt_rad))?, tilt_rad, at, written_rad })
+        Some(Stand { centre: centre(self.wheel_turned(tilt_rad))?, tilt_rad, programmed_point: at, programmed_tilt_rad: written_rad })
     }
 
     /// Computes the deviation of a step at its middle. The control moves slides and head in proportion. An error of
@@ -196,9 +196,9 @@ impl PathOptions {
         let (chord, half) = (to.centre - from.centre, middle.centre - from.centre);
         let length2 = chord.norm_squared();
         let share = if length2 > 0.0 { half.dot(&chord) / length2 } else { 0.0 };
-        let (Some(rotary), Some(Lean::Following { .. })) = (self.leaning(), self.lean) else {
+        let (Some(rotary), Some(Lean::Following { .. })) = (self.leaning(), self.tilt) else {
             let sag = (half - chord * share).norm();
-            return Sag { sag, chord: length2.sqrt(), bent: sag };
+            return Sag { sag_mm: sag, chord_mm: length2.sqrt(), slide_sag_mm: sag };
         };
         let turn = |stand: &Stand| rotary.shift_mm(stand.tilt_rad);
         let turned = from.tilt_rad + share * (to.tilt_rad - from.tilt_rad);
@@ -211,7 +211,7 @@ impl PathOptions {
             Wheel::Torus { ring_mm, .. } | Wheel::Cup { ring_mm, .. } => ring_mm,
         };
         let sag = (off - chord * along).norm() + ring_mm * (middle.tilt_rad - turned).abs();
-        Sag { sag, chord: length2.sqrt(), bent }
+        Sag { sag_mm: sag, chord_mm: length2.sqrt(), slide_sag_mm: bent }
     }
 
     /// Returns how far the slides must be above the highest place of the wheel's centre, for any angle of the head, in
@@ -224,7 +224,7 @@ impl PathOptions {
     /// the wheel rotates in the air, it is at least the height of the contact plus the reach of the wheel.
     #[inline]
     pub(super) fn height_mm(&self, contact: &Contact, lifted_mm: f64, stand: &Stand) -> f64 {
-        match self.lean {
+        match self.tilt {
             None | Some(Lean::Constant { angle_rad: 0.0 }) => stand.centre.z,
             _ => {
                 let place = contact.point + contact.normal * lifted_mm;
@@ -244,22 +244,22 @@ pub(super) fn or_tilted(
     mut would_do: impl FnMut(PathOptions) -> bool,
 ) -> PathError {
     const STEP_DEG: f64 = 5.0;
-    const MOST_DEG: f64 = 90.0;
+    const MAX_TILT_DEG: f64 = 90.0;
     let is_of_reach = matches!(
         refused,
         PathError::Steep { .. } | PathError::CannotTouch { .. } | PathError::Body { .. } | PathError::Hollow { .. }
     );
-    let (Some(rotary), None, true, false) = (&options.rotary, options.lean, is_of_reach, options.from_below) else {
+    let (Some(rotary), None, true, false) = (&options.rotary, options.tilt, is_of_reach, options.from_below) else {
         return refused;
     };
     let [least, most] = rotary.range_rad;
-    let steps = (1..=(MOST_DEG / STEP_DEG) as i32).flat_map(|k| [k, -k]).map(|k| STEP_DEG * f64::from(k));
+    let steps = (1..=(MAX_TILT_DEG / STEP_DEG) as i32).flat_map(|k| [k, -k]).map(|k| STEP_DEG * f64::from(k));
     let found = steps.filter(|deg| (least..=most).contains(&rotary.on_scale_rad(deg.to_radians()))).find(|deg| {
         let lean = Some(Lean::Constant { angle_rad: deg.to_radians() });
-        would_do(PathOptions { lean, ..*options })
+        would_do(PathOptions { tilt: lean, ..*options })
     });
     match found {
-        Some(angle_deg) => PathError::Upright { refused: Box::new(refused), letter: rotary.letter, angle_deg },
+        Some(angle_deg) => PathError::NeedsTilt { refused: Box::new(refused), letter: rotary.letter, angle_deg },
         None => refused,
     }
 }
@@ -276,7 +276,7 @@ mod tests {
         let letter = if about == TurnAxis::X { 'A' } else { 'B' };
         Rotary {
             letter,
-            about,
+            axis: about,
             reversed: false,
             range_rad: [-2.0, 2.0],
             rate_rad_s: 10.0,
@@ -286,13 +286,13 @@ mod tests {
     }
 
     fn leaning(rotary: Rotary, lean: Lean, wheel: Wheel) -> PathOptions {
-        PathOptions { wheel, rotary: Some(rotary), lean: Some(lean), ..ball(1.0) }
+        PathOptions { wheel, rotary: Some(rotary), tilt: Some(lean), ..ball(1.0) }
     }
 
     /// Returns for every move at feed: position of the slides, tilt of the head, and distance that the centre moves.
     fn feeds(path: &ToolPath) -> Vec<(Point, f64, f64)> {
         let of = |one| match one {
-            Move::FeedTilted { at, tilt_rad, centre_mm, .. } => Some((at, tilt_rad, centre_mm)),
+            Move::FeedTilted { to: at, tilt_rad, centre_mm, .. } => Some((at, tilt_rad, centre_mm)),
             _ => None,
         };
         path.moves().filter_map(of).collect()
@@ -307,7 +307,7 @@ mod tests {
         let upright: Vec<Point> = path(quadric(0.0, 0.0), ball(10.0))
             .unwrap()
             .moves()
-            .filter_map(|one| if let Move::Feed { at, .. } = one { Some(at) } else { None })
+            .filter_map(|one| if let Move::Feed { to: at, .. } = one { Some(at) } else { None })
             .collect();
         // The pivot moves by 200 sin 30° to +x when B rotates, or to -y when A rotates, and down by 200 (1 - cos 30°).
         for (about, by) in [
@@ -335,7 +335,7 @@ mod tests {
             for (a, b) in tilted.moves().zip(plain.moves()) {
                 let upright = match a {
                     Move::RapidTilted { to_mm, tilt_rad: 0.0 } => Move::RapidXy(to_mm),
-                    Move::FeedTilted { at, tilt_rad: 0.0, feed_mm_min, .. } => Move::Feed { at, feed_mm_min },
+                    Move::FeedTilted { to: at, tilt_rad: 0.0, feed_mm_min, .. } => Move::Feed { to: at, feed_mm_min },
                     other => other,
                 };
                 assert_eq!(upright, b);
@@ -358,8 +358,8 @@ mod tests {
             assert!((contact.normal.angle(&follows.head_at(&contact)) - lead).abs() < 1e-6);
         }
         assert!((laid.least_lean_rad() - lead).abs() < 1e-6);
-        let turned = laid.summary().unwrap().turned.unwrap();
-        assert!(turned.least_rad.value < 0.2 && turned.most_rad.value > 0.8 && turned.rate_rad_s.value > 0.1);
+        let turned = laid.summary().unwrap().head_rotation.unwrap();
+        assert!(turned.min_tilt_rad.value < 0.2 && turned.max_tilt_rad.value > 0.8 && turned.max_rate_rad_s.value > 0.1);
     }
 
     #[test]
@@ -422,7 +422,7 @@ mod tests {
         ] {
             assert_eq!(path(quadric(0.0, 0.0), options).unwrap_err(), expected);
         }
-        let pole = PathOptions { lean: Some(Lean::Following { lead_rad: 0.01 }), ..slower };
+        let pole = PathOptions { tilt: Some(Lean::Following { lead_rad: 0.01 }), ..slower };
         assert!(matches!(path(quadric(0.0, 0.0), pole), Err(PathError::Option { key: "lead of a ball (rad)", .. })));
     }
 
@@ -431,11 +431,11 @@ mod tests {
         // A flank of 74°: the spindle of an upright wheel is in the way.
         let flank = || surface(|[x, y]| (3.5 * y + 0.01 * x * x, [0.02 * x, 3.5]));
         let upright = PathOptions { rotary: Some(head(TurnAxis::X)), ..ball(5.0) };
-        let Err(PathError::Upright { refused, letter: 'A', angle_deg }) = path(flank(), upright) else { panic!() };
+        let Err(PathError::NeedsTilt { refused, letter: 'A', angle_deg }) = path(flank(), upright) else { panic!() };
         assert!(matches!(*refused, PathError::Steep { .. }), "{refused}");
         // At least 74.05° - 68.75°, towards the normal, which points to -y.
         assert_eq!(angle_deg, 10.0);
-        let tilted = PathOptions { lean: Some(Lean::Constant { angle_rad: angle_deg.to_radians() }), ..upright };
+        let tilted = PathOptions { tilt: Some(Lean::Constant { angle_rad: angle_deg.to_radians() }), ..upright };
         assert!(path(flank(), tilted).is_ok());
         // A rotation about y does not help. A machine without a rotary axis gets the original error.
         let about_y = PathOptions { rotary: Some(head(TurnAxis::Y)), ..upright };
@@ -444,9 +444,9 @@ mod tests {
         // A cup that is tilted less than the slope of the dome.
         let cup = PathOptions { wheel: Wheel::tilted_cup(6.0, 1.0, 0.15), ..about_y };
         let refused = path(quadric(-0.0125, -0.001), cup).unwrap_err();
-        let PathError::Upright { angle_deg, .. } = refused else { panic!("{refused}") };
+        let PathError::NeedsTilt { angle_deg, .. } = refused else { panic!("{refused}") };
         let lean = Some(Lean::Constant { angle_rad: angle_deg.to_radians() });
-        assert!(angle_deg < 0.0 && path(quadric(-0.0125, -0.001), PathOptions { lean, ..cup }).is_ok(), "{angle_deg}");
+        assert!(angle_deg < 0.0 && path(quadric(-0.0125, -0.001), PathOptions { tilt, ..cup }).is_ok(), "{angle_deg}");
     }
 
     #[test]

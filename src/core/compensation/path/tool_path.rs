@@ -14,12 +14,12 @@ const SOME_TRACKS: usize = 200;
 /// Path of a wheel over a part. Its points are computed on demand by [`ToolPath::moves`].
 #[derive(Clone, Debug)]
 pub struct ToolPath {
-    wanted: Wanted,
+    target: Wanted,
     outline: Aperture,
     options: PathOptions,
     pub(super) tracks: Tracks,
     safe_z_mm: f64,
-    grain_mm: f64,
+    min_node_spacing_mm: f64,
 }
 
 impl ToolPath {
@@ -37,28 +37,28 @@ impl ToolPath {
         options.check()?;
         let grain_mm = wanted.grain_mm();
         let tracks = Tracks { spans: Vec::new(), track_mm: f64::NAN };
-        let mut path = Self { wanted, outline, options, tracks, safe_z_mm: f64::INFINITY, grain_mm };
+        let mut path = Self { target: wanted, outline, options, tracks, safe_z_mm: f64::INFINITY, min_node_spacing_mm: grain_mm };
         match path.lay() {
             Ok(()) => Ok(path),
             Err(refused) => Err(or_tilted(refused, &options, |tilted| {
                 path.options = tilted;
-                fit::may_fit(&path.wanted, &path.outline, &tilted) && path.lay().is_ok()
+                fit::may_fit(&path.target, &path.outline, &tilted) && path.lay().is_ok()
             })),
         }
     }
 
     fn lay(&mut self) -> Result<(), PathError> {
-        let track_mm = fit::track_mm(&self.wanted, &self.outline, &self.options)?;
+        let track_mm = fit::track_mm(&self.target, &self.outline, &self.options)?;
         self.tracks = Tracks::lay(&self.outline, &self.options, track_mm)?;
         self.safe_z_mm = self.highest_mm()? + self.options.safe_height_mm + self.options.lift_mm();
-        fit::check_body(&self.wanted, &self.outline, &self.options)
+        fit::check_body(&self.target, &self.outline, &self.options)
     }
 
     /// Returns the smallest angle between the axis of the head and a normal of the part, in rad. At 0 a ball touches
     /// with its pole, which has no cutting speed.
     pub fn least_lean_rad(&self) -> f64 {
         let lean = |place: [f64; 2]| {
-            let contact = self.wanted.at(place);
+            let contact = self.target.at(place);
             contact.normal.angle(&self.options.head_at(&contact))
         };
         fit::on_grid(&self.outline, fit::PLACES).into_iter().map(lean).fold(f64::INFINITY, f64::min)
@@ -93,7 +93,7 @@ impl ToolPath {
 
     /// Returns the smallest node spacing of the surface, in millimetres.
     pub(super) fn grain_mm(&self) -> f64 {
-        self.grain_mm
+        self.min_node_spacing_mm
     }
 
     /// Returns the options of the path.
@@ -103,7 +103,7 @@ impl ToolPath {
 
     /// Returns the target surface of the path.
     pub fn wanted(&self) -> &Wanted {
-        &self.wanted
+        &self.target
     }
 
     /// Returns the outline of the part.
@@ -115,17 +115,17 @@ impl ToolPath {
     /// there; [`ToolPath::new`] rejects these paths.
     #[inline]
     pub(super) fn stand(&self, span: &Span, t: f64) -> Stand {
-        let contact = self.wanted.at(span.place(t));
+        let contact = self.target.at(span.place(t));
         let lifted = self.tracks.lift_mm(span, t, &self.options);
         let nowhere = Point::new(f64::NAN, f64::NAN, f64::NAN);
-        let none = Stand { centre: nowhere, tilt_rad: f64::NAN, at: nowhere, written_rad: f64::NAN };
+        let none = Stand { centre: nowhere, tilt_rad: f64::NAN, programmed_point: nowhere, programmed_tilt_rad: f64::NAN };
         self.options.stand(&contact, lifted).unwrap_or(none)
     }
 
     /// Returns the height that rapid moves must clear at parameter `t` of a track, in mm; NaN if the wheel cannot
     /// touch there.
     fn height_mm(&self, span: &Span, t: f64) -> f64 {
-        let contact = self.wanted.at(span.place(t));
+        let contact = self.target.at(span.place(t));
         let lifted = self.tracks.lift_mm(span, t, &self.options);
         self.options.stand(&contact, lifted).map_or(f64::NAN, |stand| self.options.height_mm(&contact, lifted, &stand))
     }
@@ -186,14 +186,14 @@ mod tests {
                 let mirrored = match up {
                     Move::RapidZ(z) => Move::RapidZ(-z),
                     Move::RapidXy(_) | Move::RapidTilted { .. } | Move::FeedTilted { .. } => up,
-                    Move::Feed { at, feed_mm_min } => Move::Feed { at: Point::new(at.x, at.y, -at.z), feed_mm_min },
+                    Move::Feed { to: at, feed_mm_min } => Move::Feed { to: Point::new(at.x, at.y, -at.z), feed_mm_min },
                 };
                 assert_eq!(mirrored, down);
             }
             let (up, down) = (above.summary().unwrap(), below.summary().unwrap());
-            assert_eq!([up.least_mm[2], up.most_mm[2]], [-down.most_mm[2], -down.least_mm[2]]);
+            assert_eq!([up.min_mm[2], up.max_mm[2]], [-down.max_mm[2], -down.min_mm[2]]);
             assert_eq!((up.points, up.length_mm, up.rapid_mm), (down.points, down.length_mm, down.rapid_mm));
-            assert!(below.safe_z_mm() == -above.safe_z_mm() && below.safe_z_mm() == down.least_mm[2]);
+            assert!(below.safe_z_mm() == -above.safe_z_mm() && below.safe_z_mm() == down.min_mm[2]);
         }
     }
 
@@ -206,7 +206,7 @@ mod tests {
         let model = seen(1.0);
         let mut touching = 0;
         for one in below.moves() {
-            let Move::Feed { at, .. } = one else { continue };
+            let Move::Feed { to: at, .. } = one else { continue };
             let mut place = [at.x, at.y];
             for _ in 0..50 {
                 let contact = model.at(place);

@@ -25,7 +25,7 @@ pub enum Move {
     /// Straight move at a feed.
     Feed {
         /// End point, in millimetres.
-        at: Point,
+        to: Point,
         /// Feed of the wheel's centre.
         feed_mm_min: f64,
     },
@@ -40,7 +40,7 @@ pub enum Move {
     FeedTilted {
         /// End point, in millimetres: of the wheel's centre if the control compensates the pivot, otherwise of the
         /// slides.
-        at: Point,
+        to: Point,
         /// How far the head is turned there, right-handed.
         tilt_rad: f64,
         /// Feed of the wheel's centre.
@@ -59,7 +59,7 @@ pub struct Moves<'a> {
     end: usize,
     state: State,
     /// Curvature of the path at the last point returned, in 1/mm.
-    pub(super) bend: f64,
+    pub(super) curvature_per_mm: f64,
     /// True if the step to the last point returned is on the part or its overrun. False in a lead-in or lead-out.
     pub(super) on_span: bool,
     /// Point of the path in the middle of the step to the last point. `None` for the first point of a track, and for a
@@ -105,12 +105,12 @@ impl<'a> Moves<'a> {
     /// Returns the moves of the spans `from..to`. They begin and end at the safe height.
     pub(super) fn of(path: &'a ToolPath, from: usize, to: usize) -> Self {
         let (state, bend, on_span, middle, centre_mm) = (State::Above, 0.0, false, None, 0.0);
-        Self { path, next: from, end: to, state, bend, on_span, middle, centre_mm }
+        Self { path, next: from, end: to, state, curvature_per_mm: bend, on_span, middle, centre_mm }
     }
 
     fn walk(&self, span: Span) -> Walk {
         let (from, to) = span.with_leads(self.path.options());
-        let longest = self.path.options().longest_step_mm;
+        let longest = self.path.options().max_step_mm;
         let step = 0.25 * longest / span.speed_mm(from);
         Walk { span, to, t: from, step, at: self.path.stand(&span, from) }
     }
@@ -121,7 +121,7 @@ impl<'a> Moves<'a> {
         let upright = |z| self.path.upright(z);
         match given {
             Move::RapidZ(z) => Move::RapidZ(upright(z)),
-            Move::Feed { at, feed_mm_min } => Move::Feed { at: Point::new(at.x, at.y, upright(at.z)), feed_mm_min },
+            Move::Feed { to: at, feed_mm_min } => Move::Feed { to: Point::new(at.x, at.y, upright(at.z)), feed_mm_min },
             Move::RapidXy(_) | Move::RapidTilted { .. } | Move::FeedTilted { .. } => given,
         }
     }
@@ -132,7 +132,7 @@ impl<'a> Moves<'a> {
         let path = self.path;
         let options = path.options();
         let (span, left) = (walk.span, walk.to - walk.t);
-        let longest = options.longest_step_mm.min(path.grain_mm()) / span.speed_mm(walk.t);
+        let longest = options.max_step_mm.min(path.grain_mm()) / span.speed_mm(walk.t);
         let mut step = walk.step.min(longest);
         loop {
             // If less than two steps remain, divide the rest into two equal steps: a long and a tiny step are worse.
@@ -147,20 +147,20 @@ impl<'a> Moves<'a> {
             let taken = (t - walk.t).abs();
             let at = path.stand(&span, t);
             let middle = path.stand(&span, 0.5 * (walk.t + t));
-            let Sag { sag, chord, bent } = options.sag_mm(&walk.at, &middle, &at);
+            let Sag { sag_mm: sag, chord_mm: chord, slide_sag_mm: bent } = options.sag_mm(&walk.at, &middle, &at);
             let share = sag / (AIM * options.chord_error_mm);
             if share > 1.0 && taken > SHORTEST * longest {
                 step = taken * (0.95 / share.sqrt()).max(0.2);
                 continue;
             }
-            self.bend = 8.0 * bent / (chord * chord).max(f64::MIN_POSITIVE);
+            self.curvature_per_mm = 8.0 * bent / (chord * chord).max(f64::MIN_POSITIVE);
             self.centre_mm = chord;
             let next = taken * (0.95 / share.max(1e-6).sqrt()).clamp(0.5, 2.0);
             let (low, high) = (span.from.min(span.to), span.from.max(span.to));
             self.on_span = low <= walk.t.min(t) && walk.t.max(t) <= high;
             // The curvature jumps where a lead meets the span. The middle does not represent a step across that place.
             let over_an_end = [low, high].iter().any(|end| walk.t.min(t) < *end && *end < walk.t.max(t));
-            self.middle = (!over_an_end).then(|| Point::new(middle.at.x, middle.at.y, path.upright(middle.at.z)));
+            self.middle = (!over_an_end).then(|| Point::new(middle.programmed_point.x, middle.programmed_point.y, path.upright(middle.programmed_point.z)));
             walk = Walk { t, at, step: next, ..walk };
             return walk;
         }
@@ -169,19 +169,19 @@ impl<'a> Moves<'a> {
     /// Returns the move at feed to a point.
     #[inline]
     fn feed(&self, stand: &Stand) -> Move {
-        let (at, feed_mm_min) = (stand.at, self.feed_mm_min());
-        match self.path.options().lean {
-            None => Move::Feed { at, feed_mm_min },
-            Some(_) => Move::FeedTilted { at, tilt_rad: stand.written_rad, feed_mm_min, centre_mm: self.centre_mm },
+        let (at, feed_mm_min) = (stand.programmed_point, self.feed_mm_min());
+        match self.path.options().tilt {
+            None => Move::Feed { to: at, feed_mm_min },
+            Some(_) => Move::FeedTilted { to: at, tilt_rad: stand.programmed_tilt_rad, feed_mm_min, centre_mm: self.centre_mm },
         }
     }
 
     /// Returns the rapid move to the place above the first point of a track.
     fn over(&self, walk: &Walk) -> Move {
-        let to_mm = [walk.at.at.x, walk.at.at.y];
-        match self.path.options().lean {
+        let to_mm = [walk.at.programmed_point.x, walk.at.programmed_point.y];
+        match self.path.options().tilt {
             None => Move::RapidXy(to_mm),
-            Some(_) => Move::RapidTilted { to_mm, tilt_rad: walk.at.written_rad },
+            Some(_) => Move::RapidTilted { to_mm, tilt_rad: walk.at.programmed_tilt_rad },
         }
     }
 
@@ -192,7 +192,7 @@ impl<'a> Moves<'a> {
         let (Pattern::Spiral, Some(limit)) = (options.pattern, options.spiral_acceleration_mm_s2) else {
             return options.feed_mm_min;
         };
-        let most = 60.0 * (ACCELERATION_SHARE * limit / self.bend.max(1e-12)).sqrt();
+        let most = 60.0 * (ACCELERATION_SHARE * limit / self.curvature_per_mm.max(1e-12)).sqrt();
         if most >= options.feed_mm_min {
             return options.feed_mm_min;
         }
@@ -223,10 +223,10 @@ impl Iterator for Moves<'_> {
             }
             State::Above => (State::Ended, Move::RapidZ(safe)),
             State::Over(walk) => (State::Down(walk), self.over(&walk)),
-            State::Down(walk) => (State::Begin(walk), Move::RapidZ((walk.at.at.z + APPROACH_MM).min(safe))),
+            State::Down(walk) => (State::Begin(walk), Move::RapidZ((walk.at.programmed_point.z + APPROACH_MM).min(safe))),
             State::Begin(walk) => {
-                (self.bend, self.on_span, self.middle) = (0.0, false, None);
-                self.centre_mm = APPROACH_MM.min(safe - walk.at.at.z);
+                (self.curvature_per_mm, self.on_span, self.middle) = (0.0, false, None);
+                self.centre_mm = APPROACH_MM.min(safe - walk.at.programmed_point.z);
                 (State::Along(walk), self.feed(&walk.at))
             }
             State::Ended => return None,

@@ -38,10 +38,10 @@ pub(super) struct Bend {
     /// Point and normal.
     pub contact: Contact,
     /// Two orthogonal unit tangents: along x, and across.
-    pub along: [Vector; 2],
+    pub tangents: [Vector; 2],
     /// Second fundamental form in these directions, in 1/mm, positive in a hollow: normal curvature along the first,
     /// mixed term, normal curvature along the second.
-    pub curvature: [f64; 3],
+    pub second_form_per_mm: [f64; 3],
 }
 
 impl Wanted {
@@ -82,7 +82,7 @@ impl Wanted {
         let normal = Vector::new(-p * w, -q * w, w);
         // N_x = (-r, -s, 0) w - N (p r + q s) w^2, and N_y likewise.
         let turned = |a: f64, b: f64| Vector::new(-a * w, -b * w, 0.0) - normal * ((p * a + q * b) * w * w);
-        let [r, mixed, t] = s.bend;
+        let [r, mixed, t] = s.second_derivatives;
         let by_x = Vector::new(1.0, 0.0, p) + normal * e.slope[0] + turned(r, mixed) * d;
         let by_y = Vector::new(0.0, 1.0, q) + normal * e.slope[1] + turned(mixed, t) * d;
         (Point::new(place_mm[0], place_mm[1], s.value) + normal * d, [by_x, by_y])
@@ -112,13 +112,13 @@ impl Wanted {
         let turned = [n_x / length, n_x * a + n_y * b];
         let of = |i: usize, j: usize| -turned[i].dot(&along[j]);
         // In a hollow the normal turns against the step, hence the minus sign in `of`.
-        Bend { contact: Contact { point, normal }, along, curvature: [of(0, 0), 0.5 * (of(0, 1) + of(1, 0)), of(1, 1)] }
+        Bend { contact: Contact { point, normal }, tangents: along, second_form_per_mm: [of(0, 0), 0.5 * (of(0, 1) + of(1, 0)), of(1, 1)] }
     }
 
     /// Returns the factor for a tangent-plane step towards the projection of a point at height h above the surface:
     /// 1 / (1 - h k), with the mean curvature k, positive in a hollow. The factor is limited to 1.9.
     fn bend_factor(&self, place_mm: [f64; 2], height_mm: f64) -> f64 {
-        let [a, _, c] = self.bend(place_mm).curvature;
+        let [a, _, c] = self.bend(place_mm).second_form_per_mm;
         (1.0 / (1.0 - 0.5 * height_mm * (a + c)).max(0.05)).min(1.9)
     }
 
@@ -242,7 +242,7 @@ mod tests {
             let centre = Point::new(0.0, 0.0, 40.0);
             assert!(((point - centre).norm() - 39.98).abs() < 1e-8, "{}", (point - centre).norm());
             assert!((normal - (centre - point).normalize()).norm() < 1e-6);
-            let [a, mixed, c] = wanted.bend(place).curvature;
+            let [a, mixed, c] = wanted.bend(place).second_form_per_mm;
             assert!(
                 (a - 1.0 / 39.98).abs() < 1e-5 && (c - 1.0 / 39.98).abs() < 1e-5 && mixed.abs() < 1e-5,
                 "{a} {mixed} {c}"

@@ -56,7 +56,7 @@ impl Conic {
     /// Returns the sag and its derivative, both with respect to q = h^2; none at the conic's edge and beyond.
     ///
     /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
-    pub fn along(&self, q: f64) -> Option<(f64, f64)> {
+    pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
         let c = self.curvature_per_mm;
         let root = 1.0 - (1.0 + self.conic) * c * c * q;
         if root.is_nan() || root <= 0.0 {
@@ -78,7 +78,7 @@ impl TryFrom<&ConicDefinition> for Conic {
 
 /// Checks the conic that polynomials are added to; none is the plane.
 pub(super) fn base(written: Option<&ConicDefinition>) -> Result<Conic, DefinitionError> {
-    written.map_or(Ok(Conic::PLANE), |conic| Conic::try_from(conic).map_err(|error| error.under("base")))
+    written.map_or(Ok(Conic::PLANE), |conic| Conic::try_from(conic).map_err(|error| error.in_table("base")))
 }
 
 /// A conic and a sum of powers of the distance from the axis, ISO 10110-12.
@@ -131,8 +131,8 @@ impl Asphere {
     /// Returns the sag and its derivative, both with respect to q = h^2; none at the conic's edge and beyond.
     ///
     /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
-    pub fn along(&self, q: f64) -> Option<(f64, f64)> {
-        let (mut sag, mut slope) = self.base.along(q)?;
+    pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
+        let (mut sag, mut slope) = self.base.sag_and_derivative(q)?;
         let h = q.sqrt();
         for &(power, coefficient) in &self.terms {
             let below = q.powi((power / 2) as i32 - 1) * if power % 2 == 0 { 1.0 } else { h };
@@ -143,7 +143,7 @@ impl Asphere {
     }
 
     /// How many terms an evaluation sums.
-    pub(super) fn terms(&self) -> usize {
+    pub(super) fn term_count(&self) -> usize {
         1 + self.terms.len()
     }
 }
@@ -190,29 +190,29 @@ mod tests {
         for (radius_mm, conic, q, sag, slope) in
             [(5.0, 0.0, 9.0, 1.0, 0.125), (-5.0, 0.0, 9.0, -1.0, -0.125), (150.0, -1.0, 900.0, 3.0, 1.0 / 300.0)]
         {
-            let found = Conic::new(radius_mm, conic).unwrap().along(q).unwrap();
+            let found = Conic::new(radius_mm, conic).unwrap().sag_and_derivative(q).unwrap();
             assert!((found.0 - sag).abs() < 1e-15 && (found.1 - slope).abs() < 1e-16, "{found:?}");
         }
-        assert_eq!(Conic::new(f64::INFINITY, 0.0).unwrap().along(1e12), Some((0.0, 0.0)));
+        assert_eq!(Conic::new(f64::INFINITY, 0.0).unwrap().sag_and_derivative(1e12), Some((0.0, 0.0)));
     }
 
     #[test]
     fn the_edge_of_a_conic_is_outside_and_so_is_nan() {
         let sphere = Conic::new(5.0, 0.0).unwrap();
-        assert!(sphere.along(24.99).is_some());
-        assert!([25.0, 26.0, f64::NAN].iter().all(|&q| sphere.along(q).is_none()));
-        assert!(Conic::new(5.0, -1.0).unwrap().along(1e9).is_some());
+        assert!(sphere.sag_and_derivative(24.99).is_some());
+        assert!([25.0, 26.0, f64::NAN].iter().all(|&q| sphere.sag_and_derivative(q).is_none()));
+        assert!(Conic::new(5.0, -1.0).unwrap().sag_and_derivative(1e9).is_some());
     }
 
     #[test]
     fn powers_even_and_odd_by_hand() {
         let asphere = Asphere::new(Conic::PLANE, &[(4, 1e-3), (3, 1e-2)]).unwrap();
         // At h = 2: 0.016 + 0.08, slope 0.032 + 0.12 over 2h = 4.
-        let (sag, slope) = asphere.along(4.0).unwrap();
+        let (sag, slope) = asphere.sag_and_derivative(4.0).unwrap();
         assert!((sag - 0.096).abs() < 1e-16 && (slope - 0.038).abs() < 1e-16);
-        assert_eq!(asphere.along(0.0), Some((0.0, 0.0)));
+        assert_eq!(asphere.sag_and_derivative(0.0), Some((0.0, 0.0)));
         let paraboloid = Asphere::new(Conic::PLANE, &[(2, 0.01)]).unwrap();
-        assert_eq!(paraboloid.along(0.0), Some((0.0, 0.01)));
+        assert_eq!(paraboloid.sag_and_derivative(0.0), Some((0.0, 0.01)));
     }
 
     #[test]

@@ -226,10 +226,10 @@ impl SurfaceDefinition {
     /// # Errors
     /// Whatever is wrong with a value, by key, with the limit and a remedy.
     pub fn resolve(&self) -> Result<DefinedSurface, DefinitionError> {
-        let formula = self.surface.resolve().map_err(|error| error.under("surface"))?;
+        let formula = self.surface.resolve().map_err(|error| error.in_table("surface"))?;
         let sampling = match &self.sampling {
             None => Sampling::Accuracy { accuracy_mm: 1e-6 * DEFAULT_ACCURACY_NM },
-            Some(written) => written.resolve().map_err(|error| error.under("sampling"))?,
+            Some(written) => written.resolve().map_err(|error| error.in_table("sampling"))?,
         };
         DefinedSurface::new(formula, self.aperture.clone(), sampling)
     }
@@ -331,7 +331,7 @@ impl DefinedSurface {
 fn at_its_place(text: &str, error: DefinitionError) -> DefinitionError {
     let Some(span) = error.key().and_then(|key| place_of(text, &key)) else { return error };
     let (line, column) = line_and_column(text, span.start);
-    DefinitionError::At { line, column, source: Box::new(error) }
+    DefinitionError::Located { line, column, source: Box::new(error) }
 }
 
 /// Returns where the value of a key stands; for one that is not in the text, its innermost table that is.
@@ -432,7 +432,7 @@ mod tests {
 
     fn place(error: &DefinitionError) -> (usize, usize) {
         match error {
-            DefinitionError::Toml { line, column, .. } | DefinitionError::At { line, column, .. } => (*line, *column),
+            DefinitionError::Toml { line, column, .. } | DefinitionError::Located { line, column, .. } => (*line, *column),
             other => panic!("{other} has no place"),
         }
     }
@@ -505,7 +505,7 @@ mod tests {
             ("radius_mm = 20", "radius_mm = 100", (5, 2), ["not defined", "aperture"]),
         ] {
             let error = changed(from, to).unwrap_err();
-            assert!(matches!(error, DefinitionError::At { .. }), "{error}");
+            assert!(matches!(error, DefinitionError::Located { .. }), "{error}");
             assert_eq!(place(&error), expected, "{error}");
             assert!(words.iter().all(|word| error.to_string().contains(word)), "{error}");
         }
@@ -527,7 +527,7 @@ mod tests {
         let error = read(&format!("{cut}[surface.parent]\nkind = 'sphere'\nradius_mm = 50\n"));
         assert_eq!(place(&error), (6, 15), "{error}");
         let nested = format!("{cut}[surface.parent]\n{cut}[surface.parent.parent]\nkind = 'plane'\n");
-        assert!(matches!(read(&nested), DefinitionError::At { source, .. }
+        assert!(matches!(read(&nested), DefinitionError::Located { source, .. }
             if matches!(*source, DefinitionError::NestedSection { .. })));
     }
 

@@ -16,7 +16,7 @@ pub enum DefinitionError {
     Toml { line: usize, column: usize, message: String },
     /// An error of value, with the place where the value stands.
     #[error("line {line}, column {column}: {source}")]
-    At { line: usize, column: usize, source: Box<DefinitionError> },
+    Located { line: usize, column: usize, source: Box<DefinitionError> },
     /// A number lies outside what the formula can take; value and limit are in the unit that the key ends with.
     #[error("`{key}` is {value}; it must be {limit}; {remedy}")]
     OutOfRange { key: String, value: f64, limit: &'static str, remedy: &'static str },
@@ -91,7 +91,7 @@ impl DefinitionError {
     }
 
     /// Puts the name of the enclosing table before the key.
-    pub(super) fn under(mut self, table: &str) -> Self {
+    pub(super) fn in_table(mut self, table: &str) -> Self {
         match &mut self {
             Self::OutOfRange { key, .. }
             | Self::Term { key, .. }
@@ -110,7 +110,7 @@ impl DefinitionError {
             | Self::RepeatedTerm { key }
             | Self::NestedSection { key } => Some(key.clone()),
             Self::Aperture(error) => Some(format!("aperture.{}", error.key())),
-            Self::At { source, .. } => source.key(),
+            Self::Located { source, .. } => source.key(),
             Self::SectionOffParent { .. } => Some("surface.distance_mm".to_owned()),
             Self::BeyondNormalisation { .. } => Some("surface.normalisation_radius_mm".to_owned()),
             Self::SectionOutsideAperture { .. } | Self::NotDefined { .. } => Some("aperture".to_owned()),

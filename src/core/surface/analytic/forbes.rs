@@ -46,15 +46,15 @@ impl Qcon {
     /// normalisation radius.
     ///
     /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
-    pub fn along(&self, q: f64) -> Option<(f64, f64)> {
-        let (sag, slope) = self.base.along(q)?;
+    pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
+        let (sag, slope) = self.base.sag_and_derivative(q)?;
         let [v, per_mm2] = square(q, self.normalisation_radius_mm)?;
         let [(sum, sum_slope)] = jacobi::series(&self.coefficients_mm, 4, 2.0 * v - 1.0);
         Some((sag + v * v * sum, slope + 2.0 * v * (sum + v * sum_slope) * per_mm2))
     }
 
     /// How many terms an evaluation sums.
-    pub(super) fn terms(&self) -> usize {
+    pub(super) fn term_count(&self) -> usize {
         1 + self.coefficients_mm.len()
     }
 }
@@ -99,8 +99,8 @@ impl Qbfs {
     /// normalisation radius.
     ///
     /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
-    pub fn along(&self, q: f64) -> Option<(f64, f64)> {
-        let (sag, slope) = self.sphere.along(q)?;
+    pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
+        let (sag, slope) = self.sphere.sag_and_derivative(q)?;
         let [v, per_mm2] = square(q, self.normalisation_radius_mm)?;
         let c = self.sphere.curvature_per_mm();
         let cosine = (1.0 - c * c * q).sqrt();
@@ -112,7 +112,7 @@ impl Qbfs {
     }
 
     /// How many terms an evaluation sums.
-    pub(super) fn terms(&self) -> usize {
+    pub(super) fn term_count(&self) -> usize {
         1 + self.p_coefficients_mm.len()
     }
 }
@@ -245,26 +245,26 @@ mod tests {
             coefficients_mm: vec![0.0, 0.5],
         };
         // u^2 = 1/2: 1/4 * 0.5 * (6/2 - 5).
-        assert!((Qcon::try_from(&con).unwrap().along(50.0).unwrap().0 + 0.25).abs() < 1e-16);
+        assert!((Qcon::try_from(&con).unwrap().sag_and_derivative(50.0).unwrap().0 + 0.25).abs() < 1e-16);
         let bfs = QbfsDefinition { radius_mm: 10.0, normalisation_radius_mm: 8.0, coefficients_mm: vec![0.01] };
         // h = 6: sphere 2, cosine 0.8, u^2 = 9/16.
         let expected = 2.0 + 0.01 * 9.0 / 16.0 * 7.0 / 16.0 / 0.8;
-        assert!((Qbfs::try_from(&bfs).unwrap().along(36.0).unwrap().0 - expected).abs() < 1e-15);
+        assert!((Qbfs::try_from(&bfs).unwrap().sag_and_derivative(36.0).unwrap().0 - expected).abs() < 1e-15);
     }
 
     #[test]
     fn without_coefficients_they_are_their_base_and_at_the_rim_qbfs_is_too() {
         let con =
             QconDefinition { radius_mm: 50.0, conic: -2.0, normalisation_radius_mm: 30.0, coefficients_mm: vec![] };
-        assert_eq!(Qcon::try_from(&con).unwrap().along(400.0), Conic::new(50.0, -2.0).unwrap().along(400.0));
+        assert_eq!(Qcon::try_from(&con).unwrap().sag_and_derivative(400.0), Conic::new(50.0, -2.0).unwrap().sag_and_derivative(400.0));
         let sphere = Conic::new(50.0, 0.0).unwrap();
         let mut bfs = QbfsDefinition { radius_mm: 50.0, normalisation_radius_mm: 30.0, coefficients_mm: vec![] };
-        assert_eq!(Qbfs::try_from(&bfs).unwrap().along(400.0), sphere.along(400.0));
+        assert_eq!(Qbfs::try_from(&bfs).unwrap().sag_and_derivative(400.0), sphere.sag_and_derivative(400.0));
         bfs.coefficients_mm = vec![0.3, -0.2, 0.1];
         let departing = Qbfs::try_from(&bfs).unwrap();
-        assert_eq!(departing.along(900.0).unwrap().0, sphere.along(900.0).unwrap().0);
-        assert_eq!(departing.along(0.0).unwrap().0, 0.0);
-        assert_eq!(departing.along(46.0 * 46.0), None);
+        assert_eq!(departing.sag_and_derivative(900.0).unwrap().0, sphere.sag_and_derivative(900.0).unwrap().0);
+        assert_eq!(departing.sag_and_derivative(0.0).unwrap().0, 0.0);
+        assert_eq!(departing.sag_and_derivative(46.0 * 46.0), None);
     }
 
     #[test]
@@ -279,8 +279,8 @@ mod tests {
         let bfs = Qbfs::try_from(&QbfsDefinition { radius_mm: -60.0, normalisation_radius_mm: 30.0, coefficients_mm });
         let (con, bfs) = (con.unwrap(), bfs.unwrap());
         let radial = |x: f64, y: f64, slope: f64| [2.0 * x * slope, 2.0 * y * slope];
-        let con = |x: f64, y: f64| con.along(x * x + y * y).map(|(z, slope)| (z, radial(x, y, slope)));
-        let bfs = |x: f64, y: f64| bfs.along(x * x + y * y).map(|(z, slope)| (z, radial(x, y, slope)));
+        let con = |x: f64, y: f64| con.sag_and_derivative(x * x + y * y).map(|(z, slope)| (z, radial(x, y, slope)));
+        let bfs = |x: f64, y: f64| bfs.sag_and_derivative(x * x + y * y).map(|(z, slope)| (z, radial(x, y, slope)));
         assert!(gradient_error(&con, 29.9) < 1e-9, "{}", gradient_error(&con, 29.9));
         assert!(gradient_error(&bfs, 29.9) < 1e-9, "{}", gradient_error(&bfs, 29.9));
     }

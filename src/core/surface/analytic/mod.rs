@@ -70,10 +70,10 @@ impl AnalyticSurface {
         let q = x * x + y * y;
         let around = |(z, slope): (f64, f64)| (z, [2.0 * x * slope, 2.0 * y * slope]);
         let found = match self {
-            Self::Conic(conic) => conic.along(q).map(around),
-            Self::Asphere(asphere) => asphere.along(q).map(around),
-            Self::Qcon(qcon) => qcon.along(q).map(around),
-            Self::Qbfs(qbfs) => qbfs.along(q).map(around),
+            Self::Conic(conic) => conic.sag_and_derivative(q).map(around),
+            Self::Asphere(asphere) => asphere.sag_and_derivative(q).map(around),
+            Self::Qcon(qcon) => qcon.sag_and_derivative(q).map(around),
+            Self::Qbfs(qbfs) => qbfs.sag_and_derivative(q).map(around),
             Self::OffAxis(section) => section.sag_and_gradient(x, y),
             Self::Toroid(toroid) => toroid.sag_and_gradient(x, y),
             Self::Biconic(biconic) => biconic.sag_and_gradient(x, y),
@@ -112,16 +112,16 @@ impl AnalyticSurface {
     }
 
     /// How many terms an evaluation sums, as a measure of its time.
-    fn terms(&self) -> usize {
+    fn term_count(&self) -> usize {
         match self {
             Self::Conic(_) | Self::Biconic(_) => 1,
-            Self::Asphere(asphere) => asphere.terms(),
-            Self::Qcon(qcon) => qcon.terms(),
-            Self::Qbfs(qbfs) => qbfs.terms(),
-            Self::OffAxis(section) => section.terms(),
-            Self::Toroid(toroid) => toroid.terms(),
-            Self::XyPolynomial(polynomial) => polynomial.terms(),
-            Self::Zernike(zernike) => zernike.terms(),
+            Self::Asphere(asphere) => asphere.term_count(),
+            Self::Qcon(qcon) => qcon.term_count(),
+            Self::Qbfs(qbfs) => qbfs.term_count(),
+            Self::OffAxis(section) => section.term_count(),
+            Self::Toroid(toroid) => toroid.term_count(),
+            Self::XyPolynomial(polynomial) => polynomial.term_count(),
+            Self::Zernike(zernike) => zernike.term_count(),
         }
     }
 }

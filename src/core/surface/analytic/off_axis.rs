@@ -104,7 +104,7 @@ impl OffAxis {
                 let (z, gradient) = self.parent.sag_and_gradient(self.centre.x + x, self.centre.y + y)?;
                 Some((z - self.centre.z, gradient))
             }
-            SectionFrame::Tilted => self.newton(x, y, 0.0).or_else(|| self.follow(x, y)),
+            SectionFrame::Tilted => self.newton(x, y, 0.0).or_else(|| self.continue_from_centre(x, y)),
         }
     }
 
@@ -149,7 +149,7 @@ impl OffAxis {
     }
 
     /// Follows the surface from the section's centre to a place, where the tangent plane there misses the parent.
-    fn follow(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
+    fn continue_from_centre(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
         let step = 1.0 / f64::from(WAY_STEPS);
         let (mut z, mut gradient) = self.newton(0.0, 0.0, 0.0)?;
         for i in 1..=WAY_STEPS {
@@ -161,9 +161,9 @@ impl OffAxis {
     }
 
     /// How many terms an evaluation sums.
-    pub(super) fn terms(&self) -> usize {
+    pub(super) fn term_count(&self) -> usize {
         // Newton's method takes some five steps.
-        self.parent.terms() * if self.frame == SectionFrame::Tilted { 5 } else { 1 }
+        self.parent.term_count() * if self.frame == SectionFrame::Tilted { 5 } else { 1 }
     }
 }
 
@@ -174,7 +174,7 @@ impl TryFrom<&OffAxisDefinition> for OffAxis {
         if matches!(*written.parent, Formula::OffAxis(_)) {
             return Err(DefinitionError::NestedSection { key: "parent".to_owned() });
         }
-        let parent = written.parent.resolve().map_err(|error| error.under("parent"))?;
+        let parent = written.parent.resolve().map_err(|error| error.in_table("parent"))?;
         Self::new(parent, written.distance_mm, written.azimuth_deg.to_radians(), written.frame)
     }
 }

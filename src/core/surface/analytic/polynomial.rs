@@ -49,7 +49,7 @@ impl XyPolynomial {
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
-        let (sag, slope) = self.base.along(x * x + y * y)?;
+        let (sag, slope) = self.base.sag_and_derivative(x * x + y * y)?;
         let scale = 1.0 / self.normalisation_radius_mm;
         let (u, v) = (x * scale, y * scale);
         let (mut z, mut gx, mut gy) = (sag, 2.0 * x * slope, 2.0 * y * slope);
@@ -67,7 +67,7 @@ impl XyPolynomial {
     }
 
     /// How many terms an evaluation sums.
-    pub(super) fn terms(&self) -> usize {
+    pub(super) fn term_count(&self) -> usize {
         1 + self.terms.len()
     }
 }
@@ -119,7 +119,7 @@ mod tests {
         let conic = Conic::try_from(&base).unwrap();
         for [x, y] in disc(50.0) {
             let found = polynomial(&[], Some(base)).unwrap().sag_and_gradient(x, y).map(|(z, _)| z);
-            assert_eq!(found, conic.along(x * x + y * y).map(|(z, _)| z));
+            assert_eq!(found, conic.sag_and_derivative(x * x + y * y).map(|(z, _)| z));
         }
     }
 

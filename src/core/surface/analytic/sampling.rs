@@ -53,7 +53,7 @@ impl DefinedSurface {
         let bounds = self.aperture().bounds();
         let cells = [0, 1].map(|k| ((bounds[1][k] - bounds[0][k]) / spacing_mm * (1.0 - 1e-12)).ceil().max(1.0));
         let nodes = (cells[0] + 3.0) * (cells[1] + 3.0);
-        self.refuse_excess(nodes, spacing_mm)?;
+        self.check_size(nodes, spacing_mm)?;
         let spacing = [0, 1].map(|k| (bounds[1][k] - bounds[0][k]) / cells[k]);
         let [columns, rows] = cells.map(|n| n as usize + 3);
         let margin = MARGIN * spacing[0].max(spacing[1]);
@@ -119,12 +119,12 @@ impl DefinedSurface {
     }
 
     /// Refuses a sampling that would be too large or take too long.
-    fn refuse_excess(&self, nodes: f64, spacing_mm: f64) -> Result<(), DefinitionError> {
+    fn check_size(&self, nodes: f64, spacing_mm: f64) -> Result<(), DefinitionError> {
         if nodes > MOST_NODES {
             return Err(DefinitionError::TooManyNodes { spacing_mm, nodes, limit: MOST_NODES });
         }
         let corners = if let Aperture::Polygon { corners_mm } = self.aperture() { corners_mm.len() } else { 0 };
-        let terms = self.formula().terms() + corners;
+        let terms = self.formula().term_count() + corners;
         let work = nodes * terms as f64;
         if work > MOST_WORK {
             return Err(DefinitionError::TooMuchWork { nodes, terms, work, limit: MOST_WORK });

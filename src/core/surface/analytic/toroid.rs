@@ -51,7 +51,7 @@ impl Toroid {
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
         let c = self.rotation_per_mm;
-        let (g, slope) = self.curve.along(y * y)?;
+        let (g, slope) = self.curve.sag_and_derivative(y * y)?;
         let w = 1.0 - c * g;
         let root = w * w - c * c * x * x;
         if !(w > 0.0 && root > 0.0) {
@@ -62,8 +62,8 @@ impl Toroid {
     }
 
     /// How many terms an evaluation sums.
-    pub(super) fn terms(&self) -> usize {
-        1 + self.curve.terms()
+    pub(super) fn term_count(&self) -> usize {
+        1 + self.curve.term_count()
     }
 }
 
@@ -163,14 +163,14 @@ mod tests {
     fn equal_radii_make_the_sphere_and_an_infinite_one_a_cylinder() {
         let sphere = Conic::new(-80.0, 0.0).unwrap();
         for [x, y] in disc(70.0) {
-            let (sag, slope) = sphere.along(x * x + y * y).unwrap();
+            let (sag, slope) = sphere.sag_and_derivative(x * x + y * y).unwrap();
             let (z, [gx, gy]) = toroid(-80.0, -80.0).sag_and_gradient(x, y).unwrap();
             assert!((z - sag).abs() < 1e-13 && (gx - 2.0 * x * slope).abs() < 1e-13);
             assert!((gy - 2.0 * y * slope).abs() < 1e-13);
             let (along_x, _) = toroid(80.0, f64::INFINITY).sag_and_gradient(x, y).unwrap();
-            assert!((along_x + sphere.along(x * x).unwrap().0).abs() < 1e-13);
+            assert!((along_x + sphere.sag_and_derivative(x * x).unwrap().0).abs() < 1e-13);
             let (along_y, _) = toroid(f64::INFINITY, 80.0).sag_and_gradient(x, y).unwrap();
-            assert!((along_y + sphere.along(y * y).unwrap().0).abs() < 1e-13);
+            assert!((along_y + sphere.sag_and_derivative(y * y).unwrap().0).abs() < 1e-13);
         }
     }
 
@@ -180,7 +180,7 @@ mod tests {
         let written = BiconicDefinition { radius_x_mm: 60.0, radius_y_mm: 60.0, conic_x: -0.7, conic_y: -0.7 };
         let biconic = Biconic::try_from(&written).unwrap();
         for [x, y] in disc(50.0) {
-            let (sag, slope) = conic.along(x * x + y * y).unwrap();
+            let (sag, slope) = conic.sag_and_derivative(x * x + y * y).unwrap();
             let (z, [gx, gy]) = biconic.sag_and_gradient(x, y).unwrap();
             assert!((z - sag).abs() < 1e-14 && (gx - 2.0 * x * slope).abs() < 1e-14);
             assert!((gy - 2.0 * y * slope).abs() < 1e-14);

@@ -94,7 +94,7 @@ impl Zernike {
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
-        let (sag, slope) = self.base.along(x * x + y * y)?;
+        let (sag, slope) = self.base.sag_and_derivative(x * x + y * y)?;
         let scale = 1.0 / self.normalisation_radius_mm;
         let (u, v) = (x * scale, y * scale);
         let q = u * u + v * v;
@@ -119,7 +119,7 @@ impl Zernike {
     }
 
     /// How many terms an evaluation sums.
-    pub(super) fn terms(&self) -> usize {
+    pub(super) fn term_count(&self) -> usize {
         1 + self.orders.iter().map(|(_, coefficients)| 2 * coefficients.len()).sum::<usize>()
     }
 }
@@ -312,7 +312,7 @@ mod tests {
         let paraboloid = Conic::new(200.0, -1.0).unwrap();
         for [x, y] in disc(20.0) {
             let (z, [gx, _]) = defocus.sag_and_gradient(x, y).unwrap();
-            let (sag, slope) = paraboloid.along(x * x + y * y).unwrap();
+            let (sag, slope) = paraboloid.sag_and_derivative(x * x + y * y).unwrap();
             assert!((z - sag).abs() < 1e-15 && (gx - 2.0 * x * slope).abs() < 1e-15);
         }
     }

@@ -29,7 +29,7 @@ fn scattered(columns: usize, rows: usize) -> Vec<Point> {
 fn truth(points: Vec<Point>, distance: Distance, step_mm: f64) -> [f64; 2] {
     let shape = FreeForm::default();
     let nominal = Nominal::from_points(points, Projection::Auto).unwrap();
-    let surface = OffsetSurface::new(&nominal, 1.5, Side::Normal).unwrap().with_distance(distance);
+    let surface = OffsetSurface::new(&nominal, 1.5, Side::Normal).unwrap().with_distance_model(distance);
     let at = |i: usize, n: usize, size: f64| (size - 6.0 * step_mm) * ((i as f64 + 0.37) / n as f64 - 0.5);
     let (mut low, mut high, mut sum) = (f64::INFINITY, f64::NEG_INFINITY, 0.0);
     const COUNT: [usize; 2] = [517, 331];
@@ -37,7 +37,7 @@ fn truth(points: Vec<Point>, distance: Distance, step_mm: f64) -> [f64; 2] {
         let (x, y) = (at(k % COUNT[0], COUNT[0], 102.0), at(k / COUNT[0], COUNT[1], 62.0));
         let (s, n) = (shape.point(x, y), shape.normal(x, y));
         let centre = Point::from(std::array::from_fn::<f64, 3, _>(|k| s[k] + 1.5 * n[k]));
-        let error = surface.foot(&centre, Place::UNKNOWN).distance_mm * 1e6;
+        let error = surface.project(&centre, Place::UNKNOWN).distance_mm * 1e6;
         (low, high, sum) = (low.min(error), high.max(error), sum + error * error);
     }
     [high - low, (sum / (COUNT[0] * COUNT[1]) as f64).sqrt()]
@@ -60,7 +60,7 @@ fn assert_agrees(points: Vec<Point>) {
                 "{distance:?}: {predicted} against {truth} nm"
             );
         }
-        assert_eq!(estimate.trust, Trust::Extrapolated, "{distance:?}");
+        assert_eq!(estimate.reliability, Trust::Extrapolated, "{distance:?}");
     }
 }
 
@@ -81,13 +81,13 @@ fn rounding_is_told_from_coarseness() {
     let mut points = free_form(451, 251);
     points.iter_mut().for_each(|p| p.z = (p.z * 1e5).round() / 1e5);
     let found = predicted(&points);
-    assert_eq!(found.curved.trust, Trust::Rounding);
+    assert_eq!(found.curved.reliability, Trust::Rounding);
     assert!((3e-6..3e-5).contains(&found.curved.inside.pv_mm), "{:?}", found.curved.inside);
     assert_eq!(found.curved.spacing_for(1e-7), None);
-    assert_eq!(found.flat.trust, Trust::Extrapolated);
+    assert_eq!(found.flat.reliability, Trust::Extrapolated);
     let ripple = |p: &Point| Point::new(p.x, p.y, p.z + 0.05 * (2.0 * p.x).sin() * (2.1 * p.y).cos());
     let rippled: Vec<Point> = free_form(128, 156).iter().map(ripple).collect();
-    assert_eq!(predicted(&rippled).curved.trust, Trust::TooCoarse);
+    assert_eq!(predicted(&rippled).curved.reliability, Trust::TooCoarse);
 }
 
 #[test]
@@ -107,7 +107,7 @@ fn a_plane_is_exact_at_any_spacing_that_was_looked_at() {
     let points: Vec<Point> = free_form(61, 41).iter().map(|p| Point::new(p.x, p.y, 0.1 * p.x)).collect();
     let found = predicted(&points);
     for estimate in [&found.flat, &found.curved] {
-        assert_eq!(estimate.trust, Trust::Extrapolated);
+        assert_eq!(estimate.reliability, Trust::Extrapolated);
         let spacing_mm = estimate.spacing_for(1e-6).unwrap();
         assert!((spacing_mm / found.spacing_mm - 6.0).abs() < 1e-6, "{spacing_mm}");
     }

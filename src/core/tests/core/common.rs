@@ -65,6 +65,6 @@ pub fn pose_error_mm(found: &Pose, truth: &Pose) -> f64 {
     [[-50.0, -30.0], [50.0, -30.0], [-50.0, 30.0], [50.0, 30.0]]
         .iter()
         .map(|[x, y]| Point::new(*x, *y, FreeForm::default().height(*x, *y)))
-        .map(|p| (found.point(&p) - truth.point(&p)).norm())
+        .map(|p| (found.transform_point(&p) - truth.transform_point(&p)).norm())
         .fold(0.0, f64::max)
 }

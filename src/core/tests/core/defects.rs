@@ -68,7 +68,7 @@ fn bump(middle: [f64; 2], width_mm: f64, height_mm: f64) -> impl Fn(f64, f64) ->
 /// Every touch of a defect counts, and the peak to valley is the defect's.
 fn counts_whole(name: &str, height_mm: f64, planted: &dyn Fn(f64, f64) -> f64) {
     let found = found(&touched(COUNTS, NOISE_MM, planted));
-    let pv_mm = found.verdict.pv_mm;
+    let pv_mm = found.quality.pv_mm;
     println!("{name}, {} um: PV {:.2} um, left out {:?}", 1e3 * height_mm, 1e3 * pv_mm, left_out(&found));
     assert!(left_out(&found).is_empty(), "{name}, {height_mm} mm: left out {:?}", left_out(&found));
     assert!(pv_mm > 0.8 * height_mm.abs(), "{name}, {height_mm} mm: PV {pv_mm}");
@@ -93,7 +93,7 @@ fn what_two_neighbouring_touches_found_is_in_the_figures_at_any_height() {
 fn a_clean_map_keeps_its_only_bump() {
     let found = found(&touched([80, 45], 1e-6, bump([11.0, -6.2], 12.0, 1e-3)));
     assert!(left_out(&found).is_empty(), "{:?}", left_out(&found));
-    assert!(found.verdict.pv_mm > 0.9e-3, "{}", found.verdict.pv_mm);
+    assert!(found.quality.pv_mm > 0.9e-3, "{}", found.quality.pv_mm);
 }
 
 #[test]
@@ -137,20 +137,20 @@ fn the_form_is_as_high_as_what_was_touched() {
         let found = found(&touched([36, 18], NOISE_MM, planted));
         let form = Form::estimate(&found, &ModelInputs::default()).unwrap();
         let (pv, rms) = (form.figures.pv, form.figures.rms);
-        println!("{name}: PV {pv:.4?} of {:.4}, rms {rms:.4?} of {:.4}", found.verdict.pv_mm, found.verdict.rms_mm);
-        assert_eq!(form.points.len(), found.verdict.used, "{name}");
+        println!("{name}: PV {pv:.4?} of {:.4}, rms {rms:.4?} of {:.4}", found.quality.pv_mm, found.quality.rms_mm);
+        assert_eq!(form.points.len(), found.quality.inliers, "{name}");
         // Two touches of a peak have the scatter of both in their distance.
         let of_two_mm = 3.0 * NOISE_MM * 2f64.sqrt();
-        assert!((pv.median_mm - found.verdict.pv_mm).abs() < of_two_mm.max(0.03 * pv.median_mm), "{name}: {pv:?}");
-        assert!(pv.low_mm <= found.verdict.pv_mm && pv.high_mm >= 0.97 * found.verdict.pv_mm, "{name}: {pv:?}");
-        assert!((rms.median_mm / found.verdict.rms_mm - 1.0).abs() < 0.15, "{name}: {rms:?}");
+        assert!((pv.median_mm - found.quality.pv_mm).abs() < of_two_mm.max(0.03 * pv.median_mm), "{name}: {pv:?}");
+        assert!(pv.low_mm <= found.quality.pv_mm && pv.high_mm >= 0.97 * found.quality.pv_mm, "{name}: {pv:?}");
+        assert!((rms.median_mm / found.quality.rms_mm - 1.0).abs() < 0.15, "{name}: {rms:?}");
         // Each point has its own place and height.
-        let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let used = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         for (of, d) in form.points.iter().zip(used) {
-            assert!((of.at_mm[0] - d.point.x).abs() < 1e-12 && (of.at_mm[1] - d.point.y).abs() < 1e-12, "{name}");
+            assert!((of.place_mm[0] - d.point.x).abs() < 1e-12 && (of.place_mm[1] - d.point.y).abs() < 1e-12, "{name}");
             // The form is after its own best fit, which the defect tilts, and the deviations are after one that it does not.
             let off_mm = (of.form.mean_mm - d.deviation_mm).abs();
-            assert!(off_mm < 6.0 * NOISE_MM + 0.1 * found.verdict.pv_mm, "{name}: {of:?} of {d:?}");
+            assert!(off_mm < 6.0 * NOISE_MM + 0.1 * found.quality.pv_mm, "{name}: {of:?} of {d:?}");
         }
     }
 }
@@ -174,7 +174,7 @@ fn of_a_strong_form_that_the_pose_is_not_fitted_to_everywhere_the_figures_are_tr
     // High at the corners alone, by the fourth power of the distance from the middle.
     let planted = |x: f64, y: f64| 0.03 * ((x.powi(4) + y.powi(4) - 6.0 * x * x * y * y) / 3400f64.powi(2));
     let found = found(&touched(FEW, NOISE_MM, planted));
-    let beside = found.deviations.iter().filter(|d| d.status == PointStatus::Used && !d.in_fit).count();
+    let beside = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier && !d.in_fit).count();
     let told = Form::estimate(&found, &ModelInputs::default()).unwrap().figures;
     let [rms_mm, pv_mm] = true_figures_mm(FEW, planted);
     println!(

@@ -10,7 +10,7 @@ use regrind_sim::shape::{FreeForm, Shape};
 fn errors_nm(nominal: &Nominal, distance: Distance, step: [f64; 2]) -> [f64; 2] {
     let shape = FreeForm::default();
     let form = FormError::new(3, 30.0, 6.657e-3, 102.0, 62.0);
-    let surface = OffsetSurface::new(nominal, RADIUS_MM, Side::Normal).unwrap().with_distance(distance);
+    let surface = OffsetSurface::new(nominal, RADIUS_MM, Side::Normal).unwrap().with_distance_model(distance);
     let mut range = [[f64::INFINITY, f64::NEG_INFINITY]; 2];
     let at = |i: usize, n: usize, size: f64| size * ((i as f64 + 0.37) / n as f64 - 0.5);
     for j in 0..331 {
@@ -18,7 +18,7 @@ fn errors_nm(nominal: &Nominal, distance: Distance, step: [f64; 2]) -> [f64; 2] 
             let (x, y) = (at(i, 517, 102.0), at(j, 331, 62.0));
             let (s, n, e) = (shape.point(x, y), shape.normal(x, y), form.height(x, y));
             let p = Point::from(std::array::from_fn::<f64, 3, _>(|k| s[k] + (RADIUS_MM + e) * n[k]));
-            let foot = surface.foot(&p, Place::UNKNOWN);
+            let foot = surface.project(&p, Place::UNKNOWN);
             let error = (foot.distance_mm - e) * 1e6;
             let border = 51.0 - x.abs() < 2.0 * step[0] || 31.0 - y.abs() < 2.0 * step[1];
             let r = &mut range[usize::from(border)];

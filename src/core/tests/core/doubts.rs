@@ -44,14 +44,14 @@ fn with_radius(radius_mm: f64, measured: &[Point]) -> Registration {
 }
 
 fn said(found: &Registration) -> String {
-    found.verdict.warnings.join("; ")
+    found.quality.warnings.join("; ")
 }
 
 #[test]
 fn of_a_ground_part_nothing_is_said() {
     for seed in 1..=4 {
         let found = with_radius(RADIUS_MM, &whole(seed));
-        assert!(found.verdict.rms_mm > 1e-3, "{}", found.verdict.rms_mm);
+        assert!(found.quality.rms_mm > 1e-3, "{}", found.quality.rms_mm);
         assert_eq!(said(&found), "", "seed {seed}");
     }
 }
@@ -82,7 +82,7 @@ fn a_diameter_and_half_a_radius_are_told() {
 fn contact_points_that_were_taken_for_centres_are_told() {
     for seed in 1..=4 {
         let right = with_radius(RADIUS_MM, &whole(seed));
-        let contacts: Vec<Point> = right.deviations.iter().map(|d| right.cmm_from_model.point(&d.point)).collect();
+        let contacts: Vec<Point> = right.deviations.iter().map(|d| right.cmm_from_model.transform_point(&d.point)).collect();
         let words = said(&with_radius(RADIUS_MM, &contacts));
         assert!(words.contains("look like contact points") && words.contains("`contact`"), "{words}");
         let found = register(nominal(), &contacts, &Options { method: Method::Contact, ..Options::new(0.0) }).unwrap();

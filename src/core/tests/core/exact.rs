@@ -47,7 +47,7 @@ fn exact_least_squares(shape: &dyn Shape, measured: &[Point], keep: &[bool], sta
         distances.clear();
         let inverse = pose.inverse();
         for (p, keep) in measured.iter().zip(keep) {
-            let q = inverse.point(p);
+            let q = inverse.transform_point(p);
             let (d, n) = exact_distance(shape, &q);
             let d = d - RADIUS_MM;
             distances.push(d);
@@ -108,7 +108,7 @@ fn a_realistic_part_agrees_with_exact_least_squares_on_every_kind_of_nominal() {
     let kinds = [
         ("grid", Nominal::from_points(grid.clone(), Projection::Auto)),
         ("shuffled", Nominal::from_points(shuffled.clone(), Projection::Auto)),
-        ("triangulated", Nominal::scattered(shuffled, Projection::Auto)),
+        ("triangulated", Nominal::from_triangulated_points(shuffled, Projection::Auto)),
         ("scattered", Nominal::from_points(scattered, Projection::Auto)),
         ("mesh", Nominal::from_mesh(grid, triangles)),
     ];
@@ -116,10 +116,10 @@ fn a_realistic_part_agrees_with_exact_least_squares_on_every_kind_of_nominal() {
         let found = register(&nominal.unwrap(), &measured, &Options::new(RADIUS_MM)).unwrap();
         let (um, urad) = difference(&found.cmm_from_model, &exact);
         let map = rms_nm(found.deviations.iter().zip(&distances).map(|(f, d)| f.deviation_mm - d));
-        println!("{name}: {um:.5} um {urad:.5} urad {map:.5} nm used {}", found.verdict.used);
+        println!("{name}: {um:.5} um {urad:.5} urad {map:.5} nm used {}", found.quality.inliers);
         assert!(um < 1e-3 && urad < 0.01, "{name}: {um} um, {urad} urad");
         assert!(map < 0.05, "{name}: map off by {map} nm rms");
-        assert_eq!(found.verdict.used, measured.len(), "{name}");
+        assert_eq!(found.quality.inliers, measured.len(), "{name}");
     }
 }
 
@@ -151,7 +151,7 @@ fn noise_gross_outliers_and_a_missing_corner() {
         let far: Vec<usize> = gross.iter().copied().filter(|&k| distances[k].abs() > 0.02).collect();
         let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
         // Two of them side by side may pass for form, but no pose is fitted to either.
-        let dropped = |k: usize| found.deviations[k].status != PointStatus::Used || !found.deviations[k].in_fit;
+        let dropped = |k: usize| found.deviations[k].status != PointStatus::Inlier || !found.deviations[k].in_fit;
         assert!(far.iter().all(|&k| dropped(k)), "seed {seed}: an outlier was kept");
         let good_dropped = (0..measured.len()).filter(|&k| keep[k] && dropped(k)).count();
         assert!(good_dropped * 100 <= measured.len(), "seed {seed}: {good_dropped} good points dropped");
@@ -187,7 +187,7 @@ fn the_stated_covariance_is_the_observed_scatter() {
             let found = register(&nominal, &points(&measured), &options).unwrap();
             let error = (truth.inverse() * found.cmm_from_model).log();
             observed += error * error.transpose() / DRAWS as f64;
-            stated += found.verdict.covariance / DRAWS as f64;
+            stated += found.quality.covariance / DRAWS as f64;
         }
         for k in 0..6 {
             let ratio = (observed[(k, k)] / stated[(k, k)]).sqrt();

@@ -30,7 +30,7 @@ fn sampled(aperture: &Aperture, step: f64, f: impl Fn(f64, f64) -> f64) -> Vec<S
     let places = (0..count(0) * count(1))
         .map(|k| [low[0] + (k % count(0)) as f64 * step, low[1] + (k / count(0)) as f64 * step]);
     let inside = places.filter(|[x, y]| aperture.contains(*x, *y));
-    inside.map(|at_mm| Sample { at_mm, deviation_mm: f(at_mm[0], at_mm[1]) }).collect()
+    inside.map(|at_mm| Sample { place_mm: at_mm, deviation_mm: f(at_mm[0], at_mm[1]) }).collect()
 }
 
 /// rho and theta about the middle of the disc.
@@ -50,7 +50,7 @@ fn planted(x: f64, y: f64) -> f64 {
 }
 
 fn coefficient(fit: &Fit, term: &str) -> f64 {
-    let k = (0..fit.coefficients_mm.len()).find(|k| fit.basis.term(*k) == term);
+    let k = (0..fit.coefficients_mm.len()).find(|k| fit.basis.term_name(*k) == term);
     fit.coefficients_mm[k.unwrap_or_else(|| panic!("no {term}"))]
 }
 
@@ -62,7 +62,7 @@ fn is_about(found: f64, expected: f64, within: f64) -> bool {
 fn planted_zernike_terms_come_back_on_disc_and_ring() {
     for aperture in [circle(), ring()] {
         let samples = sampled(&aperture, 1.0, planted);
-        let fitted = fit(&Basis::of(&aperture), 36, &samples).unwrap();
+        let fitted = fit(&Basis::for_aperture(&aperture), 36, &samples).unwrap();
         for (term, expected) in [
             ("Z5 (2, 2)", 3e-4),
             ("Z8 (3, -1)", -1e-4),
@@ -92,7 +92,7 @@ fn planted_legendre_terms_come_back_on_the_rectangle() {
         let [u, v] = [(x + 4.0) / 30.0, (y - 10.0) / 18.0];
         1e-3 * p2(u) * 3f64.sqrt() * v - 4e-4 * p3(v) + 2e-5
     };
-    let fitted = fit(&Basis::of(&rectangle), 36, &sampled(&rectangle, 1.5, form)).unwrap();
+    let fitted = fit(&Basis::for_aperture(&rectangle), 36, &sampled(&rectangle, 1.5, form)).unwrap();
     for (term, expected) in [("L2(x) L1(y)", 1e-3), ("L0(x) L3(y)", -4e-4), ("L0(x) L0(y)", 2e-5), ("L7(x) L0(y)", 0.0)]
     {
         assert!(is_about(coefficient(&fitted, term), expected, 1e-14), "{term}: {}", coefficient(&fitted, term));
@@ -104,7 +104,7 @@ fn orthogonal_terms_share_out_the_mean_square_and_do_not_change_with_their_numbe
     let rough = |x: f64, y: f64| 1e-4 * ((0.7 * x).sin() + (0.4 * x * y).cos()) + planted(x, y);
     for aperture in [circle(), ring(), rectangle()] {
         let samples = sampled(&aperture, 1.0, rough);
-        let basis = Basis::of(&aperture);
+        let basis = Basis::for_aperture(&aperture);
         let (few, many) = (fit(&basis, 15, &samples).unwrap(), fit(&basis, 36, &samples).unwrap());
         for (a, b) in few.orthogonal_mm.iter().zip(&many.orthogonal_mm) {
             assert!(is_about(*a, *b, 1e-15), "{a} {b}");
@@ -131,8 +131,8 @@ fn one_spike_makes_the_pv_and_not_the_pvr() {
         let found = of(&spiked, aperture);
         assert_eq!((found.pvr.basis, found.pvr.terms), (basis, 36));
         assert!(found.pv_mm > 5.0 * clean.pv_mm && found.pvr.value_mm < 2.0 * clean.pvr.value_mm, "{:?}", found.pvr);
-        assert!(is_about(found.pv998_mm, clean.pv998_mm, 1e-2 * clean.pv_mm), "{} {}", found.pv998_mm, clean.pv998_mm);
-        assert_eq!((found.highest.value_mm, found.highest.at_mm), (1e-2, smooth[middle].at_mm));
+        assert!(is_about(found.pv_998_mm, clean.pv_998_mm, 1e-2 * clean.pv_mm), "{} {}", found.pv_998_mm, clean.pv_998_mm);
+        assert_eq!((found.highest.value_mm, found.highest.at_mm), (1e-2, smooth[middle].place_mm));
         assert_eq!(found.lowest, clean.lowest);
         // PVr by hand: three times the rms of the rest and the range of the fit.
         let rms = found.pvr.residual_rms_mm;
@@ -144,7 +144,7 @@ fn one_spike_makes_the_pv_and_not_the_pvr() {
 #[test]
 fn nothing_is_nothing_and_figures_grow_with_the_deviations() {
     let zero = of(&sampled(&circle(), 1.0, |_, _| 0.0), circle());
-    assert_eq!([zero.pv_mm, zero.pvr.value_mm, zero.pv998_mm, zero.rms_mm, zero.mean_mm], [0.0; 5]);
+    assert_eq!([zero.pv_mm, zero.pvr.value_mm, zero.pv_998_mm, zero.rms_mm, zero.mean_mm], [0.0; 5]);
     assert_eq!(zero.iso_10110.notation, "3/0(0/0) RMSt<0; RMSi<0; RMSa<0; lambda=632.8");
     let one = of(&sampled(&circle(), 1.0, planted), circle());
     for scale in [1e-9, 1e9] {
@@ -152,7 +152,7 @@ fn nothing_is_nothing_and_figures_grow_with_the_deviations() {
         let pairs = [
             (one.pv_mm, other.pv_mm),
             (one.pvr.value_mm, other.pvr.value_mm),
-            (one.pv998_mm, other.pv998_mm),
+            (one.pv_998_mm, other.pv_998_mm),
             (one.rms_mm, other.rms_mm),
             (one.iso_10110.irregularity_nm, other.iso_10110.irregularity_nm),
             (one.iso_10110.symmetric_nm, other.iso_10110.symmetric_nm),
@@ -222,7 +222,7 @@ fn iso_10110_takes_known_forms_apart() {
 #[test]
 fn too_few_points_make_fewer_terms_or_an_error_with_its_remedy() {
     let samples = sampled(&circle(), 1.0, planted);
-    let basis = Basis::of(&circle());
+    let basis = Basis::for_aperture(&circle());
     for (points, terms) in [(4, 1), (15, 1), (16, 4), (100, 25), (143, 25), (144, 36)] {
         let spread: Vec<Sample> = (0..points).map(|k| samples[k * 997 % samples.len()]).collect();
         assert_eq!(fit_most(&basis, 36, &spread).unwrap().coefficients_mm.len(), terms, "{points}");
@@ -230,13 +230,13 @@ fn too_few_points_make_fewer_terms_or_an_error_with_its_remedy() {
     }
     let three = &samples[..3];
     let told = figures(three, &FormOptions::default()).unwrap_err();
-    assert_eq!(told, FormError::TooFewPoints { points: 3, least: 4 });
+    assert_eq!(told, FormError::TooFewPoints { points: 3, min_points: 4 });
     assert!(told.to_string().contains("measure more"));
-    assert!(matches!(fit(&basis, 36, &samples[..35]), Err(FormError::TooFewPoints { points: 35, least: 36 })));
+    assert!(matches!(fit(&basis, 36, &samples[..35]), Err(FormError::TooFewPoints { points: 35, min_points: 36 })));
     // Five columns tell no sixth power of x, however many points they hold.
     let columns: Vec<Sample> = (0..2000)
         .map(|k| [f64::from(k % 5) - 2.0, f64::from(k / 5) * 0.01])
-        .map(|at_mm| Sample { at_mm, deviation_mm: at_mm[0].powi(3) })
+        .map(|at_mm| Sample { place_mm: at_mm, deviation_mm: at_mm[0].powi(3) })
         .collect();
     let rectangle = Basis::legendre([[-2.0, 0.0], [2.0, 4.0]]);
     let told = fit(&rectangle, 36, &columns).unwrap_err().to_string();
@@ -246,17 +246,17 @@ fn too_few_points_make_fewer_terms_or_an_error_with_its_remedy() {
 
 #[test]
 fn what_has_no_area_or_no_number_is_refused() {
-    let line: Vec<Sample> = (0..50).map(|k| Sample { at_mm: [f64::from(k), 2.0], deviation_mm: 1e-3 }).collect();
+    let line: Vec<Sample> = (0..50).map(|k| Sample { place_mm: [f64::from(k), 2.0], deviation_mm: 1e-3 }).collect();
     assert_eq!(figures(&line, &FormOptions::default()), Err(FormError::NoArea));
-    let slant: Vec<Sample> = (0..50).map(|k| Sample { at_mm: [f64::from(k); 2], deviation_mm: 1e-3 }).collect();
+    let slant: Vec<Sample> = (0..50).map(|k| Sample { place_mm: [f64::from(k); 2], deviation_mm: 1e-3 }).collect();
     assert!(matches!(figures(&slant, &FormOptions::default()), Err(FormError::Undetermined { .. })));
-    let place = vec![Sample { at_mm: [1.0, 1.0], deviation_mm: 0.0 }; 9];
+    let place = vec![Sample { place_mm: [1.0, 1.0], deviation_mm: 0.0 }; 9];
     assert_eq!(figures(&place, &FormOptions::default()), Err(FormError::NoArea));
     let mut bad = sampled(&circle(), 2.0, planted);
     bad[7].deviation_mm = f64::NAN;
     assert_eq!(figures(&bad, &FormOptions::default()), Err(FormError::NotFinite { index: 7 }));
     let mut far = sampled(&circle(), 2.0, planted);
-    far[5].at_mm = [500.0, 0.0];
+    far[5].place_mm = [500.0, 0.0];
     let options = FormOptions { aperture: Some(circle()), ..FormOptions::default() };
     assert!(matches!(figures(&far, &options), Err(FormError::FarOut { index: 5, .. })));
 }
@@ -265,7 +265,7 @@ fn what_has_no_area_or_no_number_is_refused() {
 fn coverage_is_the_share_of_the_aperture_with_points() {
     let full = of(&sampled(&circle(), 0.5, planted), circle());
     assert!(full.coverage.share > 0.99, "{:?}", full.coverage);
-    let half: Vec<Sample> = sampled(&circle(), 0.5, planted).into_iter().filter(|s| s.at_mm[0] > CENTRE[0]).collect();
+    let half: Vec<Sample> = sampled(&circle(), 0.5, planted).into_iter().filter(|s| s.place_mm[0] > CENTRE[0]).collect();
     let half = of(&half, circle());
     assert!(is_about(half.coverage.share, 0.5, 0.06), "{:?}", half.coverage);
     // Without an aperture there is nothing beyond the points.

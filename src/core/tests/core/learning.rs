@@ -36,17 +36,17 @@ fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
             let mut random = StdRng::seed_from_u64(SEED + world);
             let form = drawn(&mut random, 0.02);
             let mut known = LearningState::new(rule, &MapOptions::new(2.5, 1.0), [40.0, 30.0], None);
-            let mut correction = Correction::none(GRID, 0.0);
+            let mut correction = Correction::zero(GRID, 0.0);
             for left in &mut left {
                 let scatter = drawn(&mut random, SCATTER_MM);
                 let sum = |k: usize| form[k] + correction.values_mm[k] + scatter[k];
-                let error = ErrorMap::known(GRID, (0..GRID.len()).map(sum).collect(), vec![true; GRID.len()]);
-                known = known.after(&Seen { correction: &correction, error: &error, answer: None, smooth: None });
-                correction = correction.changed(&known, None);
+                let error = ErrorMap::exact(GRID, (0..GRID.len()).map(sum).collect(), vec![true; GRID.len()]);
+                known = known.updated(&Seen { correction: &correction, error: &error, response: None, explained: None });
+                correction = correction.compensating(&known, None);
                 let rest: Vec<f64> = form.iter().zip(&correction.values_mm).map(|(r, u)| r + u).collect();
                 *left += rms(&rest).powi(2) / WORLDS as f64;
             }
-            told += known.scatter_mm().expect("six passes tell it") / WORLDS as f64;
+            told += known.repeatability_mm().expect("six passes tell it") / WORLDS as f64;
         }
         for (k, left) in (1..).zip(left) {
             let found = left.sqrt() / (SCATTER_MM / f64::from(k).sqrt());

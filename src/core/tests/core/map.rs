@@ -14,7 +14,7 @@ use regrind_core::geometry::{Grid, GridError, Sample};
 fn sampled(columns: usize, rows: usize, step_mm: [f64; 2], f: impl Fn(f64, f64) -> f64) -> Vec<Sample> {
     let at = |k: usize, n: usize, step: f64| (k as f64 - 0.5 * (n - 1) as f64) * step;
     let place = |k: usize| [at(k % columns, columns, step_mm[0]), at(k / columns, rows, step_mm[1])];
-    let reading = |at_mm: [f64; 2]| Sample { at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
+    let reading = |at_mm: [f64; 2]| Sample { place_mm: at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
     (0..columns * rows).map(place).map(reading).collect()
 }
 
@@ -27,7 +27,7 @@ fn trial(f: impl Fn(f64, f64) -> f64) -> Vec<Sample> {
 fn strewn(count: usize, size_mm: [f64; 2], seed: u64, f: impl Fn(f64, f64) -> f64) -> Vec<Sample> {
     let mut rng = StdRng::seed_from_u64(seed);
     let mut place = || size_mm.map(|size| size * (rng.random::<f64>() - 0.5));
-    let reading = |at_mm: [f64; 2]| Sample { at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
+    let reading = |at_mm: [f64; 2]| Sample { place_mm: at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
     (0..count).map(|_| place()).map(reading).collect()
 }
 
@@ -68,7 +68,7 @@ fn direct(readings: &[Sample], grid: &Grid, cutoff_mm: f64) -> Vec<f64> {
             let [x0, y0] = grid.place_mm(k);
             let (mut normal, mut right) = (nalgebra::Matrix3::zeros(), nalgebra::Vector3::zeros());
             for r in readings {
-                let t = nalgebra::Vector3::new(1.0, r.at_mm[0] - x0, r.at_mm[1] - y0);
+                let t = nalgebra::Vector3::new(1.0, r.place_mm[0] - x0, r.place_mm[1] - y0);
                 let w = (-PI * (t[1] * t[1] + t[2] * t[2]) / width2).exp();
                 normal += w * t * t.transpose();
                 right += w * r.deviation_mm * t;
@@ -90,10 +90,10 @@ fn waves(order: Order) {
                 x.hypot(y) > HOLE_MM + 1.2 * cutoff && x.abs() < 45.0 - cutoff && y.abs() < 35.0 - cutoff
             };
             let mut readings = sampled(161, 121, [90.0 / 160.0, 70.0 / 120.0], |x, y| 1e-3 * wave([x, y]));
-            readings.retain(|r| r.at_mm[0].hypot(r.at_mm[1]) > HOLE_MM);
+            readings.retain(|r| r.place_mm[0].hypot(r.place_mm[1]) > HOLE_MM);
             let map = made(&readings, &MapOptions { order, ..plain(cutoff, 1.0) });
             let share = 1e3 * passed(&map, wave, inside);
-            let wanted = order.passes(ratio);
+            let wanted = order.transmission(ratio);
             assert!((share - wanted).abs() < 0.005, "{name}, {ratio} cut-offs, {order:?}: {share} instead of {wanted}");
         }
     }
@@ -101,8 +101,8 @@ fn waves(order: Order) {
 
 #[test]
 fn half_of_a_wave_passes_at_the_cutoff() {
-    assert!((Order::Plane.passes(1.0) - 0.5).abs() < 1e-12);
-    assert!((Order::Quadric.passes(1.0) - 0.5).abs() < 1e-9);
+    assert!((Order::Plane.transmission(1.0) - 0.5).abs() < 1e-12);
+    assert!((Order::Quadric.transmission(1.0) - 0.5).abs() < 1e-9);
     waves(Order::Constant);
     waves(Order::Plane);
     waves(Order::Quadric);
@@ -138,7 +138,7 @@ fn the_sums_along_the_axes_are_those_of_the_definition() {
 
 #[test]
 fn what_the_order_lets_pass_passes_to_the_edges() {
-    let hole = |r: &Sample| (r.at_mm[0] - 5.0).hypot(r.at_mm[1]) > 8.0;
+    let hole = |r: &Sample| (r.place_mm[0] - 5.0).hypot(r.place_mm[1]) > 8.0;
     let plane = |x: f64, y: f64| 3e-3 + 1e-4 * x - 2e-4 * y;
     let quadric = |x: f64, y: f64| plane(x, y) + 1e-5 * x * x - 3e-6 * x * y + 2e-5 * y * y;
     let check = |order: Order, smoothing: Smoothing, f: &dyn Fn(f64, f64) -> f64, most: f64| {
@@ -166,7 +166,7 @@ fn the_filter_does_not_care_where_the_part_lies() {
         let options = MapOptions { smoothing, ..MapOptions::new(6.0, 1.0) };
         let here = with_noise(&strewn(2000, [50.0, 40.0], 8, |x, y| 1e-3 * (0.3 * x).sin() * (0.2 * y).cos()), 2e-4, 4);
         let there: Vec<Sample> =
-            here.iter().map(|r| Sample { at_mm: [r.at_mm[0] + 1234.5, r.at_mm[1] - 777.25], ..*r }).collect();
+            here.iter().map(|r| Sample { place_mm: [r.place_mm[0] + 1234.5, r.place_mm[1] - 777.25], ..*r }).collect();
         let mut turned = here.clone();
         turned.reverse();
         let (map, moved, back) = (made(&here, &options), made(&there, &options), made(&turned, &options));
@@ -198,8 +198,8 @@ fn spiked(readings: &mut [Sample], height_mm: f64, seed: u64) -> Vec<usize> {
     let mut rng = StdRng::seed_from_u64(seed);
     let mut spikes: Vec<usize> = Vec::new();
     for k in (0..readings.len()).filter(|_| rng.random::<f64>() < 0.01) {
-        let [x, y] = readings[k].at_mm;
-        let is_near = |other: &usize| (readings[*other].at_mm[0] - x).hypot(readings[*other].at_mm[1] - y) < APART_MM;
+        let [x, y] = readings[k].place_mm;
+        let is_near = |other: &usize| (readings[*other].place_mm[0] - x).hypot(readings[*other].place_mm[1] - y) < APART_MM;
         if !spikes.iter().any(is_near) {
             spikes.push(k);
         }
@@ -272,11 +272,11 @@ fn a_feature_of_the_part_is_kept() {
 fn two_neighbours_that_agree_are_kept_and_one_alone_is_left_out() {
     let quiet = with_noise(&trial(|_, _| 0.0), 3e-4, 5);
     let nearest = |[x, y]: [f64; 2], but: Option<usize>| {
-        let away = |k: usize| (quiet[k].at_mm[0] - x).hypot(quiet[k].at_mm[1] - y);
+        let away = |k: usize| (quiet[k].place_mm[0] - x).hypot(quiet[k].place_mm[1] - y);
         (0..quiet.len()).filter(|k| Some(*k) != but).min_by(|a, b| away(*a).total_cmp(&away(*b))).unwrap()
     };
     let first = nearest([10.0, -5.0], None);
-    let second = nearest(quiet[first].at_mm, Some(first));
+    let second = nearest(quiet[first].place_mm, Some(first));
     for (depth_mm, cutoff_mm) in [(3e-3, 5.0), (1e-2, 5.0), (5e-2, 5.0), (3e-3, 10.0), (5e-2, 10.0)] {
         let chipped = |depths_mm: &[(usize, f64)]| {
             let mut readings = quiet.clone();
@@ -287,7 +287,7 @@ fn two_neighbours_that_agree_are_kept_and_one_alone_is_left_out() {
         for shallow_mm in [depth_mm, 0.5 * depth_mm] {
             let map = chipped(&[(first, depth_mm), (second, shallow_mm)]);
             assert!(!map.outliers.contains(&first) && !map.outliers.contains(&second), "{:?}", map.outliers);
-            let held_mm = -map.at(quiet[first].at_mm);
+            let held_mm = -map.at(quiet[first].place_mm);
             assert!(held_mm > 0.5 * depth_mm && held_mm < 1.1 * depth_mm, "{held_mm} of {depth_mm}");
         }
         assert_eq!(chipped(&[(first, depth_mm)]).outliers, [first]);
@@ -301,7 +301,7 @@ fn a_place_that_is_touched_again_does_not_agree_with_itself() {
     let beside = [[0.0, 0.0], [0.3, -0.2], [-0.1, 0.4]];
     let touched = sampled(22, 24, [260.0, 260.0], wave);
     let thrice =
-        touched.iter().flat_map(|r| beside.map(|[x, y]| Sample { at_mm: [r.at_mm[0] + x, r.at_mm[1] + y], ..*r }));
+        touched.iter().flat_map(|r| beside.map(|[x, y]| Sample { place_mm: [r.place_mm[0] + x, r.place_mm[1] + y], ..*r }));
     let mut readings = with_noise(&thrice.collect::<Vec<_>>(), 0.02, 3);
     let options = MapOptions::new(1200.0, 100.0);
     let before = made(&readings, &options);
@@ -309,7 +309,7 @@ fn a_place_that_is_touched_again_does_not_agree_with_itself() {
     readings[raised..raised + 3].iter_mut().for_each(|r| r.deviation_mm -= 0.6);
     let map = made(&readings, &options);
     assert_eq!(map.outliers, [raised, raised + 1, raised + 2]);
-    let at_mm = readings[raised].at_mm;
+    let at_mm = readings[raised].place_mm;
     assert!((map.at(at_mm) - before.at(at_mm)).abs() < 0.02, "{} {}", map.at(at_mm), before.at(at_mm));
 }
 
@@ -377,7 +377,7 @@ fn the_spline_passes_half_at_the_cutoff_and_finds_what_is_there() {
     }
     // A planted truth under noise: cross-validation comes closer to it than the noise by far.
     let readings = with_noise(&strewn(2500, [60.0, 40.0], 4, form), 1e-3, 3);
-    let options = |roughness| MapOptions { smoothing: Smoothing::Spline, roughness, ..plain(5.0, 1.0) };
+    let options = |roughness| MapOptions { smoothing: Smoothing::Spline, spline_smoothness: roughness, ..plain(5.0, 1.0) };
     let off = |roughness| {
         let map = made(&readings, &options(roughness));
         rms(map.samples_mm().into_iter().map(|[x, y, e]| e - form(x, y)))
@@ -391,7 +391,7 @@ fn the_spline_passes_half_at_the_cutoff_and_finds_what_is_there() {
 fn outside_what_was_measured_the_map_levels_off() {
     // A round part whose error rises to its border.
     let mut readings = sampled(81, 81, [1.0, 1.0], |x, _| 1e-4 * x);
-    readings.retain(|r| r.at_mm[0].hypot(r.at_mm[1]) < 40.0);
+    readings.retain(|r| r.place_mm[0].hypot(r.place_mm[1]) < 40.0);
     let level_off_mm = 12.5;
     let map = made(&readings, &MapOptions { level_off_mm, ..MapOptions::new(6.0, 1.0) });
     let corner = map.grid.len() - 1;
@@ -422,7 +422,7 @@ fn a_map_on_a_net_is_filtered_as_readings_are() {
     let plain_form = filter_grid(&grid, &values, &valid, 5.0, Order::Plane, false).unwrap();
     let readings: Vec<Sample> = (0..grid.len())
         .filter(|&k| valid[k])
-        .map(|k| Sample { at_mm: grid.place_mm(k), deviation_mm: values[k] })
+        .map(|k| Sample { place_mm: grid.place_mm(k), deviation_mm: values[k] })
         .collect();
     let exact = direct(&readings, &grid, 5.0);
     let nodes = || (0..grid.len()).filter(|&k| plain_form.valid[k]);
@@ -447,12 +447,12 @@ fn what_makes_no_map_is_said() {
     assert!(matches!(error_map(&some[..1], &options), Err(MapError::TooSparse { .. })));
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
         let options = MapOptions { smoothing, ..options };
-        let line: Vec<Sample> = (0..100).map(|k| Sample { at_mm: [f64::from(k), 0.0], deviation_mm: 1e-3 }).collect();
+        let line: Vec<Sample> = (0..100).map(|k| Sample { place_mm: [f64::from(k), 0.0], deviation_mm: 1e-3 }).collect();
         assert!(matches!(error_map(&line, &options), Err(MapError::TooSparse { .. })), "{smoothing:?}");
         let slanted: Vec<Sample> =
-            (0..100).map(|k| Sample { at_mm: [f64::from(k), 0.3 * f64::from(k)], deviation_mm: 1e-3 }).collect();
+            (0..100).map(|k| Sample { place_mm: [f64::from(k), 0.3 * f64::from(k)], deviation_mm: 1e-3 }).collect();
         assert!(matches!(error_map(&slanted, &options), Err(MapError::TooSparse { .. })), "{smoothing:?}");
-        let one_place = vec![Sample { at_mm: [3.0, 4.0], deviation_mm: 1e-3 }; 50];
+        let one_place = vec![Sample { place_mm: [3.0, 4.0], deviation_mm: 1e-3 }; 50];
         assert!(error_map(&one_place, &options).is_err(), "{smoothing:?}");
     }
     let mut broken = some.clone();
@@ -505,7 +505,7 @@ fn what_a_model_tells_is_laid_out_with_how_well_each_place_is_known() {
     let form = |x: f64, y: f64| 1e-3 * (0.05 * x).sin() + 2e-5 * y;
     let sigma = |x: f64, _: f64| 3e-4 + 4e-6 * x;
     let told: Vec<(Sample, f64)> =
-        trial(form).into_iter().map(|sample| (sample, sigma(sample.at_mm[0], sample.at_mm[1]))).collect();
+        trial(form).into_iter().map(|sample| (sample, sigma(sample.place_mm[0], sample.place_mm[1]))).collect();
     let options = MapOptions::new(5.0, 1.0);
     let map = told_map(&told, &options, 2e-4).unwrap();
     let alone = made(&trial(form), &MapOptions { outlier_limit: None, ..options });

@@ -31,7 +31,7 @@ fn missed(of_sixteen: u64) -> u64 {
 struct Part {
     form: FormError,
     truth: Pose,
-    found: Registration,
+    registration: Registration,
     model: Form,
 }
 
@@ -55,18 +55,18 @@ fn drifting(seed: u64, rms_mm: f64, drift: f64) -> Part {
     let options = Options { start: Start::Pose(truth), ..Options::new(RADIUS_MM) };
     let found = register(&free_form(409, 249), &points(&all), &options).unwrap();
     let model = Form::estimate(&found, &ModelInputs::default()).unwrap();
-    Part { form, truth, found, model }
+    Part { form, truth, registration: found, model }
 }
 
 impl Part {
     /// The true form at the points, after its own best fit.
     fn form(&self) -> Vec<f64> {
-        after_best_fit(&self.found, |d| self.form.height(d.point.x, d.point.y))
+        after_best_fit(&self.registration, |d| self.form.height(d.point.x, d.point.y))
     }
 
     /// The square of the error of the pose in units of a covariance, by its degrees of freedom: 1 where the covariance is right.
     fn pose_error(&self, covariance: &Matrix6<f64>) -> f64 {
-        let twist = (self.truth.inverse() * self.found.cmm_from_model).log();
+        let twist = (self.truth.inverse() * self.registration.cmm_from_model).log();
         let off = Vector6::from_iterator(twist.iter().copied());
         (off.transpose() * covariance.try_inverse().unwrap() * off)[0] / 6.0
     }
@@ -106,7 +106,7 @@ fn form_and_frame_are_said_with_intervals_that_hold_the_truth() {
         rms += u64::from(holds(part.model.figures.rms, true_rms));
         pv += u64::from(holds(part.model.figures.pv, true_pv));
         frame += part.pose_error(&part.model.frame_covariance) / parts() as f64;
-        repeated += part.pose_error(&part.found.verdict.covariance) / parts() as f64;
+        repeated += part.pose_error(&part.registration.quality.covariance) / parts() as f64;
         assert_eq!(part.model.points.len(), truth.len());
         assert!(
             (part.model.hyperparameters.noise_sigma_mm / SCATTER_MM - 1.0).abs() < 0.25,
@@ -174,9 +174,9 @@ fn a_probe_that_drifts_along_its_path_is_not_taken_for_form() {
         seen += u64::from(part.model.hyperparameters.noise_autocorrelation > 0.4);
         // Points that come in no order tell nothing of a path.
         if seed == 100 {
-            let mut shuffled = part.found.clone();
+            let mut shuffled = part.registration.clone();
             let n = shuffled.deviations.len();
-            shuffled.deviations = (0..n).map(|k| part.found.deviations[(k * 271) % n]).collect();
+            shuffled.deviations = (0..n).map(|k| part.registration.deviations[(k * 271) % n]).collect();
             assert_eq!(
                 Form::estimate(&shuffled, &ModelInputs::default()).unwrap().hyperparameters.noise_autocorrelation,
                 0.0
@@ -198,7 +198,7 @@ fn a_form_as_small_as_the_scatter_is_told_without_it() {
         let figures = part.model.figures;
         rms += u64::from(holds(figures.rms, truth[0]));
         pv += u64::from(holds(figures.pv, truth[1]));
-        let verdict = &part.found.verdict;
+        let verdict = &part.registration.quality;
         raw[0] += verdict.rms_mm / truth[0] / parts() as f64;
         raw[1] += verdict.pv_mm / truth[1] / parts() as f64;
     }
@@ -235,7 +235,7 @@ fn what_a_machine_does_to_all_points_is_allowed_for_where_it_is_stated() {
         let (form, found) = by_a_machine(seed, &machine, radius_sigma_mm);
         let model = Form::estimate(&found, &given).unwrap();
         let blind = Form::estimate(&found, &ModelInputs::default()).unwrap();
-        let part = Part { form, truth: Pose::identity(), found, model };
+        let part = Part { form, truth: Pose::identity(), registration: found, model };
         let [true_rms, _] = figures(&part.form());
         with += u32::from(holds(part.model.figures.rms, true_rms));
         without += u32::from(holds(blind.figures.rms, true_rms));
@@ -265,7 +265,7 @@ fn held_elsewhere(seed: u64, datum: [f64; 6]) -> (FormError, Registration) {
         let by_mm = [x_mm - turn_rad * y, y_mm + turn_rad * x, 0.0];
         centre.iter_mut().zip(by_mm).for_each(|(v, by)| *v += by + SCATTER_MM * normal(&mut rng));
     }
-    let locked = Coordinate::locked(&[Coordinate::X, Coordinate::Y, Coordinate::Rz]);
+    let locked = Coordinate::locked_flags(&[Coordinate::X, Coordinate::Y, Coordinate::Rz]);
     let options = Options { start: Start::Pose(Pose::identity()), locked, ..Options::new(RADIUS_MM) };
     (form, register(&free_form(409, 249), &points(&all), &options).unwrap())
 }
@@ -274,7 +274,7 @@ fn held_elsewhere(seed: u64, datum: [f64; 6]) -> (FormError, Registration) {
 fn where_a_fixture_holds_a_part_is_in_what_is_said_of_it() {
     let drawn = seeds(5);
     let datum = [5e-3, 5e-3, 0.0, 0.0, 0.0, 1e-4];
-    let given = ModelInputs { datum: Some(datum), ..ModelInputs::default() };
+    let given = ModelInputs { locked_sigmas: Some(datum), ..ModelInputs::default() };
     let (mut with, mut without, mut wider) = ([0; 2], [0; 2], 0.0);
     for seed in 0..drawn {
         let (form, found) = held_elsewhere(seed, datum);
@@ -288,7 +288,7 @@ fn where_a_fixture_holds_a_part_is_in_what_is_said_of_it() {
         let base = motions.qr().q();
         let truth = figures((&form - &base * base.tr_mul(&form)).as_slice());
         let [sure, blind] =
-            [given, ModelInputs { datum: Some([0.0; 6]), ..given }].map(|of| Form::estimate(&found, &of).unwrap());
+            [given, ModelInputs { locked_sigmas: Some([0.0; 6]), ..given }].map(|of| Form::estimate(&found, &of).unwrap());
         for (held, told) in [(&mut with, &sure), (&mut without, &blind)] {
             held[0] += u32::from(holds(told.figures.rms, truth[0]));
             held[1] += u32::from(holds(told.figures.pv, truth[1]));
@@ -324,7 +324,7 @@ fn ground_by(seed: u64, machine: &MachineUncertainty, datum: [f64; 6]) -> (Regis
     let held = if datum == [0.0; 6] {
         [false; 6]
     } else {
-        Coordinate::locked(&[Coordinate::X, Coordinate::Y, Coordinate::Rz])
+        Coordinate::locked_flags(&[Coordinate::X, Coordinate::Y, Coordinate::Rz])
     };
     let options = Options { start: Start::Pose(Pose::identity()), locked: held, ..Options::new(RADIUS_MM) };
     let [looks, is] = [looks, is].map(|all| register(&free_form(409, 249), &points(&all), &options).unwrap());
@@ -341,7 +341,7 @@ fn what_a_machine_has_had_ground_into_a_part_is_in_what_is_said_of_it() {
         for seed in 0..drawn {
             let (looks, is) = ground_by(seed, &machine, datum);
             let truth = figures(&is.deviations.iter().map(|d| d.deviation_mm).collect::<Vec<_>>());
-            let first = ModelInputs { machine, datum: Some(datum), ..ModelInputs::default() };
+            let first = ModelInputs { machine, locked_sigmas: Some(datum), ..ModelInputs::default() };
             let [sure, blind] =
                 [ModelInputs { is_corrected: true, ..first }, first].map(|of| Form::estimate(&looks, &of).unwrap());
             for (held, told) in [(&mut with, &sure), (&mut without, &blind)] {
@@ -376,13 +376,13 @@ fn what_no_uncertainty_can_be_is_refused_in_words() {
             MachineUncertainty { probe_mm: wrong, ..MachineUncertainty::default() },
             MachineUncertainty { squareness_rad: [0.0, wrong, 0.0], ..MachineUncertainty::default() },
         ] {
-            let error = Form::estimate(&part.found, &ModelInputs { machine, ..ModelInputs::default() })
+            let error = Form::estimate(&part.registration, &ModelInputs { machine, ..ModelInputs::default() })
                 .unwrap_err()
                 .to_string();
             assert!(error.contains("standard uncertainty") && error.contains(&wrong.to_string()), "{error}");
         }
-        let given = ModelInputs { datum: Some([0.0, wrong, 0.0, 0.0, 0.0, 0.0]), ..ModelInputs::default() };
-        let error = Form::estimate(&part.found, &given).unwrap_err().to_string();
+        let given = ModelInputs { locked_sigmas: Some([0.0, wrong, 0.0, 0.0, 0.0, 0.0]), ..ModelInputs::default() };
+        let error = Form::estimate(&part.registration, &given).unwrap_err().to_string();
         assert!(error.contains("pose of the fixture") && error.contains(&wrong.to_string()), "{error}");
     }
 }
@@ -391,12 +391,12 @@ fn what_no_uncertainty_can_be_is_refused_in_words() {
 fn what_is_known_of_the_radius_of_the_probe_is_in_what_is_said() {
     let (part, with_form) = (part(3, 1e-9), part(3, 5e-3));
     let given = ModelInputs { radius_sigma_mm: 2e-2, ..ModelInputs::default() };
-    let doubted = Form::estimate(&part.found, &given).unwrap();
+    let doubted = Form::estimate(&part.registration, &given).unwrap();
     let [z, z_doubted] = [&part.model, &doubted].map(|form| form.frame_covariance[(2, 2)].sqrt());
     assert!((z_doubted / 2e-2 - 1.0).abs() < 0.2 && z < 3e-4, "{z} {z_doubted}");
     // A wrong radius would show in points that have no form; in a form it may hide.
     let [sure, doubted] =
-        [ModelInputs::default(), given].map(|given| Form::estimate(&with_form.found, &given).unwrap().figures.rms);
+        [ModelInputs::default(), given].map(|given| Form::estimate(&with_form.registration, &given).unwrap().figures.rms);
     let width = |of: Interval| of.high_mm - of.low_mm;
     println!("RMS {:.2} times as wide beside an unknown radius", width(doubted) / width(sure));
     assert!(width(doubted) > 2.0 * width(sure), "{sure:?} {doubted:?}");
@@ -405,20 +405,20 @@ fn what_is_known_of_the_radius_of_the_probe_is_in_what_is_said() {
 #[test]
 fn the_figures_of_a_part_without_form_are_not_the_scatter_of_its_probe() {
     let part = part(1, 1e-9);
-    let raw = figures(&part.found.deviations.iter().map(|d| d.deviation_mm).collect::<Vec<_>>());
+    let raw = figures(&part.registration.deviations.iter().map(|d| d.deviation_mm).collect::<Vec<_>>());
     let told = part.model.figures;
     println!("raw rms {:.2e} pv {:.2e}; {told:?}", raw[0], raw[1]);
     assert!(told.rms.high_mm < 0.6 * raw[0] && told.pv.high_mm < 0.6 * raw[1], "{told:?} {raw:?}");
-    assert!(!part.model.is_seen && told.rms.low_mm == 0.0 && told.pv.low_mm == 0.0, "{told:?}");
+    assert!(!part.model.is_detected && told.rms.low_mm == 0.0 && told.pv.low_mm == 0.0, "{told:?}");
 }
 
 /// What is true of the figures of an area: of the planted form at the points.
 fn of_an_area(part: &Part) -> (IsoOfForm, [f64; 2]) {
-    let places: Vec<[f64; 2]> = part.found.deviations.iter().map(|d| [d.point.x, d.point.y]).collect();
+    let places: Vec<[f64; 2]> = part.registration.deviations.iter().map(|d| [d.point.x, d.point.y]).collect();
     let slope = part.model.slope.unwrap();
-    let slopes = SlopesAt::over(&places, Some(slope.integration_mm)).unwrap();
+    let slopes = SlopesAt::new(&places, Some(slope.integration_mm)).unwrap();
     assert_eq!((slopes.integration_mm, slopes.nodes), (slope.integration_mm, slope.places));
-    (IsoFits::over(&places, None).unwrap().of(&part.form()), slopes.of(&part.form()))
+    (IsoFits::new(&places, None).unwrap().evaluate(&part.form()), slopes.evaluate(&part.form()))
 }
 
 /// Whether each figure of an area is held: ISO 10110-5 from the power on, and the slopes.
@@ -459,10 +459,10 @@ fn a_part_without_form_has_slopes_and_iso_10110_with_upper_bounds_alone() {
     }
     assert!(slope.rms.low_rad == 0.0 && slope.largest.low_rad == 0.0 && slope.rms.high_rad > slopes[0], "{slope:?}");
     // The scatter of the probe is off them.
-    let raw: Vec<f64> = part.found.deviations.iter().map(|d| d.deviation_mm).collect();
-    let places: Vec<[f64; 2]> = part.found.deviations.iter().map(|d| [d.point.x, d.point.y]).collect();
-    let raw_iso = IsoFits::over(&places, None).unwrap().of(&raw);
-    let raw_slopes = SlopesAt::over(&places, Some(slope.integration_mm)).unwrap().of(&raw);
+    let raw: Vec<f64> = part.registration.deviations.iter().map(|d| d.deviation_mm).collect();
+    let places: Vec<[f64; 2]> = part.registration.deviations.iter().map(|d| [d.point.x, d.point.y]).collect();
+    let raw_iso = IsoFits::new(&places, None).unwrap().evaluate(&raw);
+    let raw_slopes = SlopesAt::new(&places, Some(slope.integration_mm)).unwrap().evaluate(&raw);
     assert!(told.irregularity.high_mm < 0.6 * raw_iso.irregularity_mm, "{told:?} {raw_iso:?}");
     assert!(slope.rms.high_rad < 0.8 * raw_slopes[0], "{slope:?} {raw_slopes:?}");
 }
@@ -470,18 +470,18 @@ fn a_part_without_form_has_slopes_and_iso_10110_with_upper_bounds_alone() {
 #[test]
 fn of_too_few_points_no_figure_of_an_area_is_invented() {
     let mut part = part(2, 5e-3);
-    for (k, deviation) in part.found.deviations.iter_mut().enumerate() {
+    for (k, deviation) in part.registration.deviations.iter_mut().enumerate() {
         if k % 43 != 0 {
             deviation.status = PointStatus::Outlier;
         }
     }
-    let told = Form::estimate(&part.found, &ModelInputs::default()).unwrap();
+    let told = Form::estimate(&part.registration, &ModelInputs::default()).unwrap();
     assert_eq!(told.points.len(), 14);
     assert!(told.slope.is_none() && told.iso.is_some());
-    for (k, deviation) in part.found.deviations.iter_mut().enumerate() {
-        deviation.status = if k % 60 == 7 { PointStatus::Used } else { PointStatus::Outlier };
+    for (k, deviation) in part.registration.deviations.iter_mut().enumerate() {
+        deviation.status = if k % 60 == 7 { PointStatus::Inlier } else { PointStatus::Outlier };
     }
-    let told = Form::estimate(&part.found, &ModelInputs::default()).unwrap();
+    let told = Form::estimate(&part.registration, &ModelInputs::default()).unwrap();
     assert!(told.slope.is_none() && told.iso.is_none());
 }
 
@@ -491,7 +491,7 @@ fn between_the_touches_there_is_no_more_form_than_at_them() {
     let given = ModelInputs { probe_noise_mm: [0.5 * SCATTER_MM, 0.1], ..ModelInputs::default() };
     for seed in 0..2 {
         let part = part(seed, 5e-3);
-        let FormFigures { pv, pv_most_points, .. } = Form::estimate(&part.found, &given).unwrap().figures;
+        let FormFigures { pv, pv_998: pv_most_points, .. } = Form::estimate(&part.registration, &given).unwrap().figures;
         println!("seed {seed}: touched up to {:.2e}, the aperture up to {:.2e} mm", pv.high_mm, pv_most_points.high_mm);
         assert!(pv_most_points.high_mm < 1.2 * pv.high_mm && pv_most_points.low_mm >= pv.low_mm, "{pv_most_points:?}");
     }
@@ -502,7 +502,7 @@ fn between_the_touches_there_is_no_more_form_than_at_them() {
 fn a_scatter_that_the_sphere_may_have_missed_is_not_told_as_form() {
     let low_mm = |part: &Part, share: f64| {
         let given = ModelInputs { probe_noise_mm: [share * SCATTER_MM, 0.15], ..ModelInputs::default() };
-        Form::estimate(&part.found, &given).unwrap().figures.rms.low_mm
+        Form::estimate(&part.registration, &given).unwrap().figures.rms.low_mm
     };
     let (parts, mut told) = (seeds(3), 0.0);
     for seed in 0..parts {
@@ -523,17 +523,17 @@ fn too_few_points_have_the_upper_ends_of_a_form_that_is_all_of_what_was_found() 
     for seed in 0..parts {
         let mut part = part(seed, 1e-3);
         let [true_mm, _] = figures(&part.form());
-        for (k, deviation) in part.found.deviations.iter_mut().enumerate() {
-            deviation.status = if k % 38 == 17 { PointStatus::Used } else { PointStatus::Outlier };
+        for (k, deviation) in part.registration.deviations.iter_mut().enumerate() {
+            deviation.status = if k % 38 == 17 { PointStatus::Inlier } else { PointStatus::Outlier };
         }
-        let few = Form::estimate(&part.found, &ModelInputs::default()).unwrap();
-        assert!(few.is_of_few && few.degrees_of_freedom == 10.0, "{}", few.degrees_of_freedom);
+        let few = Form::estimate(&part.registration, &ModelInputs::default()).unwrap();
+        assert!(few.is_underdetermined && few.degrees_of_freedom == 10.0, "{}", few.degrees_of_freedom);
         let sphere = ModelInputs { probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() };
-        let by_sphere = Form::estimate(&part.found, &sphere).unwrap();
-        assert!(!by_sphere.is_of_few && by_sphere.figures.rms.high_mm < few.figures.rms.high_mm);
+        let by_sphere = Form::estimate(&part.registration, &sphere).unwrap();
+        assert!(!by_sphere.is_underdetermined && by_sphere.figures.rms.high_mm < few.figures.rms.high_mm);
         println!("seed {seed}: {:.2e} mm, in truth {true_mm:.2e} over the part", few.figures.rms.high_mm);
         held += u64::from(few.figures.rms.high_mm >= true_mm);
-        assert!(!part.model.is_of_few);
+        assert!(!part.model.is_underdetermined);
     }
     assert!(held + missed(2) >= parts, "{held} of {parts}");
 }
@@ -551,7 +551,7 @@ fn figures_are_the_same_on_any_number_of_threads() {
         pool.install(|| Form::estimate(&found, &ModelInputs::default()).unwrap())
     };
     let bits = |form: &Form| {
-        let FormFigures { rms, pv, pv_most_points } = form.figures;
+        let FormFigures { rms, pv, pv_998: pv_most_points } = form.figures;
         [rms, pv, pv_most_points].map(|of| [of.low_mm, of.median_mm, of.high_mm].map(f64::to_bits))
     };
     let [one, three] = [1, 3].map(|threads| bits(&on(threads)));

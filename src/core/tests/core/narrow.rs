@@ -93,20 +93,20 @@ fn next_to_a_line_is_a_line_and_a_strip_is_not() {
 fn a_line_may_tell_what_it_can_where_the_rest_is_held() {
     let cloud = measured(&line(60, [2.0, -3.0], 0.0, 45.0), 0.0, 8);
     let start = Start::Pose(pose(&placement()));
-    let hold = |held: &[Coordinate]| Options { start, locked: Coordinate::locked(held), ..free() };
+    let hold = |held: &[Coordinate]| Options { start, locked: Coordinate::locked_flags(held), ..free() };
     assert!(matches!(found(&cloud, &hold(&[Coordinate::Y])), Err(RegistrationError::Narrow { .. })));
     let said = found(&cloud, &free()).unwrap_err().to_string();
     assert!(said.contains("lock y and rx") && said.contains("measure a strip at least"), "{said}");
     let registration = found(&cloud, &hold(&[Coordinate::Y, Coordinate::Rx])).unwrap();
-    assert!(registration.verdict.rms_mm < 1e-3);
+    assert!(registration.quality.rms_mm < 1e-3);
 }
 
 #[test]
 fn a_line_covers_its_own_strip() {
     let cover = |places: &[[f64; 2]]| {
         let start = Start::Pose(pose(&placement()));
-        let held = Coordinate::locked(&[Coordinate::Y, Coordinate::Rx]);
-        found(&measured(places, 0.0, 9), &Options { start, locked: held, ..free() }).unwrap().verdict.coverage
+        let held = Coordinate::locked_flags(&[Coordinate::Y, Coordinate::Rx]);
+        found(&measured(places, 0.0, 9), &Options { start, locked: held, ..free() }).unwrap().quality.coverage
     };
     let grid = |columns: u32, rows: u32, [x0, x1]: [f64; 2]| -> Vec<[f64; 2]> {
         let at = |k: u32, count: u32, [a, b]: [f64; 2]| a + (b - a) * (f64::from(k) + 0.5) / f64::from(count);
@@ -138,13 +138,13 @@ fn a_turn_that_only_the_sampling_sees_is_held() {
         cloud.iter_mut().flatten().for_each(|v| *v += 3e-4 * normal(&mut rng));
         let options = Options { start: Start::Pose(pose(&placement())), ..free() };
         let found = register(&nominal, &points(&cloud), &options).unwrap();
-        let weak: Vec<&str> = found.verdict.weak_directions.iter().map(|weak| weak.words.as_str()).collect();
+        let weak: Vec<&str> = found.quality.weak_directions.iter().map(|weak| weak.words.as_str()).collect();
         assert!(
-            found.verdict.weak_directions.iter().any(|weak| weak.held) && weak[0].contains("rotation about z"),
+            found.quality.weak_directions.iter().any(|weak| weak.held) && weak[0].contains("rotation about z"),
             "{columns} x {rows}: {weak:?}, condition {:.1e}",
-            found.verdict.condition
+            found.quality.condition
         );
-        let held = found.verdict.weak_directions.iter().filter(|weak| weak.held).count();
+        let held = found.quality.weak_directions.iter().filter(|weak| weak.held).count();
         assert_eq!(held, 1, "{columns} x {rows}: {weak:?}");
     }
 }
@@ -154,7 +154,7 @@ fn as_many_points_are_needed_as_directions_are_free_and_one() {
     let places = [[-30.0, -20.0], [30.0, -18.0], [2.0, 25.0], [-10.0, 5.0], [20.0, 10.0], [-25.0, 15.0], [10.0, -10.0]];
     let cloud = measured(&places, 0.0, 10);
     let start = Start::Pose(pose(&placement()));
-    let held = Coordinate::locked(&[Coordinate::X, Coordinate::Y, Coordinate::Rz]);
+    let held = Coordinate::locked_flags(&[Coordinate::X, Coordinate::Y, Coordinate::Rz]);
     let options = Options { start, locked: held, ..free() };
     for (count, options, is_enough) in [(7, free(), true), (6, free(), false), (4, options, true), (3, options, false)]
     {

@@ -49,11 +49,11 @@ fn tens_of_millimetres_and_degrees_are_undone_to_rounding() {
         let measured = points(&placed(&placement, &exact));
         for distance in [Distance::Curved, Distance::Triangle] {
             let case = format!("{shift_mm:?} mm, {degrees:?} degrees, {distance:?}");
-            let found = register(&nominal, &measured, &Options { distance, ..as_in_the_paper() }).expect(&case);
-            let pv_nm = 1e6 * found.verdict.pv_mm;
+            let found = register(&nominal, &measured, &Options { distance_model: distance, ..as_in_the_paper() }).expect(&case);
+            let pv_nm = 1e6 * found.quality.pv_mm;
             assert!(pv_nm <= 1e-6, "{case}: {pv_nm:e} nm");
-            assert_eq!(found.verdict.used, measured.len(), "{case}");
-            assert!(found.verdict.iterations <= 10, "{case}: {} iterations", found.verdict.iterations);
+            assert_eq!(found.quality.inliers, measured.len(), "{case}");
+            assert!(found.quality.iterations <= 10, "{case}: {} iterations", found.quality.iterations);
             // Eq. (14), as long as the points are the same: those on the very edge come in when the pose is found.
             let taken: Vec<_> = found.trace.iter().filter(|turn| turn.taken).collect();
             let falls = |w: &[&regrind_core::registration::Iteration]| {

@@ -32,12 +32,12 @@ fn on(shape: &dyn Shape, off: impl Fn(&Contact, f64) -> f64) -> Vec<Contact> {
 }
 
 fn find(contacts: &[Contact], free_motions: [bool; 6]) -> Parameters {
-    parameters(contacts, None, &ParameterOptions { free_motions, datum: EXACT, ..ParameterOptions::new(WHEEL_MM) })
+    parameters(contacts, None, &ParameterOptions { free_motions, locked_sigmas: EXACT, ..ParameterOptions::new(WHEEL_MM) })
         .unwrap()
 }
 
 fn of(found: &Parameters, kind: ParameterKind) -> &Parameter {
-    found.found.iter().find(|p| p.kind == kind).unwrap()
+    found.estimates.iter().find(|p| p.kind == kind).unwrap()
 }
 
 /// What the simulated grinder does with a wheel larger by dr, off by ex and ey.
@@ -66,10 +66,10 @@ fn what_is_planted_is_found_without_form() {
     {
         let parameter = of(&found, kind);
         println!("{}: own share {}", parameter.message, parameter.own_share);
-        assert!((parameter.value - value).abs() < 3.0 * parameter.sigma && parameter.offered, "{}", parameter.message);
-        assert!(parameter.sigma < 1e-4 && parameter.taken == 0.0 && !parameter.beyond, "{}", parameter.message);
+        assert!((parameter.value - value).abs() < 3.0 * parameter.sigma && parameter.is_offered, "{}", parameter.message);
+        assert!(parameter.sigma < 1e-4 && parameter.compensated == 0.0 && !parameter.exceeds_tolerance, "{}", parameter.message);
     }
-    assert!(found.rest_rms_mm < 1e-5 && found.rms_mm > 1e-3);
+    assert!(found.residual_rms_mm < 1e-5 && found.rms_mm > 1e-3);
     let radius = &of(&found, ParameterKind::WheelRadius).message;
     assert!(radius.starts_with("wheel radius: 12.5900 mm instead of 12.5000 mm, off by "), "{radius}");
     assert!(radius.contains("set compensation.parameters.wheel_radius_um to its tolerance"), "{radius}");
@@ -89,9 +89,9 @@ fn on_a_bowl_a_larger_wheel_leaves_what_is_worked_out_by_hand_and_is_taken_back(
         ..ParameterOptions::new(WHEEL_MM)
     };
     let values = std::array::from_fn(|k| if k == 0 { 0.1 } else { 0.0 });
-    let set = Set::of(values, 2, [&[steep], &[steep]], &options).unwrap();
+    let set = Set::from_values(values, 2, [&[steep], &[steep]], &options).unwrap();
     assert!((set.displaced_mm[0] - 0.1 * (2.0 / 3f64.sqrt() - 1.0)).abs() < 1e-15 && set.setting_mm[0] == 0.0);
-    assert_eq!(Set::of([0.0; ParameterKind::COUNT], 2, [&[steep], &[steep]], &options), None);
+    assert_eq!(Set::from_values([0.0; ParameterKind::COUNT], 2, [&[steep], &[steep]], &options), None);
     // On a free form it is told beside a form of 0.3 um, and all but its uncertainty is taken, 0.1 (1 + s^2 / 0.1^2)^-1.
     let form = FormError::with_rms(&mut regrind_sim::rng(3), 14.0, 3e-4);
     let contacts = on(&FreeForm::default(), |c, _| planted(c, 0.1, 0.0, 0.0) + form.height(c.point.x, c.point.y));
@@ -99,14 +99,14 @@ fn on_a_bowl_a_larger_wheel_leaves_what_is_worked_out_by_hand_and_is_taken_back(
     let radius = of(&found, ParameterKind::WheelRadius);
     println!("{}", radius.message);
     let by_hand = radius.value / (1.0 + (radius.sigma / 0.1).powi(2));
-    assert!(radius.offered && (radius.taken - by_hand).abs() < 1e-12 && !radius.beyond, "{}", radius.message);
+    assert!(radius.is_offered && (radius.compensated - by_hand).abs() < 1e-12 && !radius.exceeds_tolerance, "{}", radius.message);
     assert!((radius.value - 0.1).abs() < 3.0 * radius.sigma, "{}", radius.message);
     // Of a recipe that knows its wheel to 10 um a person is asked.
     let sure = ParameterOptions { tolerances: options.tolerances.map(|of| of.map(|_| 0.01)), ..options };
     let radius = of(&parameters(&contacts, None, &sure).unwrap(), ParameterKind::WheelRadius).clone();
-    assert!(radius.taken > 0.0 && radius.taken < 0.1 && radius.beyond, "{}", radius.message);
+    assert!(radius.compensated > 0.0 && radius.compensated < 0.1 && radius.exceeds_tolerance, "{}", radius.message);
     // What is left once it is gone is the form.
-    assert!(found.rest_rms_mm < 3.5e-4 && found.rms_mm > 8.0 * found.rest_rms_mm, "{found:?}");
+    assert!(found.residual_rms_mm < 3.5e-4 && found.rms_mm > 8.0 * found.residual_rms_mm, "{found:?}");
 }
 
 #[test]
@@ -120,7 +120,7 @@ fn of_nothing_nothing_is_taken() {
         let form = FormError::with_rms(&mut regrind_sim::rng(seed), 14.0, 4e-4);
         let contacts = on(&FreeForm::default(), |c, _| form.height(c.point.x, c.point.y));
         let found = parameters(&contacts, None, &options).unwrap();
-        taken += found.found.iter().filter(|p| p.taken != 0.0).count();
+        taken += found.estimates.iter().filter(|p| p.compensated != 0.0).count();
     }
     // One of twenty is by chance beyond its expanded uncertainty.
     println!("{taken} of 20 taken");
@@ -132,14 +132,14 @@ fn a_datum_tells_no_better_than_it_holds() {
     let scatter = whisper();
     let contacts = on(&FreeForm::default(), |c, _| planted(c, 0.0, 0.012, 0.0) + scatter());
     let told = |datum| {
-        let options = ParameterOptions { free_motions: DATUM, datum, ..ParameterOptions::new(WHEEL_MM) };
+        let options = ParameterOptions { free_motions: DATUM, locked_sigmas: datum, ..ParameterOptions::new(WHEEL_MM) };
         of(&parameters(&contacts, None, &options).unwrap(), ParameterKind::SettingX).clone()
     };
     let unknown = told(None);
-    assert!(!unknown.offered && unknown.message.contains("registration.lock_uncertainty_um"), "{}", unknown.message);
+    assert!(!unknown.is_offered && unknown.message.contains("registration.lock_uncertainty_um"), "{}", unknown.message);
     let badly = told(Some([0.01, 0.0]));
-    assert!(!badly.offered && (badly.sigma - 0.01).abs() < 1e-4, "{}", badly.message);
-    assert!(told(Some([0.001, 0.0])).offered);
+    assert!(!badly.is_offered && (badly.sigma - 0.01).abs() < 1e-4, "{}", badly.message);
+    assert!(told(Some([0.001, 0.0])).is_offered);
 }
 
 /// Two dozen worlds: how far values are off in units of their stated uncertainty, and how often by more than three.
@@ -198,14 +198,14 @@ fn what_looks_alike_is_said() {
     // A setting error of a round wheel is a shift of the part.
     let free = find(&on(&FreeForm::default(), scatter), [true; 6]);
     let setting = of(&free, ParameterKind::SettingX);
-    assert_eq!(setting.alike, ["a shift of the part along x"], "{}", setting.message);
-    assert!(!setting.offered && setting.value == 0.0);
+    assert_eq!(setting.inseparable_from, ["a shift of the part along x"], "{}", setting.message);
+    assert!(!setting.is_offered && setting.value == 0.0);
     // On a sphere a shift is also a tilt.
     let sphere = find(&on(&Sphere { radius_mm: 120.0 }, scatter), DATUM);
     for kind in [ParameterKind::SettingX, ParameterKind::SettingY] {
         let setting = of(&sphere, kind);
         assert!(
-            !setting.offered && setting.alike.iter().any(|a| a.starts_with("a tilt of the part about")),
+            !setting.is_offered && setting.inseparable_from.iter().any(|a| a.starts_with("a tilt of the part about")),
             "{}",
             setting.message
         );
@@ -214,9 +214,9 @@ fn what_looks_alike_is_said() {
     let radius = of(&plane, ParameterKind::WheelRadius);
     assert!(radius.message.contains("no effect on a level surface"), "{}", radius.message);
     let wear = of(&plane, ParameterKind::Wear);
-    assert!(wear.alike.iter().any(|a| a.contains("tilt of the part about x")), "{}", wear.message);
-    assert!(plane.found.iter().all(|p| !p.offered && !p.alike.is_empty()));
-    assert_eq!(plane.rest_rms_mm, plane.rms_mm);
+    assert!(wear.inseparable_from.iter().any(|a| a.contains("tilt of the part about x")), "{}", wear.message);
+    assert!(plane.estimates.iter().all(|p| !p.is_offered && !p.inseparable_from.is_empty()));
+    assert_eq!(plane.residual_rms_mm, plane.rms_mm);
     // A plane that leans: 1/nz - 1 is a constant there, which is a shift along z.
     let tilted = Vector::new(0.3, 0.0, 1.0).normalize();
     let leaning: Vec<Contact> = on(&FreeForm { scale: 0.0 }, scatter)
@@ -224,7 +224,7 @@ fn what_looks_alike_is_said() {
         .map(|c| Contact { normal: tilted, point: Point::new(c.point.x, c.point.y, -0.3 * c.point.x), ..c })
         .collect();
     let radius = of(&find(&leaning, [true; 6]), ParameterKind::WheelRadius).clone();
-    assert!(!radius.offered && radius.alike.iter().any(|a| a.starts_with("a shift")), "{}", radius.message);
+    assert!(!radius.is_offered && radius.inseparable_from.iter().any(|a| a.starts_with("a shift")), "{}", radius.message);
 }
 
 /// Progress along a path that winds to and fro.
@@ -263,10 +263,10 @@ fn what_cannot_be_separated_is_refused() {
     // All at one place, on a line: figures or a reason, no panic.
     for shape in [vec![contacts[7]; 40], contacts[..60].to_vec()] {
         if let Ok(found) = parameters(&shape, None, &options) {
-            assert!(found.found.iter().all(|p| p.value.is_finite() && p.sigma.is_finite()));
+            assert!(found.estimates.iter().all(|p| p.value.is_finite() && p.sigma.is_finite()));
         }
     }
     let still: Vec<Contact> = contacts.iter().map(|c| Contact { deviation_mm: 0.0, ..*c }).collect();
     let found = parameters(&still, None, &options).unwrap();
-    assert!(found.found.iter().all(|p| !p.offered && p.taken == 0.0) && found.rest_rms_mm == 0.0);
+    assert!(found.estimates.iter().all(|p| !p.is_offered && p.compensated == 0.0) && found.residual_rms_mm == 0.0);
 }

@@ -29,7 +29,7 @@ fn normal_error_mm(found: &Pose, truth: &Pose, shape: &dyn Shape, half: [f64; 2]
     (-4..=4)
         .flat_map(|j| (-4..=4).map(move |i| (at(i, half[0]), at(j, half[1]))))
         .map(|(x, y)| {
-            let q = truth.inverse().point(&found.point(&Point::from(shape.point(x, y))));
+            let q = truth.inverse().transform_point(&found.transform_point(&Point::from(shape.point(x, y))));
             (q.z - shape.height(q.x, q.y)).abs() * shape.normal(q.x, q.y)[2]
         })
         .fold(0.0, f64::max)
@@ -40,7 +40,7 @@ fn from_identity(probe_radius_mm: f64) -> Options {
 }
 
 fn words(found: &Registration) -> String {
-    found.verdict.weak_directions.iter().map(|w| w.words.as_str()).collect::<Vec<_>>().join("; ")
+    found.quality.weak_directions.iter().map(|w| w.words.as_str()).collect::<Vec<_>>().join("; ")
 }
 
 #[test]
@@ -55,7 +55,7 @@ fn a_steep_off_axis_asphere() {
     // The parent is a surface of revolution about the line x = -70.
     let said = words(&found);
     assert!(said.contains("rotation about z through (-70.0") && said.contains("keeps its start value"), "{said}");
-    assert!((found.verdict.rms_mm / 3e-4 - 1.0).abs() < 0.05, "{}", found.verdict.rms_mm);
+    assert!((found.quality.rms_mm / 3e-4 - 1.0).abs() < 0.05, "{}", found.quality.rms_mm);
 }
 
 #[test]
@@ -72,9 +72,9 @@ fn a_biconic_fits_in_two_poses_and_says_so() {
         truths.map(|t| normal_error_mm(p, &t, &shape, [29.0, 29.0])).into_iter().fold(f64::INFINITY, f64::min)
     };
     assert!(error(&found.cmm_from_model) < 2e-4);
-    assert_eq!(found.verdict.alternatives.len(), 1);
-    assert!(error(&found.verdict.alternatives[0].0) < 2e-3);
-    assert!((found.cmm_from_model.inverse() * found.verdict.alternatives[0].0).angle_rad() > 3.0);
+    assert_eq!(found.quality.alternatives.len(), 1);
+    assert!(error(&found.quality.alternatives[0].0) < 2e-3);
+    assert!((found.cmm_from_model.inverse() * found.quality.alternatives[0].0).angle_rad() > 3.0);
 }
 
 #[test]
@@ -88,11 +88,11 @@ fn a_shallow_wave_is_registered_in_height_and_its_weak_directions_are_named() {
     assert!(error < 1e-4, "{error}");
     let said = words(&found);
     assert!(said.contains("x and y position repeats only to"), "{said}");
-    assert!(found.verdict.weak_directions.iter().all(|w| !w.held), "{said}");
+    assert!(found.quality.weak_directions.iter().all(|w| !w.held), "{said}");
     // What is said of the weak directions is true of them.
     let off = (pose(&placement).inverse() * found.cmm_from_model).log();
     for k in [0, 1] {
-        assert!(off[k].abs() < 4.0 * found.verdict.covariance[(k, k)].sqrt(), "axis {k}: {}", off[k]);
+        assert!(off[k].abs() < 4.0 * found.quality.covariance[(k, k)].sqrt(), "axis {k}: {}", off[k]);
     }
 }
 
@@ -105,12 +105,12 @@ fn a_sphere_cap_holds_its_three_rotations() {
     let found = register(&nominal, &measured(&shape, [22.0, 22.0], [40, 40], &placement, 3e-4), &options).unwrap();
     let said = words(&found);
     assert!(said.contains("every rotation about (") && said.contains("-60.0"), "{said}");
-    assert!(found.verdict.weak_directions[0].held);
+    assert!(found.quality.weak_directions[0].held);
     // The centre is where it should be, to the scatter of 1,600 points; no rotation was made up.
     let centre = Point::new(0.0, 0.0, -60.0);
-    assert!((found.cmm_from_model.point(&centre) - pose(&placement).point(&centre)).norm() < 1e-3);
+    assert!((found.cmm_from_model.transform_point(&centre) - pose(&placement).transform_point(&centre)).norm() < 1e-3);
     assert!(found.cmm_from_model.angle_rad() < 0.2);
-    assert!((found.verdict.rms_mm / 3e-4 - 1.0).abs() < 0.05);
+    assert!((found.quality.rms_mm / 3e-4 - 1.0).abs() < 0.05);
 }
 
 #[test]
@@ -133,7 +133,7 @@ fn a_plane_and_a_cylinder_hold_what_they_cannot_see() {
     let found = register(&nominal, &points(&placed(&tilted, &on_plane)), &options).unwrap();
     let said = words(&found);
     assert!(said.contains("shift along") && said.contains("rotation about z"), "{said}");
-    assert!(found.verdict.pv_mm < 1e-9);
+    assert!(found.quality.pv_mm < 1e-9);
 
     let gutter = |r: f64| move |x: f64, t: f64| Point::new(x, r * t.sin(), r * (1.0 - t.cos()) + (20.0 - r));
     let at = |k: i32, n: i32, low: f64, high: f64| low + (high - low) * f64::from(k) / f64::from(n - 1);
@@ -151,7 +151,7 @@ fn a_plane_and_a_cylinder_hold_what_they_cannot_see() {
     let found = register(&nominal, &points(&placed(&tilted, &on_offset)), &options).unwrap();
     let said = words(&found);
     assert!(said.contains("shift along x") && said.contains("rotation about x"), "{said}");
-    assert!(found.verdict.pv_mm < 1e-5, "{}", found.verdict.pv_mm);
+    assert!(found.quality.pv_mm < 1e-5, "{}", found.quality.pv_mm);
 }
 
 /// Points on a sphere about (0, 0, -r0) that stand evenly, to a polar angle.
@@ -191,7 +191,7 @@ fn a_hyper_hemisphere_to_a_polar_angle_of_120_degrees() {
         .collect();
     let surface = OffsetSurface::new(&nominal, RADIUS_MM, Side::Normal).unwrap();
     let worst =
-        exact.iter().map(|c| surface.foot(&Point::from(*c), Place::UNKNOWN).distance_mm.abs()).fold(0.0, f64::max);
+        exact.iter().map(|c| surface.project(&Point::from(*c), Place::UNKNOWN).distance_mm.abs()).fold(0.0, f64::max);
     assert!(worst < 2e-6, "{worst} mm");
     let placement = Placement::new([100.0, -40.0, 7.0], [30.0, 160.0, -70.0]);
     let found = register(&nominal, &points(&placed(&placement, &exact)), &Options::new(RADIUS_MM)).unwrap();
@@ -217,7 +217,7 @@ fn several_patches_are_one_surface() {
     let placement = Placement::new([10.0, 5.0, 3.0], [5.0, -5.0, 8.0]);
     let cloud = measured(&shape, [50.0, 30.0], [50, 30], &placement, 0.0);
     let found = register(&nominal, &cloud, &Options::new(RADIUS_MM)).unwrap();
-    assert_eq!(found.verdict.used, 1500);
+    assert_eq!(found.quality.inliers, 1500);
     assert!(normal_error_mm(&found.cmm_from_model, &pose(&placement), &shape, [50.0, 30.0]) < 1e-7);
 }
 
@@ -290,8 +290,8 @@ fn the_same_surface_as_a_formula_and_as_points() {
     let between =
         normal_error_mm(&(from_formula.cmm_from_model), &(from_points.cmm_from_model * lifted), &shape, [27.0, 20.0]);
     assert!(between < 1e-7, "{between} mm");
-    assert!((from_formula.verdict.rms_mm - from_points.verdict.rms_mm).abs() < 1e-9);
-    assert_eq!(from_formula.verdict.used, cloud.len());
+    assert!((from_formula.quality.rms_mm - from_points.quality.rms_mm).abs() < 1e-9);
+    assert_eq!(from_formula.quality.inliers, cloud.len());
 }
 
 #[test]

@@ -22,7 +22,7 @@ const TOUCHES: usize = 45;
 struct Part {
     targets: Vec<(Point, Vector)>,
     form: FormError,
-    found: Registration,
+    registration: Registration,
 }
 
 impl Part {
@@ -45,11 +45,11 @@ impl Part {
         let touched: Vec<[f64; 3]> = farthest_points(&targets, TOUCHES).into_iter().map(&mut centre).collect();
         let options = Options { start: Start::Pose(pose(&placement)), ..Options::new(RADIUS_MM) };
         let found = register(&free_form(205, 125), &points(&placed(&placement, &touched)), &options).unwrap();
-        Self { targets, form, found }
+        Self { targets, form, registration: found }
     }
 
     fn told(&self, lesson: Option<PartFit>) -> Form {
-        Form::estimate_at(&self.found, &given(lesson), &self.targets).unwrap()
+        Form::estimate_at(&self.registration, &given(lesson), &self.targets).unwrap()
     }
 
     /// The true form at all targets after its own best fit: RMS and PV.
@@ -71,7 +71,7 @@ impl Part {
 
 fn given(lesson: Option<PartFit>) -> ModelInputs {
     let priors = lesson.map(|lesson| lesson.priors());
-    ModelInputs { priors, probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() }
+    ModelInputs { prior: priors, probe_noise_mm: [SCATTER_MM, 0.15], ..ModelInputs::default() }
 }
 
 fn parts() -> u64 {
@@ -154,7 +154,7 @@ fn what_parts_taught_is_believed_as_far_as_it_is_true() {
     let mut taught = PartPriors::default();
     for seed in 0..4 {
         let part = Part::new(seed, 15.0, 2e-3);
-        if let Some(field) = Form::estimate(&part.found, &given(None)).unwrap().hyperparameters_without_prior {
+        if let Some(field) = Form::estimate(&part.registration, &given(None)).unwrap().hyperparameters_without_prior {
             taught.update(true, &field);
         }
     }

@@ -18,12 +18,12 @@ use regrind_sim::shape::{FreeForm, Shape};
 const SCATTER_MM: f64 = 3e-4;
 const STRICT: StoppingCriteria = StoppingCriteria {
     pv_mm: f64::INFINITY,
-    pv_most_points_mm: 1e-4,
+    pv_998_mm: 1e-4,
     rms_mm: 1e-4,
-    correction_mm: 5e-4,
+    correction_sigma_mm: 5e-4,
     may_grind: true,
 };
-const LOOSE: StoppingCriteria = StoppingCriteria { pv_most_points_mm: 1.0, rms_mm: 1.0, ..STRICT };
+const LOOSE: StoppingCriteria = StoppingCriteria { pv_998_mm: 1.0, rms_mm: 1.0, ..STRICT };
 
 /// A part with something on it that is no smooth form, and its pattern of 36 by 22 targets.
 struct Part {
@@ -143,13 +143,13 @@ fn what_is_narrower_than_the_touches_are_apart_is_in_the_figures() {
     let told = rough.form(&[first.clone(), last.clone()].concat()).figures;
     // PV 99.8 % leaves out the outermost one at either end of a thousand places that were not touched.
     let many = rough.targets.repeat(1500_usize.div_ceil(rough.targets.len()));
-    let FormFigures { pv, pv_most_points, .. } =
+    let FormFigures { pv, pv_998: pv_most_points, .. } =
         Form::estimate_at(&rough.measured(&[first.clone(), last.clone()].concat()), &given(), &many).unwrap().figures;
     assert!(
         pv_most_points.median_mm < pv.median_mm && pv_most_points.high_mm < pv.high_mm,
         "{pv_most_points:?} {pv:?}"
     );
-    assert_eq!(told.pv_most_points, told.pv);
+    assert_eq!(told.pv_998, told.pv);
     let [rms, _] = rough.truth();
     assert!(told.rms.high_mm > rms && told.rms.median_mm > 0.7 * rms, "{told:?} {rms}");
     // Also where every target is touched, and what is narrow is left of the touches themselves.
@@ -167,26 +167,26 @@ fn it_ends_where_enough_is_known_and_goes_on_where_not() {
     let part = Part::smooth(5, 5e-3);
     let (first, last) = apart(&part, 30);
     let few = part.look(&first, &last, &LOOSE);
-    assert_eq!((few.reason, few.next.len()), (Reason::Few, MIN_TOUCHES - 30));
+    assert_eq!((few.reason, few.next.len()), (Reason::TooFewTouches, MIN_TOUCHES - 30));
     let (first, last) = apart(&part, 60);
     let within = part.look(&first, &last, &LOOSE);
-    assert!(within.reason == Reason::Within && within.next.is_empty(), "{:?}", within.reason);
-    let known = part.look(&first, &last, &StoppingCriteria { correction_mm: 0.1, ..STRICT });
-    assert!(known.reason == Reason::Known && known.next.is_empty(), "{:?}", known.reason);
-    let unknown = part.look(&first, &last, &StoppingCriteria { correction_mm: 1e-7, ..STRICT });
-    assert_eq!((unknown.reason, unknown.next.len()), (Reason::Unknown, 30));
-    let between = StoppingCriteria { rms_mm: unknown.form.figures.rms.median_mm, pv_most_points_mm: 1.0, ..STRICT };
+    assert!(within.reason == Reason::WithinLimits && within.next.is_empty(), "{:?}", within.reason);
+    let known = part.look(&first, &last, &StoppingCriteria { correction_sigma_mm: 0.1, ..STRICT });
+    assert!(known.reason == Reason::FormKnown && known.next.is_empty(), "{:?}", known.reason);
+    let unknown = part.look(&first, &last, &StoppingCriteria { correction_sigma_mm: 1e-7, ..STRICT });
+    assert_eq!((unknown.reason, unknown.next.len()), (Reason::FormUnknown, 30));
+    let between = StoppingCriteria { rms_mm: unknown.form.figures.rms.median_mm, pv_998_mm: 1.0, ..STRICT };
     assert_eq!(part.look(&first, &last, &between).reason, Reason::Undecided);
     let all: Vec<usize> = (0..part.targets.len()).collect();
-    assert_eq!(part.look(&all[..400], &all[400..], &STRICT).reason, Reason::All);
+    assert_eq!(part.look(&all[..400], &all[400..], &STRICT).reason, Reason::AllTargetsTried);
 }
 
 #[test]
 fn what_is_beyond_for_certain_is_not_touched_for_a_correction_that_no_pass_is_left_for() {
     let part = Part::smooth(5, 5e-3);
     let (first, last) = apart(&part, 60);
-    let over = part.look(&first, &last, &StoppingCriteria { correction_mm: 1e-7, may_grind: false, ..STRICT });
-    assert!(over.reason == Reason::Beyond && over.next.is_empty(), "{:?}", over.reason);
+    let over = part.look(&first, &last, &StoppingCriteria { correction_sigma_mm: 1e-7, may_grind: false, ..STRICT });
+    assert!(over.reason == Reason::BeyondLimit && over.next.is_empty(), "{:?}", over.reason);
 }
 
 #[test]
@@ -194,24 +194,24 @@ fn touching_is_not_given_up_where_one_look_would_accept_and_the_risk_of_many_doe
     let part = Part::smooth(5, 5e-3);
     let (first, last) = apart(&part, 150);
     let rms = part.look(&first, &last, &LOOSE).form.figures.rms;
-    let between = |rms_mm| StoppingCriteria { rms_mm, correction_mm: 0.1, ..LOOSE };
+    let between = |rms_mm| StoppingCriteria { rms_mm, correction_sigma_mm: 0.1, ..LOOSE };
     // Within with 97.5 %, by which a run judges, and not with 99.5 %, by which it looks.
     assert_eq!(part.look(&first, &last, &between(0.5 * (rms.high_mm + rms.most_mm))).reason, Reason::Undecided);
-    assert_eq!(part.look(&first, &last, &between(0.5 * (rms.median_mm + rms.high_mm))).reason, Reason::Known);
-    assert_eq!(part.look(&first, &last, &between(1.001 * rms.most_mm)).reason, Reason::Within);
+    assert_eq!(part.look(&first, &last, &between(0.5 * (rms.median_mm + rms.high_mm))).reason, Reason::FormKnown);
+    assert_eq!(part.look(&first, &last, &between(1.001 * rms.most_mm)).reason, Reason::WithinLimits);
 }
 
 #[test]
 fn another_pass_mends_more_than_touches_beyond_a_sixth_of_the_pattern() {
     let part = Part::smooth(5, 5e-3);
-    let never = StoppingCriteria { correction_mm: 1e-7, ..STRICT };
+    let never = StoppingCriteria { correction_sigma_mm: 1e-7, ..STRICT };
     let why = |count, purpose: &StoppingCriteria| {
         let (first, last) = apart(&part, count);
         part.look(&first, &last, purpose).reason
     };
-    assert_eq!(why(part.targets.len() / 6 - 2, &never), Reason::Unknown);
-    assert_eq!(why(part.targets.len() / 6, &never), Reason::Enough);
-    assert_eq!(why(part.targets.len() / 6, &StoppingCriteria { may_grind: false, ..never }), Reason::Beyond);
+    assert_eq!(why(part.targets.len() / 6 - 2, &never), Reason::FormUnknown);
+    assert_eq!(why(part.targets.len() / 6, &never), Reason::CorrectionPreferred);
+    assert_eq!(why(part.targets.len() / 6, &StoppingCriteria { may_grind: false, ..never }), Reason::BeyondLimit);
 }
 
 #[test]
@@ -223,12 +223,12 @@ fn batches_have_an_end() {
         touched.iter().for_each(|&k| tried[k] = Some(0));
         tried[touched[0]] = Some(last);
         let so_far = PartialMeasurement { targets: &part.targets, tried: &tried, touched: &touched };
-        decide(&part.measured(&touched), &given(), &so_far, &StoppingCriteria { correction_mm: 1e-7, ..STRICT }, 1)
+        decide(&part.measured(&touched), &given(), &so_far, &StoppingCriteria { correction_sigma_mm: 1e-7, ..STRICT }, 1)
             .unwrap()
     };
-    assert_ne!(looked(MAX_BATCHES - 2).reason, Reason::Late);
+    assert_ne!(looked(MAX_BATCHES - 2).reason, Reason::MaxBatchesReached);
     let late = looked(MAX_BATCHES - 1);
-    assert_eq!((late.reason, late.next.len()), (Reason::Late, part.targets.len() - 60));
+    assert_eq!((late.reason, late.next.len()), (Reason::MaxBatchesReached, part.targets.len() - 60));
 }
 
 #[test]
@@ -242,7 +242,7 @@ fn the_next_touches_are_new_where_least_is_known_and_say_more_than_as_many_anywh
     assert!(decision.next.iter().all(|k| !touched.contains(k)), "{:?}", decision.next);
     let right = decision.next.iter().filter(|&&k| part.targets[k].0.x > 0.0).count();
     assert!(5 * right > 4 * decision.next.len(), "{right} of {}", decision.next.len());
-    let known = |next: &[usize]| part.form(&[&touched, next].concat()).known_mm;
+    let known = |next: &[usize]| part.form(&[&touched, next].concat()).rms_smooth_sigma_mm;
     let anywhere: Vec<usize> =
         (0..part.targets.len()).filter(|k| !touched.contains(k)).step_by(25).take(decision.next.len()).collect();
     let [chosen_mm, anywhere_mm] = [known(&decision.next), known(&anywhere)];
@@ -259,12 +259,12 @@ fn dust_has_its_neighbours_touched_and_is_left_out_then() {
     let (mut first, last) = apart(&part, 80);
     first.push(300);
     let seen = part.look(&first, &last, &LOOSE);
-    assert_eq!(seen.reason, Reason::Around);
+    assert_eq!(seen.reason, Reason::UnconfirmedOutlier);
     let near = |k: &&usize| (part.targets[**k].0 - at).norm() < 6.0;
     let around: Vec<usize> = seen.next.iter().filter(near).copied().collect();
     assert!(around.len() >= 4, "{around:?}");
     let again = part.look(&[&first[..], &last].concat(), &seen.next, &LOOSE);
-    assert_eq!(again.reason, Reason::Within, "alone among its neighbours it is dust");
+    assert_eq!(again.reason, Reason::WithinLimits, "alone among its neighbours it is dust");
 }
 
 #[test]
@@ -274,17 +274,17 @@ fn a_chip_at_the_edge_is_no_dust() {
     // The corner is among those that lie farthest apart; its neighbours come next.
     let (first, last) = apart(&part, 80);
     let seen = part.look(&first, &last, &LOOSE);
-    assert_eq!(seen.reason, Reason::Around);
+    assert_eq!(seen.reason, Reason::UnconfirmedOutlier);
     let again = part.look(&[&first[..], &last].concat(), &seen.next, &LOOSE);
     let told = again.form.figures.pv;
     println!("{:?}: {told:?}", again.reason);
     // Touches that agree with each other are form, however deep; those that do not are a feature of which nobody knows the edge.
     assert!(
-        again.reason == Reason::Feature && again.next.len() + 80 + seen.next.len() == part.targets.len()
+        again.reason == Reason::NarrowFeature && again.next.len() + 80 + seen.next.len() == part.targets.len()
             || told.low_mm > 0.03
     );
-    let deep = StoppingCriteria { pv_most_points_mm: 0.02, rms_mm: 1.0, ..STRICT };
-    assert_ne!(part.look(&[&first[..], &last].concat(), &seen.next, &deep).reason, Reason::Within);
+    let deep = StoppingCriteria { pv_998_mm: 0.02, rms_mm: 1.0, ..STRICT };
+    assert_ne!(part.look(&[&first[..], &last].concat(), &seen.next, &deep).reason, Reason::WithinLimits);
 }
 
 #[test]
@@ -295,7 +295,7 @@ fn a_batch_that_was_not_expected_is_followed_by_another() {
         .map(|on_right| (0..part.targets.len()).filter(|&k| (part.targets[k].0.x > 10.0) == on_right).collect());
     let some = |of: &[usize], count: usize| -> Vec<usize> { of.iter().step_by(of.len() / count).copied().collect() };
     let decision = part.look(&some(&left, 100), &some(&right, 30), &LOOSE);
-    assert!(matches!(decision.reason, Reason::Surprised | Reason::Around | Reason::Feature), "{:?}", decision.reason);
+    assert!(matches!(decision.reason, Reason::LargeInnovations | Reason::UnconfirmedOutlier | Reason::NarrowFeature), "{:?}", decision.reason);
     assert!(!decision.next.is_empty());
 }
 

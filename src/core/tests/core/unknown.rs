@@ -35,7 +35,7 @@ fn statuses(found: &Registration, status: PointStatus) -> Vec<usize> {
 }
 
 fn says(found: &Registration, word: &str) -> bool {
-    found.verdict.warnings.iter().any(|warning| warning.contains(word))
+    found.quality.warnings.iter().any(|warning| warning.contains(word))
 }
 
 /// A free form that reaches so far along x from one end.
@@ -64,7 +64,7 @@ fn points_beyond_the_edge_move_nothing_whatever_their_share() {
                 (0..measured.len()).filter(|&k| -50.0 + 100.0 * (k % 80) as f64 / 79.0 <= to_x_mm).collect();
             let expected = measured.len() - inside.len();
             assert!(off.len().abs_diff(expected) <= 40, "{to_x_mm}: {} of {expected} off the part", off.len());
-            let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+            let used = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
             let farthest_mm = used.fold(f64::NEG_INFINITY, |most, d| most.max(d.point.x - to_x_mm));
             assert!(farthest_mm < 1e-3, "{to_x_mm}: a point {farthest_mm} mm beyond the edge");
             // The others alone give the same map.
@@ -74,7 +74,7 @@ fn points_beyond_the_edge_move_nothing_whatever_their_share() {
             let squares: Vec<f64> = inside
                 .iter()
                 .zip(&other.deviations)
-                .filter(|(k, d)| found.deviations[**k].status == PointStatus::Used && d.status == PointStatus::Used)
+                .filter(|(k, d)| found.deviations[**k].status == PointStatus::Inlier && d.status == PointStatus::Inlier)
                 .map(|(k, d)| (found.deviations[*k].deviation_mm - d.deviation_mm).powi(2))
                 .collect();
             let rms_mm = (squares.iter().sum::<f64>() / squares.len() as f64).sqrt();
@@ -83,7 +83,7 @@ fn points_beyond_the_edge_move_nothing_whatever_their_share() {
             assert!(
                 says(&found, "beyond the edge") == (off.len() * 5 > measured.len()),
                 "{:?}",
-                found.verdict.warnings
+                found.quality.warnings
             );
         }
     }
@@ -126,7 +126,7 @@ fn a_gap_of_the_nominal_is_called_one() {
     let found = register(&nominal, &cloud(WHOLE, [60, 30]), &Options::new(RADIUS_MM)).unwrap();
     let off = statuses(&found, PointStatus::OffPart);
     assert!(!off.is_empty() && off.iter().all(|&k| found.deviations[k].point.coords.xy().norm() < 8.5));
-    assert!(says(&found, "over a gap") && !says(&found, "beyond the edge"), "{:?}", found.verdict.warnings);
+    assert!(says(&found, "over a gap") && !says(&found, "beyond the edge"), "{:?}", found.quality.warnings);
 }
 
 #[test]
@@ -152,7 +152,7 @@ fn in_a_narrow_gutter_every_foot_is_on_its_own_wall() {
             Point::new(inner * angle.sin(), y, -inner * angle.cos())
         };
         let truth = pose(&Placement::new([3.0, -2.0, 1.0], [2.0, -3.0, 5.0]));
-        let measured: Vec<Point> = (0..625).map(|k| truth.point(&centre(k))).collect();
+        let measured: Vec<Point> = (0..625).map(|k| truth.transform_point(&centre(k))).collect();
         for start in [Start::Search, Start::Pose(truth)] {
             let options = Options { start, side: ProbeSide::Above, ..Options::new(BALL_MM) };
             let found = register(&nominal, &measured, &options).unwrap();
@@ -189,7 +189,7 @@ fn a_nominal_that_scatters_is_reported_and_a_smooth_one_is_not() {
     for (noise_mm, is_told) in [(0.0, false), (1e-3, true)] {
         let nominal = Nominal::from_points(scattered(|_| 0.5, noise_mm), Projection::Xy).unwrap();
         let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
-        assert_eq!(says(&found, "nominal points have a noise"), is_told, "{noise_mm}: {:?}", found.verdict.warnings);
+        assert_eq!(says(&found, "nominal points have a noise"), is_told, "{noise_mm}: {:?}", found.quality.warnings);
     }
 }
 
@@ -215,7 +215,7 @@ fn a_side_on_which_the_points_fit_a_hundred_times_better_is_known() {
     let measured = cloud(WHOLE, [80, 40]);
     for to_x_mm in [51.0, 12.0] {
         let found = register(&part_of_the_free_form(to_x_mm), &measured, &Options::new(RADIUS_MM)).unwrap();
-        assert!(!says(&found, "on which side"), "{to_x_mm}: {:?}", found.verdict.warnings);
+        assert!(!says(&found, "on which side"), "{to_x_mm}: {:?}", found.quality.warnings);
     }
 }
 
@@ -225,7 +225,7 @@ fn what_a_surface_cannot_see_begins_at_the_frame_of_the_file() {
     let nominal = Nominal::from_points((0..61 * 41).map(flat).collect(), Projection::Xy).unwrap();
     let tilt = pose(&Placement::new([4.0, -3.0, 7.0], [1.0, -2.0, 0.0]));
     let centre = |k: usize| Point::new(2.0 * (k % 25) as f64 - 24.0, 2.0 * (k / 25) as f64 - 16.0, RADIUS_MM);
-    let measured: Vec<Point> = (0..25 * 17).map(|k| tilt.point(&centre(k))).collect();
+    let measured: Vec<Point> = (0..25 * 17).map(|k| tilt.transform_point(&centre(k))).collect();
     let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
     let turned = found.cmm_from_model.angle_rad().to_degrees();
     assert!(turned < 3.0, "a flat is turned by {turned} degrees");
@@ -236,7 +236,7 @@ fn what_a_surface_cannot_see_begins_at_the_frame_of_the_file() {
     };
     let bumped: Vec<Point> = (0..25 * 17).map(|k| bump(&centre(k))).collect();
     let found = register(&nominal, &bumped, &Options::new(RADIUS_MM)).unwrap();
-    assert!(found.verdict.pv_mm > 6e-4 && found.cmm_from_model.angle_rad() < 1e-3, "{}", found.verdict.pv_mm);
+    assert!(found.quality.pv_mm > 6e-4 && found.cmm_from_model.angle_rad() < 1e-3, "{}", found.quality.pv_mm);
 
     let sphere = Sphere { radius_mm: 80.0 };
     let cap = |k: usize| {
@@ -274,7 +274,7 @@ fn a_pose_that_is_held_whole_gives_the_deviations_from_it() {
             let by_hand = truth.deviation_mm - 0.005 * truth.normal.z;
             assert!((raised.deviation_mm - by_hand).abs() < 1e-6, "{} {by_hand}", raised.deviation_mm);
         }
-        assert_eq!(found.verdict.covariance.amax(), 0.0);
+        assert_eq!(found.quality.covariance.amax(), 0.0);
     }
     let searched = Options { locked: [true; 6], ..Options::new(RADIUS_MM) };
     assert_eq!(register(&nominal, &cloud(WHOLE, [9, 5]), &searched).unwrap_err(), RegistrationError::Undetermined);
@@ -288,7 +288,7 @@ fn the_last_of_the_trace_is_what_is_reported() {
     let mut bad = clean.clone();
     // One touch gone wrong, and a chip that two touches agree on.
     for (k, height) in [(205, 0.4), (410, -0.1), (411, -0.1)] {
-        bad[k] += truth.direction(&Vector::z()) * height;
+        bad[k] += truth.transform_direction(&Vector::z()) * height;
     }
     let held = Options { start: Start::Pose(truth), locked: [true; 6], ..Options::new(RADIUS_MM) };
     let at_truth = Options { start: Start::Pose(truth), ..Options::new(RADIUS_MM) };
@@ -300,13 +300,13 @@ fn the_last_of_the_trace_is_what_is_reported() {
         ("robust", &bad, Options { loss: regrind_core::registration::Loss::Tukey, ..Options::new(RADIUS_MM) }),
     ] {
         let found = register(&nominal, measured, &options).unwrap();
-        let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let used = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         let (count, squares) = used.fold((0, 0.0), |(n, sum), d| (n + 1, sum + d.deviation_mm * d.deviation_mm));
-        assert_eq!(found.verdict.used, count, "{name}");
+        assert_eq!(found.quality.inliers, count, "{name}");
         let last = found.trace.last().expect(name);
         assert!(last.taken && last.points == count, "{name}: {last:?}");
         assert!((last.objective_mm2 / squares - 1.0).abs() < 1e-6, "{name}: {last:?} {squares}");
-        assert!((found.verdict.objective_mm2 / squares - 1.0).abs() < 1e-6, "{name}");
+        assert!((found.quality.objective_mm2 / squares - 1.0).abs() < 1e-6, "{name}");
     }
 }
 
@@ -318,11 +318,11 @@ fn where_a_third_of_the_touches_contradict_the_others_nothing_is_judged() {
         let mut measured = cloud(WHOLE, [60, 30]);
         for p in &mut measured {
             if rng.random::<f64>() < share {
-                *p += truth.direction(&Vector::z()) * (0.02 + 0.03 * rng.random::<f64>());
+                *p += truth.transform_direction(&Vector::z()) * (0.02 + 0.03 * rng.random::<f64>());
             }
         }
         let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
-        let why = found.no_verdict();
+        let why = found.unjudgeable_reason();
         assert_eq!(why.is_none(), is_judged, "{share}: {why:?}");
         assert_eq!(says(&found, "contradict their neighbours"), !is_judged);
     }

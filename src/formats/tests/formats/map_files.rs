@@ -182,7 +182,7 @@ fn a_container_that_swells_is_refused_before_it_does() {
 fn error_map() -> ErrorMap {
     let grid = Grid { columns: 7, rows: 5, first_mm: [-51.0, -31.0], spacing_mm: [17.0, 15.5] };
     let values_mm = (0..35).map(|k| 1e-3 * f64::from(k).sin()).collect();
-    ErrorMap::known(grid, values_mm, (0..35).map(|k| k % 6 != 2).collect())
+    ErrorMap::exact(grid, values_mm, (0..35).map(|k| k % 6 != 2).collect())
 }
 
 #[test]
